@@ -1,0 +1,122 @@
+"""The printed chessboard: where its inner corners lie in the world, in the frame of OpenCV or of the paper."""
+
+import math
+import operator
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Axes = Literal["opencv", "paper"]
+"""The board's two world frames; see `Chessboard`."""
+
+
+@dataclass(frozen=True)
+class Chessboard:
+    """A flat chessboard, described by its inner corners: the points where four squares meet.
+
+    The corners are listed row by row, each row from left to right, as they appear on a board that lies upright. This
+    order is the same in both frames, so the same pixels fit both; only the coordinates differ. With side `s`, the
+    corner in row r and column c (both from 0) lies at
+
+    * `axes="opencv"`: `(c s, r s, 0)`: x to the right, y down, z into the board, away from the camera;
+    * `axes="paper"`: `(r s, c s, 0)`: x from the top left corner down to the bottom left one, y from there to the top
+      right, z out of the board, towards the camera (Siswantoro, Prabuwono and Abdullah, 2013).
+
+    Both frames are right-handed and have their origin at the first inner corner.
+
+    Args:
+        columns: inner corners in a row: one less than the squares.
+        rows: inner corners in a column: one less than the squares.
+        square: the side of one square. Its unit becomes the unit of the world; 25 mm by default.
+        axes: `"opencv"` or `"paper"`.
+
+    Raises:
+        TypeError: columns or rows are no whole numbers, or square is no number.
+        ValueError: fewer than 2 columns or rows, a square that is not positive and finite, or unknown axes.
+
+    Example:
+        >>> board = Chessboard(columns=4, rows=3, square=10.0)
+        >>> board.points[:5].tolist()
+        [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [20.0, 0.0, 0.0], [30.0, 0.0, 0.0], [0.0, 10.0, 0.0]]
+        >>> Chessboard(columns=4, rows=3, square=10.0, axes="paper").points[3].tolist()
+        [0.0, 30.0, 0.0]
+        >>> len(board), board.size
+        (12, (4, 3))
+    """
+
+    columns: int = 9
+    rows: int = 6
+    square: float = 25.0
+    axes: Axes | str = "opencv"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "columns", _count("columns", self.columns))
+        object.__setattr__(self, "rows", _count("rows", self.rows))
+        object.__setattr__(self, "square", _length("square", self.square))
+        if self.axes not in get_args(Axes):
+            raise ValueError(f"axes: want one of {', '.join(map(repr, get_args(Axes)))}, got {self.axes!r}")
+
+    def __len__(self) -> int:
+        """The number of inner corners, N."""
+        return self.columns * self.rows
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """`(columns, rows)`, the order in which OpenCV takes them."""
+        return self.columns, self.rows
+
+    @property
+    def points(self) -> Float[Tensor, "n 3"]:
+        """The inner corners in the world, row by row, in the unit of `square`: a fresh float64 tensor each time."""
+        row, column = torch.meshgrid(
+            torch.arange(self.rows, dtype=torch.float64),
+            torch.arange(self.columns, dtype=torch.float64),
+            indexing="ij",
+        )
+        return self._placed(row.flatten(), column.flatten())
+
+    @property
+    def outline(self) -> Float[Tensor, "4 3"]:
+        """The outer corners of the printed squares, one square beyond the inner corners, in the unit of `square`.
+
+        They come as top left, top right, bottom right, bottom left.
+
+        Example:
+            >>> Chessboard(columns=4, rows=3, square=10.0).outline.tolist()
+            [[-10.0, -10.0, 0.0], [40.0, -10.0, 0.0], [40.0, 30.0, 0.0], [-10.0, 30.0, 0.0]]
+        """
+        top, right, bottom, left = -1.0, float(self.columns), float(self.rows), -1.0
+        return self._placed(
+            torch.tensor([top, top, bottom, bottom], dtype=torch.float64),
+            torch.tensor([left, right, right, left], dtype=torch.float64),
+        )
+
+    def _placed(self, row: Float[Tensor, " n"], column: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
+        """Rows and columns, counted in squares, as world points in this board's frame."""
+        along = (column, row) if self.axes == "opencv" else (row, column)
+        return torch.stack([*along, torch.zeros_like(row)], dim=-1) * self.square
+
+
+def _count(name: str, value: object) -> int:
+    try:
+        count = operator.index(value)  # type: ignore[arg-type]  # a float or a string lands in the handler below
+    except TypeError:
+        raise TypeError(f"{name}: want a whole number of inner corners, got {value!r}") from None
+    if isinstance(value, bool):
+        raise TypeError(f"{name}: want a whole number of inner corners, got {value!r}")
+    if count < 2:
+        raise ValueError(f"{name}: want at least 2 inner corners (one less than the squares), got {count}")
+    return count
+
+
+def _length(name: str, value: object) -> float:
+    try:
+        length = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise TypeError(f"{name}: want the side of a square as a number, got {value!r}") from None
+    if not (math.isfinite(length) and length > 0):
+        raise ValueError(f"{name}: want a positive, finite side, got {value!r}")
+    return length

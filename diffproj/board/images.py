@@ -1,0 +1,149 @@
+"""Photographs in any of the forms a user has them, as the grey images that corner detection works on."""
+
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Shaped, UInt8
+from torch import Tensor
+
+Source = str | os.PathLike[str] | np.ndarray | Tensor
+"""A photograph, or several: a file, folder or pattern; an array or tensor."""
+
+SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".jp2", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
+"""Endings of the files that count as photographs when a folder is given."""
+
+LAYOUTS = "an array (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA, or a tensor (1 | 3 | 4, H, W) RGB"
+
+
+class Photograph(NamedTuple):
+    """One photograph that a user handed in.
+
+    Attributes:
+        name: what its view is called: the file's name, or `image 3` for the third of several arrays.
+        label: what messages call it: the file with its folder, or the same as the name.
+        source: where the pixels are.
+    """
+
+    name: str
+    label: str
+    source: Path | np.ndarray | Tensor
+
+
+def listed(photographs: Source | Iterable[Source]) -> list[Photograph]:
+    """List one by one what the caller handed in.
+
+    Args:
+        photographs: a file, a folder (its photographs in natural order: `view2` before `view10`), a pattern such as
+            `photos/left*.jpg`, an array, a tensor, or a list of files, arrays and tensors.
+
+    Raises:
+        TypeError: an entry is none of these.
+        ValueError: the list, the folder or the pattern holds no photograph.
+        FileNotFoundError: a file does not exist.
+    """
+    entries = _entries(photographs)
+    if not entries:
+        raise ValueError(f"photographs: want at least one, got none in {photographs!r}")
+    return [_named(number, entry) for number, entry in enumerate(entries, start=1)]
+
+
+def _named(number: int, entry: Any) -> Photograph:
+    if isinstance(entry, np.ndarray | Tensor):
+        return Photograph(f"image {number}", f"image {number}", entry)
+    if isinstance(entry, str | os.PathLike):
+        path = Path(entry)
+        if not path.is_file():
+            raise FileNotFoundError(f"photographs: no such file: {path}")
+        return Photograph(path.name, str(path), path)
+    raise TypeError(f"photographs: want file names, arrays or tensors, got {type(entry).__name__}")
+
+
+def _entries(photographs: Any) -> list[Any]:
+    if isinstance(photographs, np.ndarray):
+        return [photographs]
+    if isinstance(photographs, Tensor):
+        return list(photographs) if photographs.ndim == 4 else [photographs]
+    if isinstance(photographs, str | os.PathLike):
+        path = Path(photographs)
+        if path.is_dir():
+            return sorted((file for file in path.iterdir() if file.suffix.lower() in SUFFIXES), key=_natural)
+        if not path.exists() and re.search(r"[*?\[]", path.name):
+            return sorted(path.parent.glob(path.name), key=_natural)
+        return [path]
+    if isinstance(photographs, Iterable):
+        return list(photographs)
+    raise TypeError(f"photographs: want file names, arrays or tensors, got {type(photographs).__name__}")
+
+
+def _natural(path: Path) -> list[Any]:
+    """A key that sorts by the numbers in a name, not by their digits."""
+    parts = re.split(r"([0-9]+)", path.name.lower())  # text at even places, numbers at odd ones
+    return [int(part) if place % 2 else part for place, part in enumerate(parts)]
+
+
+def grey(photograph: Photograph) -> Shaped[np.ndarray, "h w"]:
+    """Bring a photograph to grey, `(H, W)`, from 0 to 255: uint8 where 8 bits came in, float32 otherwise.
+
+    Files are read as `cv2.imread` reads them, which turns them upright where the camera noted how it was held. 16-bit
+    images are stretched over the range of values that they hold, for cameras of 10, 12 or 14 bits use a part of it.
+
+    Raises:
+        ValueError: the file is no image, the shape is none of the layouts, or floats are not in 0..1.
+        TypeError: the numbers are neither integers of 8 or 16 bits nor floats.
+        OSError: the file cannot be read.
+    """
+    label, source = photograph.label, photograph.source
+    if isinstance(source, Path):
+        return _scaled(label, _read(source))
+    image = _channels_last(label, source) if isinstance(source, Tensor) else source
+    if image.size == 0 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (1,), (3,), (4,)):
+        raise ValueError(f"{label}: want {LAYOUTS}, got shape {tuple(source.shape)}")
+    if image.shape[2:] == (4,):
+        image = image[..., :3]  # without the opacity
+    scaled = np.ascontiguousarray(_scaled(label, image))
+    return cv2.cvtColor(scaled, cv2.COLOR_BGR2GRAY) if scaled.shape[2:] == (3,) else scaled.reshape(scaled.shape[:2])
+
+
+def as_8_bit(image: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """A grey image from 0 to 255 in whole numbers."""
+    return image if image.dtype == np.uint8 else np.rint(image).astype(np.uint8)
+
+
+def _read(path: Path) -> np.ndarray:
+    # The bytes first: OpenCV alone tells neither a missing file from a broken one, nor takes every file name.
+    data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if data.size else None
+    if image is None:
+        raise ValueError(f"{path}: want an image, got {data.size} bytes that OpenCV cannot read as one")
+    return image
+
+
+def _channels_last(label: str, image: Tensor) -> np.ndarray:
+    """A tensor in RGB as OpenCV has it: `(H, W)` or `(H, W, C)` in BGR."""
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[0] not in (1, 3, 4)):
+        raise ValueError(f"{label}: want {LAYOUTS}, got a tensor of shape {tuple(image.shape)}")
+    image = image.detach().cpu()
+    array = (image.float() if image.is_floating_point() else image).numpy()
+    if array.ndim == 2:
+        return array
+    return np.moveaxis(array[:3][::-1], 0, -1)
+
+
+def _scaled(label: str, image: np.ndarray) -> np.ndarray:
+    """Any supported kind of number on the scale from 0 to 255."""
+    if image.dtype == np.uint8:
+        return image
+    if image.dtype in (np.uint16, np.int16):
+        # Not the very extremes: one hot pixel would turn all others black.
+        low, high = np.percentile(image, (0.1, 99.9))
+        return np.clip((image.astype(np.float32) - low) * (255 / max(high - low, 1)), 0, 255).astype(np.float32)
+    if np.issubdtype(image.dtype, np.floating):
+        if not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1):
+            raise ValueError(f"{label}: want floats from 0 to 1, got {image.min():g} to {image.max():g}")
+        return image.astype(np.float32) * np.float32(255)
+    raise TypeError(f"{label}: want integers of 8 or 16 bits or floats, got {image.dtype}")

@@ -1,0 +1,69 @@
+"""Pictures, drawn with matplotlib without a screen: the paper's Fig. 7."""
+
+import io
+
+import torch
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from diffproj.experiment import Experiment
+
+EXACT, APPROXIMATED, ERROR = "#8a8f98", "#0b6bcb", "#d6336c"
+
+
+def fig7(experiment: Experiment, magnification: float = 50.0) -> Figure:
+    """Exact and approximated corners of each test view, as the paper's Fig. 7.
+
+    The board is drawn as one looks at it: the paper's x points down, its y to the right. At the errors of interest both
+    marks fall on one spot, so the difference is drawn along, magnified.
+
+    Args:
+        experiment: what to draw.
+        magnification: how much longer than true the errors are drawn.
+    """
+    views = experiment.test.views.names
+    columns = min(3, len(views))
+    lines = -(-len(views) // columns)
+    figure = Figure(figsize=(4.6 * columns, 3.6 * lines + 0.9), layout="constrained")
+    exact = _as_seen(experiment, experiment.exact)
+    unit = experiment.board.square
+    for position, (name, found, measured) in enumerate(
+        zip(views, experiment.approximated, experiment.measured, strict=True)
+    ):
+        axes = figure.add_subplot(lines, columns, position + 1)
+        approximated = _as_seen(experiment, found)[measured]
+        known = exact[measured]
+        tip = known + magnification * (approximated - known)
+        axes.plot(*exact.T, "s", color=EXACT, markersize=7, markerfacecolor="none", markeredgewidth=1)
+        axes.plot(*torch.stack([known, tip]).permute(2, 0, 1), color=ERROR, linewidth=1.4)
+        axes.plot(*approximated.T, ".", color=APPROXIMATED, markersize=4)
+        row = experiment.rows[position]
+        axes.set_title(f"{name}: mean $E_x$ {row.mean[0]:.3f}, $E_y$ {row.mean[1]:.3f}", fontsize=10)
+        horizontal, vertical = ("y", "x") if experiment.board.axes == "paper" else ("x", "y")
+        axes.set_xlabel(horizontal, labelpad=1)
+        axes.set_ylabel(vertical, labelpad=1)
+        axes.set_aspect("equal")
+        axes.set_xlim(float(exact[:, 0].min()) - unit, float(exact[:, 0].max()) + unit)
+        axes.set_ylim(float(exact[:, 1].max()) + unit, float(exact[:, 1].min()) - unit)
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+    marks = [
+        Line2D([], [], marker="s", color=EXACT, markerfacecolor="none", linestyle="none", label="exact corner"),
+        Line2D([], [], marker=".", color=APPROXIMATED, linestyle="none", label="approximated by back-projection"),
+        Line2D([], [], color=ERROR, label=f"error, {magnification:g} times as long"),
+    ]
+    figure.suptitle("Corners of the test views on the board (world units)", fontsize=12)
+    figure.legend(handles=marks, loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+def png(figure: Figure, dpi: int = 150) -> bytes:
+    """The figure as the content of a PNG file."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=dpi)
+    return content.getvalue()
+
+
+def _as_seen(experiment: Experiment, points: torch.Tensor) -> torch.Tensor:
+    """World points `(N, 3)` as `(right, down)` on the drawing."""
+    return points[:, [1, 0]] if experiment.board.axes == "paper" else points[:, :2]

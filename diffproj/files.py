@@ -1,0 +1,232 @@
+"""Camera files: OpenCV's YAML, and an own JSON that holds a whole calibration.
+
+| format | suffix | holds |
+|---|---|---|
+| `"opencv"` | `.yml`, `.yaml`, `.xml` | one camera: K, lens, size; of a calibration also the views' poses and errors |
+| `"json"` | `.json` | any batch of cameras with pose, dtype and lens; of a calibration also the corners and the board |
+
+The YAML has the keys that OpenCV's own calibration program writes (`camera_matrix`, `distortion_coefficients`,
+`image_width`, `extrinsic_parameters`, ...), and files from there are read. What a format cannot hold is refused, and a
+file is written whole or not at all.
+"""
+
+import json
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffproj._atomic import write_whole
+from diffproj.board import Views
+from diffproj.calibration import Calibration
+from diffproj.camera import Camera
+from diffproj.lens import BrownConrady, KannalaBrandt
+
+Format = Literal["opencv", "json"]
+
+JSON_FORMAT = "diffproj camera"
+JSON_VERSION = 1
+
+_SUFFIXES: dict[str, Format] = {".yml": "opencv", ".yaml": "opencv", ".xml": "opencv", ".json": "json"}
+_LENSES = {"BrownConrady": BrownConrady, "KannalaBrandt": KannalaBrandt}
+
+PathLike = str | os.PathLike[str]
+
+
+def save_camera(path: PathLike, camera: Camera | Calibration, format: Format | None = None) -> None:  # noqa: A002
+    """Save a camera or a calibration.
+
+    Args:
+        path: the file to write; its folder must exist.
+        camera: what to save.
+        format: `"opencv"` or `"json"`; by the suffix if left out.
+
+    Raises:
+        TypeError: it is neither a camera nor a calibration.
+        ValueError: unknown suffix or format, or something that the format cannot hold.
+        OSError: the file cannot be written.
+
+    Example:
+        >>> import tempfile, diffproj as dp
+        >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     dp.save_camera(f"{folder}/camera.json", calibration)
+        ...     again = dp.load_calibration(f"{folder}/camera.json")
+        >>> again.rms == calibration.rms
+        True
+    """
+    if not isinstance(camera, Camera | Calibration):
+        raise TypeError(f"camera: want dp.Camera or dp.Calibration, got {type(camera).__name__}")
+    path = Path(path)
+    if _format(path, format) == "json":
+        content = json.dumps(_json_document(camera), indent=1)
+    else:
+        content = _opencv_document(path, camera)
+    write_whole(path, content)
+
+
+def load_camera(path: PathLike, format: Format | None = None) -> Camera:  # noqa: A002
+    """Load a camera; of a calibration, the camera without a pose.
+
+    Args:
+        path: the file to read.
+        format: as for `save_camera`.
+
+    Returns:
+        The camera; in float64 from OpenCV's formats, in the dtype it was saved in from JSON.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: unknown suffix or format, or the file is not what it should be.
+    """
+    path = Path(path)
+    if _format(path, format) == "json":
+        return _camera_from_json(path, _read_json(path)["camera"])
+    return _camera_from_opencv(path)
+
+
+def load_calibration(path: PathLike) -> Calibration:
+    """Load a whole calibration from the own JSON.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no JSON of this package, or holds a camera alone.
+    """
+    path = Path(path)
+    if _format(path, None) != "json":
+        raise ValueError(f"{path}: want a .json file, for OpenCV's formats hold no corners; load_camera reads them")
+    document = _read_json(path)
+    if "calibration" not in document:
+        raise ValueError(f"{path}: want a calibration, got a camera alone; load_camera reads it")
+    camera = _camera_from_json(path, document["camera"])
+    try:
+        found = document["calibration"]
+        R, t, points, pixels = (_tensor(found[key], torch.float64) for key in ("R", "t", "points", "pixels"))
+        visible = torch.tensor(found["visible"], dtype=torch.bool)
+        views = Views(pixels, visible, found["names"], found["size"])
+        return Calibration(camera, camera.at(R, t), views, points)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
+
+
+def _format(path: Path, format: str | None) -> Format:  # noqa: A002
+    if format is None:
+        if path.suffix.lower() not in _SUFFIXES:
+            raise ValueError(f"{path}: want a suffix of {', '.join(_SUFFIXES)}, or format='opencv' or 'json'")
+        return _SUFFIXES[path.suffix.lower()]
+    if format not in ("opencv", "json"):
+        raise ValueError(f"format: want 'opencv' or 'json', got {format!r}")
+    return format
+
+
+# ------------------------------------------------------------------------------------------------------------- JSON
+
+
+def _json_document(item: Camera | Calibration) -> dict[str, Any]:
+    camera = item.camera if isinstance(item, Calibration) else item
+    lens = camera.distortion
+    if lens is not None and type(lens).__name__ not in _LENSES:
+        raise ValueError(f"distortion: want one of {', '.join(_LENSES)}, got {type(lens).__name__}")
+    document: dict[str, Any] = {
+        "format": JSON_FORMAT,
+        "version": JSON_VERSION,
+        "camera": {
+            "dtype": str(camera.dtype).removeprefix("torch."),
+            "size": camera.size,
+            "K": camera.K.tolist(),
+            "R": camera.R.tolist(),
+            "t": camera.t.tolist(),
+            "lens": None if lens is None else {"model": type(lens).__name__, "coefficients": lens.coefficients.tolist()},
+        },
+    }
+    if isinstance(item, Calibration):
+        document["calibration"] = {
+            "rms": item.rms,
+            "R": item.cameras.R.tolist(),
+            "t": item.cameras.t.tolist(),
+            "points": item.points.tolist(),
+            "names": item.views.names,
+            "size": item.views.size,
+            "pixels": item.views.pixels.tolist(),
+            "visible": item.views.visible.tolist(),
+        }
+    return document
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: want a JSON file, got something else ({error})") from error
+    if not isinstance(document, dict) or document.get("format") != JSON_FORMAT or "camera" not in document:
+        raise ValueError(f"{path}: want a camera file of diffproj, got another JSON file")
+    if document.get("version") != JSON_VERSION:
+        raise ValueError(f"{path}: want version {JSON_VERSION}, got {document.get('version')}; a newer diffproj reads it")
+    return document
+
+
+def _camera_from_json(path: Path, fields: dict[str, Any]) -> Camera:
+    try:
+        dtype = {"float32": torch.float32, "float64": torch.float64}[fields["dtype"]]
+        K, R, t = (_tensor(fields[key], dtype) for key in ("K", "R", "t"))
+        lens = fields["lens"]
+        distortion = lens and _LENSES[lens["model"]](_tensor(lens["coefficients"], dtype))
+        return Camera(K, R, t, distortion, fields["size"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: the camera in this file is damaged ({error})") from error
+
+
+def _tensor(numbers: Any, dtype: torch.dtype) -> Tensor:
+    return torch.tensor(numbers, dtype=dtype)
+
+
+# ----------------------------------------------------------------------------------------------------- OpenCV's YAML
+
+
+def _opencv_document(path: Path, item: Camera | Calibration) -> str:
+    camera = item.camera if isinstance(item, Calibration) else item
+    if camera.batch_shape:
+        raise ValueError(f"{path}: OpenCV's formats hold one camera, got batch shape {tuple(camera.batch_shape)}; use .json")
+    K, dist, rvec, tvec = camera.to_opencv()
+    if rvec.any() or tvec.any():
+        raise ValueError(f"{path}: OpenCV's formats hold no pose; use .json, or save camera.without_pose()")
+    suffix = path.suffix.lower() if path.suffix.lower() in (".xml", ".yml", ".yaml") else ".yml"
+    storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    if camera.size is not None:
+        storage.write("image_width", camera.size[0])
+        storage.write("image_height", camera.size[1])
+    storage.write("camera_matrix", K)
+    storage.write("fisheye_model", int(isinstance(camera.distortion, KannalaBrandt)))
+    if dist.size:
+        storage.write("distortion_coefficients", dist.reshape(-1, 1))
+    if isinstance(item, Calibration):
+        _, _, rvecs, tvecs = item.cameras.to_opencv()
+        storage.write("nframes", len(item.views))
+        storage.write("extrinsic_parameters", np.concatenate([rvecs, tvecs], axis=-1))
+        storage.write("avg_reprojection_error", item.rms)
+        storage.write("per_view_reprojection_errors", item.view_rms.numpy().reshape(-1, 1))
+    return storage.releaseAndGetString()
+
+
+def _camera_from_opencv(path: Path) -> Camera:
+    text = path.read_text(encoding="utf-8", errors="replace")
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    except (cv2.error, SystemError) as error:
+        raise ValueError(f"{path}: want a YAML or XML file that OpenCV reads, got something else") from error
+    try:
+        K, dist = storage.getNode("camera_matrix").mat(), storage.getNode("distortion_coefficients").mat()
+        width, height = (int(storage.getNode(key).real()) for key in ("image_width", "image_height"))
+        fisheye = bool(storage.getNode("fisheye_model").real())
+    finally:
+        storage.release()
+    if K is None:
+        raise ValueError(f"{path}: want the key camera_matrix, got a file without it")
+    try:
+        return Camera.from_opencv(K, dist, size=(width, height) if width and height else None, fisheye=fisheye)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from error

@@ -1,0 +1,153 @@
+"""`BrownConrady`: the lens of OpenCV's calibration, with an exact inverse and an honest domain.
+
+Forward, the equations of `brown_equations`. Backward, Newton's method on them (the tilt, a homography, is undone in
+closed form first), in three parts:
+
+1. a start from a table of the inverse along the radius;
+2. a fixed number of Newton steps without a gradient tape, and a patient search for the few points they leave over;
+3. where a derivative is wanted, two more steps with the tape on. One step at the solution already has the exact first
+   derivative of the inverse function, two have the second.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from diffproj import _pytree
+from diffproj._numerics import in_blocks, wants_derivative
+from diffproj.lens import brown_domain
+from diffproj.lens.brown_equations import COUNTS, Terms, bend, radial
+from diffproj.lens.brown_inverse import newton, search, squared_domain, untilted
+from diffproj.lens.coefficients import CoefficientLens
+from diffproj.lens.plan import Plan
+from diffproj.lens.table import inverse_table
+
+
+class BrownConrady(CoefficientLens):
+    """Radial, tangential, rational, thin-prism and tilt distortion, in OpenCV's order of coefficients.
+
+    `k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]`, without unit but for the tilt angles, which are in
+    radians. Points are on the normalised plane `z = 1` of the camera frame (x right, y down, z forward). The lens
+    answers on a disc around the axis, `domain`, on which it is provably one-to-one; `valid` is false elsewhere, and
+    the result (0, 0) there.
+
+    Args:
+        coefficients: `(*B, k)` with k one of 4, 5, 8, 12, 14; kept as they are, gradients flow to them.
+
+    Raises:
+        TypeError: not a floating-point tensor.
+        ValueError: no such number of coefficients, or a coefficient that is not finite.
+
+    Example:
+        >>> lens = BrownConrady(torch.tensor([-0.25, 0.09, 0.0, 0.0, -0.02], dtype=torch.float64))
+        >>> xy_distorted, valid = lens.distort(torch.tensor([[0.5, 0.2], [3.0, 0.0]], dtype=torch.float64))
+        >>> valid
+        tensor([ True, False])
+        >>> xy, valid = lens.undistort(xy_distorted[:1])
+        >>> xy
+        tensor([[0.5000, 0.2000]], dtype=torch.float64)
+    """
+
+    counts = COUNTS
+
+    @property
+    def domain(self) -> Float[Tensor, "*lens"]:
+        """The radius of the disc of undistorted points on which the lens is one-to-one, `(*B,)`, without gradient.
+
+        The largest around the axis on which the symmetric part of the Jacobian is positive definite, rounded inward.
+        Infinite where the lens has no fold.
+        """
+        return self._plan().domain
+
+    def distort(self, xy: Float[Tensor, "*batch n 2"]) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
+        """Undistorted points to distorted ones, both on the normalised plane.
+
+        Args:
+            xy: `(*B, N, 2)`; batch axes broadcast against those of the lens.
+
+        Returns:
+            Distorted points, and `valid`: inside the domain and finite. (0, 0) with zero gradient where not.
+        """
+        xy = self._checked("xy", xy, 2)
+        plan = self._plan()
+
+        def forward(points: Tensor) -> tuple[Tensor, Tensor]:
+            x, y = points.unbind(-1)
+            s = (x * x + y * y).detach()
+            valid = (s <= squared_domain(plan)) & (s < torch.inf)
+            x, y = torch.where(valid, x, 0), torch.where(valid, y, 0)
+            terms = Terms.of(self._usable(plan))
+            x, y = bend(terms, x, y)
+            if terms.tilt is not None:
+                x, y = terms.tilt.apply(x, y)
+            return torch.stack([x, y], dim=-1), valid
+
+        return in_blocks(forward, xy, self.coefficients)  # type: ignore[return-value]
+
+    def undistort(
+        self, xy_distorted: Float[Tensor, "*batch n 2"]
+    ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
+        """Distorted points to undistorted ones, both on the normalised plane: the exact inverse of `distort`.
+
+        Derivatives are those of the inverse function, to second order, in points and coefficients, in reverse and in
+        forward mode.
+
+        Args:
+            xy_distorted: `(*B, N, 2)`; batch axes broadcast against those of the lens.
+
+        Returns:
+            Undistorted points, and `valid`: there is one inside the domain. (0, 0) with zero gradient where not.
+        """
+        xy_distorted = self._checked("xy_distorted", xy_distorted, 2)
+        plan = self._plan()
+
+        def backward(points: Tensor) -> tuple[Tensor, Tensor]:
+            coefficients = self._usable(plan)
+            x, y, valid = search(coefficients.detach(), plan, points.detach())
+            x, y = torch.where(valid, x, 0), torch.where(valid, y, 0)
+            if wants_derivative(points, coefficients):
+                terms = Terms.of(coefficients)
+                target = untilted(terms, torch.where(valid.unsqueeze(-1), points, 0))
+                x, y = newton(terms, target, x, y, steps=2)
+            return torch.stack([x, y], dim=-1), valid
+
+        return in_blocks(backward, xy_distorted, self.coefficients)  # type: ignore[return-value]
+
+    def project_direction(
+        self, direction: Float[Tensor, "*batch n 3"]
+    ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
+        """Where directions of the camera frame arrive on the normalised plane.
+
+        Args:
+            direction: `(*B, N, 3)`, of any length.
+
+        Returns:
+            Distorted points `(*B, N, 2)`, and `valid`: in front of the camera and inside the domain. (0, 0) with zero
+            gradient where not.
+        """
+        direction = self._checked("direction", direction, 3)
+        x, y, z = direction.unbind(-1)
+        in_front = (z > 0) & torch.isfinite(x + y + z)
+        x, y, z = torch.where(in_front, x, 0), torch.where(in_front, y, 0), torch.where(in_front, z, 1)
+        xy_distorted, valid = self.distort(torch.stack([x / z, y / z], dim=-1))
+        valid = valid & in_front
+        return torch.where(valid.unsqueeze(-1), xy_distorted, 0), valid
+
+    def unproject(
+        self, xy_distorted: Float[Tensor, "*batch n 2"]
+    ) -> tuple[Float[Tensor, "*out n 3"], Bool[Tensor, "*out n"]]:
+        """The directions `(x, y, 1)` that arrive at distorted points; (0, 0, 1) where not valid."""
+        xy, valid = self.undistort(xy_distorted)
+        return torch.nn.functional.pad(xy, (0, 1), value=1.0), valid
+
+    @staticmethod
+    def _work_out(coefficients: Tensor) -> Plan:
+        domain = brown_domain.domain_radius(coefficients)
+        terms = Terms.of(torch.where((domain > 0).unsqueeze(-1), coefficients, 0))
+        end = brown_domain.table_radius(terms, domain)
+        table = inverse_table(lambda r: r * radial(terms, r * r), end, brown_domain.sway(terms, end))
+        reach, noise = brown_domain.reach(terms, domain), brown_domain.cancellation(terms, end)
+        return Plan(domain, reach, noise, table.rho_max, table.ratio)
+
+
+_pytree.register(BrownConrady, children=("coefficients",))

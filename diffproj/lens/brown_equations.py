@@ -1,0 +1,208 @@
+"""The equations of the Brown-Conrady lens with its rational, prism and tilt terms, and their Jacobian.
+
+With `s = x^2 + y^2` a point `(x, y)` of the normalised plane goes to
+
+    g  = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3)       radial, rational
+    x' = x g + 2 p1 x y + p2 (s + 2 x^2) + s1 s + s2 s^2                    tangential, thin prism
+    y' = y g + p1 (s + 2 y^2) + 2 p2 x y + s3 s + s4 s^2
+
+and on a sensor tilted by `tau_x`, `tau_y` the point `(x', y')` goes on to `(X, Y) / W` with
+
+    X = cos(tau_x) x'
+    Y = cos(tau_y) y' - sin(tau_x) sin(tau_y) x'
+    W = sin(tau_y) x' - cos(tau_y) sin(tau_x) y' + cos(tau_x) cos(tau_y)
+
+The tangential terms are `2 (p1 y + p2 x) (x, y) + s (p2, p1)`, which is how they are computed.
+
+Sources: Brown 1966 (radial, tangential); Claus and Fitzgibbon 2005 (rational); Weng, Cohen and Herniou 1992 (thin
+prism); Louhichi, Fournel, Lavest and Ben Aissia 2007 (tilt). The order of the coefficients is OpenCV's.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffproj.lens.polynomial import polynomial
+
+COUNTS = (4, 5, 8, 12, 14)
+Columns = tuple[Tensor, ...]
+
+
+class Tilt(NamedTuple):
+    """Cosines and sines of the two angles, columns `(*B, 1)`."""
+
+    cos_x: Tensor
+    sin_x: Tensor
+    cos_y: Tensor
+    sin_y: Tensor
+
+    def depth(self, x: Tensor, y: Tensor) -> Tensor:
+        """`W`: positive for points in front of the tilted sensor's horizon."""
+        return self.sin_y * x - self.cos_y * self.sin_x * y + self.cos_x * self.cos_y
+
+    def apply(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """`(X, Y) / W`."""
+        depth = self.depth(x, y)
+        return self.cos_x * x / depth, (self.cos_y * y - self.sin_x * self.sin_y * x) / depth
+
+    def undo(self, x_tilted: Tensor, y_tilted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The point `(x', y')` that `apply` takes there, and `1 / W`, which must be positive."""
+        x = x_tilted / self.cos_x
+        y = (y_tilted + self.sin_x * self.sin_y * x) / self.cos_y
+        inverse_depth = (1 - self.sin_y * x + self.cos_y * self.sin_x * y) / (self.cos_x * self.cos_y)
+        return x / inverse_depth, y / inverse_depth, inverse_depth
+
+
+class Terms(NamedTuple):
+    """The coefficients sorted by what they do, as columns `(*B, 1)` that broadcast against points `(*B, N)`.
+
+    Polynomials are in `s`, lowest power first. A slope is twice a derivative by `s`: times `x` it is one by `x`.
+
+    Attributes:
+        above, above_slope: the radial numerator without its 1, divided by `s`; the slope of the numerator.
+        below, below_slope: the same of the denominator; `None` where the lens has none.
+        one, two_p1, two_p2: constants.
+        sideways_x, sideways_y: what is multiplied by `s` in a fixed direction: `p2 + s1 + s2 s` and `p1 + s3 + s4 s`.
+        sideways_slope_x, sideways_slope_y: the slopes of `s` times that.
+        tilt: `None` where the lens has none.
+    """
+
+    above: Columns
+    above_slope: Columns
+    below: Columns | None
+    below_slope: Columns | None
+    one: Tensor
+    two_p1: Tensor
+    two_p2: Tensor
+    sideways_x: Columns
+    sideways_y: Columns
+    sideways_slope_x: Columns
+    sideways_slope_y: Columns
+    tilt: Tilt | None
+
+    @classmethod
+    def of(cls, coefficients: Tensor) -> "Terms":
+        """Sort coefficients `(*B, k)`."""
+        k1, k2, p1, p2, *rest = coefficients.unsqueeze(-2).unbind(-1)
+        above = k1, k2, *rest[:1]
+        below = tuple(rest[1:4])
+        prism = rest[4:8]
+        sideways_x, sideways_y = ((p2 + prism[0], prism[1]), (p1 + prism[2], prism[3])) if prism else ((p2,), (p1,))
+        return cls(
+            above,
+            _slope(above),
+            below or None,
+            _slope(below) if below else None,
+            torch.ones_like(k1),
+            2 * p1,
+            2 * p2,
+            sideways_x,
+            sideways_y,
+            _slope(sideways_x),
+            _slope(sideways_y),
+            Tilt(rest[8].cos(), rest[8].sin(), rest[9].cos(), rest[9].sin()) if rest[8:] else None,
+        )
+
+
+def _slope(over_s: Columns) -> Columns:
+    return tuple(2 * (power + 1) * column for power, column in enumerate(over_s))
+
+
+class Jacobian(NamedTuple):
+    """Derivatives of `(x', y')`: `xy` is that of `x'` by `y`."""
+
+    xx: Tensor
+    xy: Tensor
+    yx: Tensor
+    yy: Tensor
+
+
+def denominator(terms: Terms, s: Tensor) -> Tensor:
+    """That of the radial factor `g`, at squared radii `s`."""
+    return torch.ones_like(s) if terms.below is None else 1 + s * polynomial(s, terms.below)
+
+
+def radial(terms: Terms, s: Tensor) -> Tensor:
+    """The radial factor `g`, at squared radii `s`."""
+    return 1 + s * _growth(terms, s)
+
+
+def _growth(terms: Terms, s: Tensor) -> Tensor:
+    """`(g - 1) / s`."""
+    above = polynomial(s, terms.above)
+    return above if terms.below is None else (above - polynomial(s, terms.below)) / denominator(terms, s)
+
+
+def radial_slope(terms: Terms, s: Tensor, factor: Tensor) -> Tensor:
+    """`2 dg/ds`, where `g` is `factor`."""
+    slope = polynomial(s, terms.above_slope)
+    if terms.below_slope is None:
+        return slope
+    return (slope - factor * polynomial(s, terms.below_slope)) / denominator(terms, s)
+
+
+def bend(terms: Terms, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """`(x', y')`: everything but the tilt."""
+    s = torch.addcmul(x * x, y, y)
+    factor = torch.addcmul(_tangential_factor(terms, x, y), s, _growth(terms, s))
+    sideways_x, sideways_y = polynomial(s, terms.sideways_x), polynomial(s, terms.sideways_y)
+    return torch.addcmul(x * factor, s, sideways_x), torch.addcmul(y * factor, s, sideways_y)
+
+
+def bend_off(terms: Terms, target: tuple[Tensor, Tensor], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Jacobian]:
+    """What `(x', y')` lacks to the target, and the derivatives of `(x', y')`, in as few operations as possible."""
+    s = torch.addcmul(x * x, y, y)
+    growth = _growth(terms, s)
+    factor = torch.addcmul(_tangential_factor(terms, x, y), s, growth)
+    slope = radial_slope(terms, s, torch.addcmul(terms.one, s, growth) if terms.below else factor)
+    sideways_x, sideways_y = polynomial(s, terms.sideways_x), polynomial(s, terms.sideways_y)
+    steep_x, steep_y = polynomial(s, terms.sideways_slope_x), polynomial(s, terms.sideways_slope_y)
+    slope_x, slope_y = torch.addcmul(terms.two_p2, x, slope), torch.addcmul(terms.two_p1, y, slope)
+    jacobian = Jacobian(
+        torch.addcmul(factor, x, slope_x + steep_x),
+        torch.addcmul(x * slope_y, y, steep_x),
+        torch.addcmul(y * slope_x, x, steep_y),
+        torch.addcmul(factor, y, slope_y + steep_y),
+    )
+    off_x = torch.addcmul(torch.addcmul(target[0], x, factor, value=-1), s, sideways_x, value=-1)
+    off_y = torch.addcmul(torch.addcmul(target[1], y, factor, value=-1), s, sideways_y, value=-1)
+    return off_x, off_y, jacobian
+
+
+def newton_direction(
+    terms: Terms, target: tuple[Tensor, Tensor], x: Tensor, y: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """What is missing at `(x, y)`, and Newton's step there as numerators and their common denominator."""
+    off_x, off_y, slope = bend_off(terms, target, x, y)
+    determinant = torch.addcmul(slope.xx * slope.yy, slope.xy, slope.yx, value=-1)
+    step_x = torch.addcmul(slope.yy * off_x, slope.xy, off_y, value=-1)
+    step_y = torch.addcmul(slope.xx * off_y, slope.yx, off_x, value=-1)
+    return off_x, off_y, step_x, step_y, determinant
+
+
+def _tangential_factor(terms: Terms, x: Tensor, y: Tensor) -> Tensor:
+    """`1 + 2 (p1 y + p2 x)`."""
+    return torch.addcmul(torch.addcmul(terms.one, x, terms.two_p2), y, terms.two_p1)
+
+
+def tilted_jacobian(terms: Terms, x: Tensor, y: Tensor) -> tuple[Jacobian, Tensor]:
+    """Derivatives of the whole lens times the depth `W`, and the depth relative to its terms (1 without a tilt)."""
+    zero = torch.zeros_like(x)
+    x_off, y_off, bent = bend_off(terms, (zero, zero), x, y)
+    tilt = terms.tilt
+    if tilt is None:
+        return bent, torch.ones_like(x)
+    depth = tilt.depth(-x_off, -y_off)
+    x_tilted, y_tilted = tilt.apply(-x_off, -y_off)
+    down = tilt.cos_y * tilt.sin_x
+    xx, xy = tilt.cos_x - x_tilted * tilt.sin_y, x_tilted * down
+    yx, yy = -tilt.sin_x * tilt.sin_y - y_tilted * tilt.sin_y, tilt.cos_y + y_tilted * down
+    chained = Jacobian(
+        xx * bent.xx + xy * bent.yx,
+        xx * bent.xy + xy * bent.yy,
+        yx * bent.xx + yy * bent.yx,
+        yx * bent.xy + yy * bent.yy,
+    )
+    size = (tilt.sin_y * x_off).abs() + (down * y_off).abs() + (tilt.cos_x * tilt.cos_y).abs()
+    return chained, depth / size

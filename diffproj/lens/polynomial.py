@@ -1,0 +1,22 @@
+"""Polynomials by Horner's rule."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+def polynomial(x: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
+    """`c0 + c1 x + c2 x^2 + ...` for coefficients that broadcast against `x`; `c0` as it is if there is no other."""
+    total = coefficients[-1]
+    for coefficient in reversed(coefficients[:-1]):
+        total = torch.addcmul(coefficient, total, x)
+    return total
+
+
+def series(x: Tensor, coefficients: Sequence[float]) -> Tensor:
+    """The same for coefficients that are numbers."""
+    total = x * coefficients[-1] + coefficients[-2]
+    for coefficient in reversed(coefficients[:-2]):
+        total = total * x + coefficient
+    return total

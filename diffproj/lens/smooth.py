@@ -1,0 +1,36 @@
+"""Functions that are smooth at 0 although their formulas divide by 0 or take a root there, exact in all derivatives.
+
+Each is a power series close to 0 and the formula elsewhere; the argument of either is replaced where the other one
+answers, so that no gradient passes through a division by 0.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from diffproj.lens.polynomial import series
+
+NEAR_ZERO = 0.02
+"""Up to here eleven terms of the series of the arc tangent are right to 1e-19, and seven are enough for the others."""
+ARC_TANGENT = [(-1) ** n / (2 * n + 1) for n in range(11)]
+SINE = [(-1) ** n / math.factorial(2 * n + 1) for n in range(7)]
+COSINE = [(-1) ** n / math.factorial(2 * n) for n in range(7)]
+
+
+def angle_over_side(side_squared: Tensor, z: Tensor) -> Tensor:
+    """`atan2(side, z) / side` for a side that may be 0 where `z` is positive."""
+    near = (z > 0) & (side_squared < NEAR_ZERO * z * z)
+    side = torch.where(near, 1, side_squared).sqrt()
+    z_near = torch.where(near, z, 1)
+    small = series(torch.where(near, side_squared, 0) / (z_near * z_near), ARC_TANGENT) / z_near
+    return torch.where(near, small, torch.atan2(side, z) / side)
+
+
+def sine_over_angle_and_cosine(angle_squared: Tensor) -> tuple[Tensor, Tensor]:
+    """`sin(a) / a` and `cos(a)` as functions of `a^2`."""
+    near = angle_squared < NEAR_ZERO
+    angle = torch.where(near, 1, angle_squared).sqrt()
+    small = torch.where(near, angle_squared, 0)
+    sine_over_angle = torch.where(near, series(small, SINE), angle.sin() / angle)
+    return sine_over_angle, torch.where(near, series(small, COSINE), angle.cos())

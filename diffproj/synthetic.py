@@ -1,0 +1,209 @@
+"""Board photographs and corner sets with known truth: the paper's set-up, rendered through the package's own kernel.
+
+A photograph is rendered by asking the question that back-projection answers: each sample of the pixel grid goes to the
+board's plane, where the chessboard says whether it is black or white. Averaging samples gives anti-aliased edges; a
+Gaussian blur stands for the optics and Gaussian noise for the sensor.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, UInt8
+from kornia.filters import gaussian_blur2d
+from kornia.geometry.grid import create_meshgrid
+from torch import Tensor
+
+from diffproj.back_projection import PlaneMap
+from diffproj.board import Chessboard, Views
+from diffproj.camera import Camera
+from diffproj.lens import Lens
+from diffproj.plane import Plane
+from diffproj.rotation import rotation_from_euler
+
+TEST_VIEWS = ("a", "b", "c", "d", "e")
+"""The paper's test views: from above at three distances, tilted by 45 degrees about x, and about y."""
+
+BLACK, WHITE, TABLE = 0.12, 0.88, 0.55
+"""Grey values of the print, the paper and the table that the board lies on, in 0..1."""
+
+# psi, phi, theta in degrees, then the board centre's place in the camera: right, down, forward in millimetres.
+_FIT_POSES = (
+    (0, 0, 3, 0, 0, 380),
+    (30, 0, 5, 20, -10, 400),
+    (-30, 0, -5, -20, 10, 400),
+    (0, 30, 10, 15, 10, 400),
+    (0, -30, -10, -15, -10, 400),
+    (25, 25, 20, 60, 35, 480),
+    (-25, 25, -20, -60, 35, 480),
+    (25, -25, 15, -60, -35, 480),
+    (-25, -25, -15, 60, -35, 480),
+    (35, 10, 90, 0, 0, 520),
+)
+_TEST_POSES = (
+    (0, 0, 5, 0, 0, 400),
+    (0, 0, 5, 0, 0, 600),
+    (0, 0, 5, 0, 0, 800),
+    (45, 0, 5, 0, 0, 500),
+    (0, 45, 5, 0, 0, 500),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PaperSetup:
+    """The paper's experiment with known truth, in millimetres.
+
+    Attributes:
+        board: 9 x 6 inner corners, 25 mm squares, in the paper's frame (z towards the camera).
+        fit: the camera at the ten fitting views, batch shape `(10,)`.
+        test: the camera at the test views a to e, batch shape `(5,)`.
+    """
+
+    board: Chessboard
+    fit: Camera
+    test: Camera
+
+    @property
+    def cameras(self) -> Camera:
+        """All fifteen views: the fitting views first."""
+        return self.fit[0].at(torch.cat([self.fit.R, self.test.R]), torch.cat([self.fit.t, self.test.t]))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The views' names: fit 1 to fit 10, then a to e."""
+        return (*(f"fit {i + 1}" for i in range(len(_FIT_POSES))), *TEST_VIEWS)
+
+
+def paper_setup(distortion: Lens | None = None) -> PaperSetup:
+    """The paper's kind of set-up: a 640 x 480 web camera, ten fitting views and the test views a to e.
+
+    Args:
+        distortion: the camera's lens in float64; a pinhole if left out, as the paper assumes.
+
+    Example:
+        >>> paper_setup().test
+        Camera(batch_shape=(5,), pinhole, size=(640, 480), torch.float64, cpu)
+    """
+    board = Chessboard(columns=9, rows=6, square=25.0, axes="paper")
+    K = torch.tensor([[700.0, 0, 322], [0, 702, 238], [0, 0, 1]], dtype=torch.float64)
+    camera = Camera(K, distortion=distortion, size=(640, 480))
+    return PaperSetup(board, _at_poses(camera, board, _FIT_POSES), _at_poses(camera, board, _TEST_POSES))
+
+
+def photograph(
+    camera: Camera,
+    board: Chessboard,
+    *,
+    blur_px: float = 0.7,
+    noise: float = 4 / 255,
+    samples: int = 12,
+    seed: int = 0,
+) -> UInt8[Tensor, "*batch h w"]:
+    """Render grey photographs of a board that lies on z = 0.
+
+    Args:
+        camera: a camera of known size, of any batch shape `*B`.
+        board: the board; one square of white paper surrounds the printed squares.
+        blur_px: standard deviation of the optics' Gaussian blur in pixels; 0 for none.
+        noise: standard deviation of the sensor's noise, in units of the full range.
+        samples: samples a pixel, whose mean it is.
+        seed: of the noise.
+
+    Returns:
+        Images `(*B, H, W)`.
+
+    Raises:
+        ValueError: the camera has no size, or an argument is out of its range.
+
+    Example:
+        >>> setup = paper_setup()
+        >>> photograph(setup.test[0], setup.board).shape
+        torch.Size([480, 640])
+    """
+    if camera.size is None:
+        raise ValueError("camera: want a size, got None; give Camera(..., size=(width, height))")
+    if blur_px < 0 or noise < 0 or samples < 1:
+        raise ValueError(
+            f"photograph: want blur_px >= 0, noise >= 0 and samples >= 1, got {blur_px}, {noise} and {samples}"
+        )
+    generator = torch.Generator().manual_seed(seed)
+    cameras = [camera] if not camera.batch_shape else [camera[i] for i in _indices(camera.batch_shape)]
+    images = []
+    for single in cameras:
+        image = _render(single.detach().to("cpu"), board, samples)
+        if blur_px > 0:
+            kernel = 2 * round(4 * blur_px) + 1
+            image = gaussian_blur2d(image[None, None], (kernel, kernel), (blur_px, blur_px))[0, 0]
+        image = image + noise * torch.randn(image.shape, generator=generator, dtype=image.dtype)
+        images.append((image.clamp(0, 1) * 255).round().to(torch.uint8))
+    return torch.stack(images).reshape(*camera.batch_shape, *images[0].shape)
+
+
+def corner_views(camera: Camera, board: Chessboard, *, noise_px: float = 0.2, seed: int = 0) -> Views:
+    """The board's corners as cameras of batch shape `(*B, V)` would see them, with Gaussian noise on each coordinate.
+
+    Args:
+        camera: the true cameras.
+        board: the board.
+        noise_px: standard deviation of the noise in pixels.
+        seed: of the noise.
+
+    Returns:
+        Views `(*B, V, N, 2)`; corners outside the image, or that the camera cannot see, are marked as not visible.
+
+    Raises:
+        ValueError: the camera has no axis of views.
+
+    Example:
+        >>> setup = paper_setup()
+        >>> corner_views(setup.fit, setup.board).pixels.shape
+        torch.Size([10, 54, 2])
+    """
+    if not camera.batch_shape:
+        raise ValueError("camera: want a batch of views (V,), got a single camera; camera.at(R, t) makes one")
+    pixels, visible = camera.project(board.points.to(camera.dtype))
+    generator = torch.Generator().manual_seed(seed)
+    pixels = pixels + noise_px * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
+    if camera.size is not None:
+        last = torch.tensor(camera.size, dtype=pixels.dtype) - 0.5
+        visible = visible & ((pixels >= -0.5) & (pixels <= last)).all(dim=-1)
+    return Views(pixels, visible, size=camera.size)
+
+
+def _at_poses(camera: Camera, board: Chessboard, poses: tuple[tuple[float, ...], ...]) -> Camera:
+    """The camera with the board's centre at a place in its frame, the board turned by Euler angles about it."""
+    table = torch.tensor(poses, dtype=camera.dtype)
+    psi, phi, theta = table[:, :3].deg2rad().unbind(-1)
+    # Straight from above the paper's x points down in the image, its y to the right and its z towards the camera.
+    from_above = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=camera.dtype)
+    R = from_above @ rotation_from_euler(psi, phi, theta)
+    center = board.points.to(camera.dtype).mean(dim=0)
+    return camera.at(R, table[:, 3:] - R @ center)
+
+
+def _render(camera: Camera, board: Chessboard, samples: int) -> Float[Tensor, "h w"]:
+    """The noiseless image of one camera: each pixel the mean of samples spread over its square."""
+    width, height = camera.size or (0, 0)
+    grid = create_meshgrid(height, width, normalized_coordinates=False).reshape(-1, 2)
+    to_board = PlaneMap(camera.to(torch.float32), Plane.z(0.0))  # right to 1e-6 of the scene: a thousandth of a pixel
+    # Samples lie on a lattice where no two share a row or column: a grid of 5 x 5 would place an upright edge no better
+    # than to a fifth of a pixel.
+    lattice = torch.arange(samples, dtype=torch.float64).unsqueeze(-1) * torch.tensor([0.754877666, 0.569840291]) % 1
+    image = torch.zeros(height * width)
+    for offset in (lattice - lattice.mean(dim=0)).to(grid):
+        points, valid = to_board(grid + offset)
+        image += torch.where(valid, _grey(points, board), TABLE)
+    return (image / samples).reshape(height, width)
+
+
+def _grey(points: Float[Tensor, "n 3"], board: Chessboard) -> Float[Tensor, " n"]:
+    """What the board shows at points of its plane; the square beyond the first inner corner is black."""
+    along = points[..., :2] / board.square
+    row, column = along.unbind(-1) if board.axes == "paper" else along.flip(-1).unbind(-1)
+    black = (row.floor() + column.floor()) % 2 == 0
+    printed = (row > -1) & (row < board.rows) & (column > -1) & (column < board.columns)
+    paper = (row > -2) & (row < board.rows + 1) & (column > -2) & (column < board.columns + 1)
+    return torch.where(paper, torch.where(printed & black, BLACK, WHITE), TABLE)
+
+
+def _indices(shape: torch.Size) -> list[tuple[int, ...]]:
+    return [tuple(index) for index in torch.cartesian_prod(*map(torch.arange, shape)).reshape(-1, len(shape)).tolist()]

@@ -1,0 +1,93 @@
+"""`Plane`: the sign of its offset, fits and their derivatives, Python numbers, and what is refused."""
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffproj as dp
+
+D = torch.float64
+
+
+def test_convention_by_hand() -> None:
+    plane = dp.Plane([0.0, 3.0, 4.0], 10.0)  # 3 y + 4 z = 10; its normal has length 5
+    points = torch.tensor([[7.0, 2, 1], [0, 0, 0]], dtype=D)
+    assert plane.distance(points).tolist() == [0.0, -2.0]
+    assert plane.parallel(2.0).offset.item() == 20.0
+    assert plane.unit_normal.tolist() == [0.0, 0.6, 0.8]
+
+
+def test_numbers_take_on_the_dtype_they_meet(camera: dp.Camera) -> None:
+    plane = dp.Plane.z(1.0)
+    single = camera.to(torch.float32)
+    points, _ = dp.back_project(torch.zeros(1, 2), single, plane.parallel(2.0))
+    assert points.dtype == torch.float32
+    assert abs(points[0, 2].item() - 3) < 1e-4
+    assert not dp.Plane.z(torch.tensor(1.0)).adopts
+    assert not plane.parallel(torch.tensor(1.0, dtype=D)).adopts
+
+
+def test_from_points_finds_the_plane_whatever_its_attitude() -> None:
+    normal = torch.nn.functional.normalize(torch.randn(100, 3, dtype=D), dim=-1)
+    offset = torch.randn(100, dtype=D) * 100
+    in_plane = torch.randn(100, 20, 3, dtype=D) * 50
+    points = in_plane - ((in_plane * normal[:, None]).sum(-1) - offset[:, None])[..., None] * normal[:, None]
+    plane = dp.Plane.from_points(points)
+    assert plane.distance(points).abs().max() < 1e-12 * 1e3
+    largest = plane.normal.abs().argmax(dim=-1, keepdim=True)
+    assert (plane.normal.gather(-1, largest) > 0).all()
+
+
+def test_from_points_is_the_least_squares_plane() -> None:
+    points = torch.randn(30, 3, dtype=D) * torch.tensor([10.0, 10, 0.5], dtype=D)
+    plane = dp.Plane.from_points(points)
+    smallest = torch.linalg.svdvals(points - points.mean(dim=0))[-1]
+    torch.testing.assert_close(plane.rms(points), smallest / 30**0.5)
+
+
+def test_derivatives_are_finite_on_a_square_grid() -> None:
+    x, y = torch.meshgrid(torch.arange(3.0, dtype=D), torch.arange(3.0, dtype=D), indexing="ij")
+    grid = torch.stack([x.flatten(), y.flatten(), 0.01 * torch.randn(9, dtype=D)], dim=-1).requires_grad_()
+
+    def fit(points: Tensor) -> tuple[Tensor, Tensor]:
+        plane = dp.Plane.from_points(points)
+        return plane.normal, plane.offset
+
+    assert torch.autograd.gradcheck(fit, grid, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(fit, grid)
+
+
+def test_indexing_and_moving() -> None:
+    planes = dp.Plane(torch.randn(4, 1, 3), torch.randn(5))
+    assert planes.batch_shape == (4, 5)
+    assert planes[1].batch_shape == (5,)
+    assert planes[..., 2].batch_shape == (4,)
+    assert planes.to(D).dtype == D
+    assert planes.detach().device.type == "cpu"
+    assert "batch_shape=(4, 5)" in repr(planes)
+    per_point = dp.Plane.per_point([0.0, 0.0, 1.0], torch.arange(3.0))
+    assert per_point.distance(torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 1]])).tolist() == [1.0, 0.0, -1.0]
+    with pytest.raises(IndexError, match="planes per point"):
+        per_point[0]
+
+
+@pytest.mark.plain
+def test_bad_planes_are_refused_by_name() -> None:
+    up = torch.tensor([0.0, 0, 1])
+    cases = [
+        (ValueError, "normal: want a vector other than zero", lambda: dp.Plane(0 * up, 1.0)),
+        (ValueError, "plane: want a finite normal and offset", lambda: dp.Plane(up, float("inf"))),
+        (TypeError, "normal: want a floating-point tensor", lambda: dp.Plane(up.int(), 1.0)),
+        (TypeError, "offset: want torch.float32 as normal has", lambda: dp.Plane(up, torch.tensor(1.0, dtype=D))),
+        (ValueError, r"normal: want shape \(\*B, 3\), got \(2,\)", lambda: dp.Plane(up[:2], 1.0)),
+        (TypeError, "normal: want a tensor or numbers, got str", lambda: dp.Plane("up", 1.0)),
+        (ValueError, "batch shapes do not broadcast", lambda: dp.Plane(up.expand(2, 3), torch.zeros(3))),
+        (ValueError, "per_point: want", lambda: dp.Plane.per_point(up, 1.0)),
+        (ValueError, "points: want at least 3, got 2", lambda: dp.Plane.from_points(torch.rand(2, 3))),
+        (ValueError, "points: want three that are not on one line", lambda: dp.Plane.from_points(torch.arange(5.0)[:, None] * up)),
+        (ValueError, "points: want finite", lambda: dp.Plane.from_points(torch.full((4, 3), float("nan")))),
+        (TypeError, "plane: want a dp.Plane, got Tensor", lambda: dp.PlaneMap(dp.Camera(torch.eye(3)), up)),
+    ]
+    for kind, message, call in cases:
+        with pytest.raises(kind, match=message):
+            call()
