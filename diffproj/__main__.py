@@ -8,9 +8,10 @@ def main() -> int:
     try:
         from diffproj.cli import main as run
     except ModuleNotFoundError as error:
-        if error.name not in ("matplotlib", "rich"):
+        missing = (error.name or "").partition(".")[0]
+        if missing not in ("matplotlib", "rich"):
             raise
-        print(f"diffproj: the command line needs {error.name}; pip install 'diffproj[cli]'", file=sys.stderr)
+        print(f"diffproj: the command line needs {missing}; pip install 'diffproj[cli]'", file=sys.stderr)
         return 1
     return run()
 

@@ -5,6 +5,7 @@ held. Both minimise the reprojection error in pixels with OpenCV's solvers and r
 are computed by this package's own projection, so that they cross-check the solver.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal, Protocol, get_args, runtime_checkable
 
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from diffproj.board import Views
@@ -134,22 +136,24 @@ def calibrate(views: Views, board: PlanarTarget, distortion: LensModel = "brown5
         for pixels, seen in zip(views.pixels.cpu(), views.visible.cpu(), strict=True)
     ]
     try:
-        _, K, dist, rvecs, tvecs, deviations, _, _ = cv2.calibrateCameraExtended(
+        _, K, dist, rvecs, tvecs = cv2.calibrateCamera(
             object_points, image_points, views.size, None, None, flags=_HELD[distortion], criteria=_STOP
         )
     except cv2.error as error:
         raise CalibrationError(f"calibrate: the solver failed on these views ({error.err})") from error
-    # The first four deviations are those of f_x, f_y, c_x, c_y.
-    worst = deviations.ravel()[:4] / K[0, 0]
-    if not (np.isfinite(K).all() and np.isfinite(worst).all() and worst.max() < WORST_DEVIATION):
+    coefficients = dist.ravel()[: _COEFFICIENTS[distortion]]
+    try:
+        cameras = Camera.from_opencv(K, coefficients, np.array(rvecs), np.array(tvecs), views.size)
+        calibration = Calibration(cameras[0].without_pose(), cameras, views.to(torch.float64), points)
+        worst = float(_deviations(calibration).amax() / calibration.camera.K[0, 0])
+    except ValueError:  # the solver ended at numbers that are no camera
+        worst = math.inf
+    if not worst < WORST_DEVIATION:
         raise CalibrationError(
             "calibrate: these views do not determine focal length and principal point; "
             "add photographs with the board tilted by 20 to 50 degrees about both axes"
         )
-    coefficients = dist.ravel()[: _COEFFICIENTS[distortion]]
-    cameras = Camera.from_opencv(K, coefficients, np.array(rvecs), np.array(tvecs), views.size)
-    camera = Camera.from_opencv(K, coefficients, size=views.size)
-    return Calibration(camera, cameras, views.to(torch.float64), points)
+    return calibration
 
 
 def locate(views: Views, board: PlanarTarget, camera: Camera) -> Calibration:
@@ -189,6 +193,41 @@ def locate(views: Views, board: PlanarTarget, camera: Camera) -> Calibration:
     ]
     R, t = (torch.from_numpy(np.stack(parts)) for parts in zip(*poses, strict=True))
     return Calibration(camera, camera.at(R, t), views.to(torch.float64), points)
+
+
+def _deviations(calibration: Calibration) -> Float[Tensor, "4"]:
+    """Standard deviations of f_x, f_y, c_x, c_y in pixels, infinite where the views do not determine them.
+
+    From the Gauss-Newton normal equations at the residuals' own level, with lens and poses free: with A the Jacobian
+    of a view's pixels to the shared parameters and B that to its pose, the poses drop out of the equations by
+
+        S = sum over views of A^T A - A^T B (B^T B)^-1 B^T A,    covariance = sigma^2 S^-1.
+    """
+    cameras, views = calibration.cameras, calibration.views
+    lens = cameras.distortion
+    coefficients = lens.coefficients if isinstance(lens, BrownConrady) else cameras.t[:, :0]
+    F, c = cameras.K.diagonal(dim1=-2, dim2=-1)[:, :2], cameras.K[:, :2, 2]
+    shared = torch.cat([F, c, coefficients], dim=-1)
+    count = shared.shape[-1]
+
+    def project(parameters: Tensor, R: Tensor, t: Tensor) -> Tensor:
+        (f_x, f_y, c_x, c_y), turn, shift = parameters[:4].unbind(), parameters[count : count + 3], parameters[-3:]
+        zero, one = torch.zeros_like(f_x), torch.ones_like(f_x)
+        K = torch.stack([f_x, zero, c_x, zero, f_y, c_y, zero, zero, one]).reshape(3, 3)
+        lens = BrownConrady(parameters[4:count]) if count > 4 else None
+        return Camera(K, axis_angle_to_rotation_matrix(turn) @ R, t + shift, lens).project(calibration.points)[0]
+
+    parameters = torch.nn.functional.pad(shared, (0, 6))
+    J = torch.func.vmap(torch.func.jacfwd(project))(parameters, cameras.R, cameras.t) * views.visible[..., None, None]
+    A, B = J.flatten(1, 2).split([count, 6], dim=-1)
+    S = (A.mT @ A - A.mT @ B @ torch.linalg.solve(B.mT @ B, B.mT @ A)).sum(dim=0)
+    # The parameters' units differ by orders of magnitude; what is singular shows after scaling.
+    scale = S.diagonal().clamp(min=torch.finfo(S.dtype).tiny).rsqrt()
+    values, vectors = torch.linalg.eigh(scale[:, None] * S * scale)
+    if float(values[0]) <= 1e-12:
+        return torch.full((4,), torch.inf, dtype=S.dtype)
+    variance = calibration.rms**2 / 2 * (vectors.square() / values).sum(dim=-1) * scale.square()
+    return variance[:4].sqrt()
 
 
 def _pose(

@@ -93,7 +93,7 @@ class Camera:
         K = check_tensor("K", K, 3, 3)
         R = torch.eye(3, dtype=K.dtype, device=K.device) if R is None else check_tensor("R", R, 3, 3)
         t = torch.zeros(3, dtype=K.dtype, device=K.device) if t is None else check_tensor("t", t, 3)
-        if distortion is not None and not isinstance(distortion, Lens):
+        if distortion is not None and not hasattr(distortion, "unproject"):  # dynamo knows no protocols
             raise TypeError(
                 f"distortion: want a lens such as dp.BrownConrady(coefficients), got {type(distortion).__name__}"
             )

@@ -107,7 +107,7 @@ def load_calibration(path: PathLike) -> Calibration:
         found = document["calibration"]
         R, t, points, pixels = (_tensor(found[key], torch.float64) for key in ("R", "t", "points", "pixels"))
         visible = torch.tensor(found["visible"], dtype=torch.bool)
-        views = Views(pixels, visible, found["names"], found["size"])
+        views = Views(pixels, visible, found["names"], _size(found["size"]))
         return Calibration(camera, camera.at(R, t), views, points)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
@@ -175,9 +175,13 @@ def _camera_from_json(path: Path, fields: dict[str, Any]) -> Camera:
         K, R, t = (_tensor(fields[key], dtype) for key in ("K", "R", "t"))
         lens = fields["lens"]
         distortion = lens and _LENSES[lens["model"]](_tensor(lens["coefficients"], dtype))
-        return Camera(K, R, t, distortion, fields["size"])
+        return Camera(K, R, t, distortion, _size(fields["size"]))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: the camera in this file is damaged ({error})") from error
+
+
+def _size(size: list[int] | None) -> tuple[int, int] | None:
+    return None if size is None else (size[0], size[1])
 
 
 def _tensor(numbers: Any, dtype: torch.dtype) -> Tensor:

@@ -392,6 +392,7 @@ def test_halves_are_lifted() -> None:
     assert lens.undistort(torch.zeros(3, 2, dtype=torch.bfloat16))[0].dtype == torch.float32
 
 
+@pytest.mark.plain
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [

@@ -23,6 +23,7 @@ LENSES: dict[str, tuple[Kind, list[float]]] = {
     ),
     "fisheye": (KannalaBrandt, [-0.02, 0.005, -0.001, 0.0001]),
 }
+SLOW_WITH_MANY = [name if name != "brown14" else pytest.param(name, marks=pytest.mark.slow) for name in LENSES]
 CENTRE = [[0.0, 0.0], [1e-12, 0.0], [0.0, -1e-12], [1e-12, 1e-12]]
 INVALID = [[5000.0, 4000.0], [math.nan, 0.1], [0.1, math.inf], [-3000.0, 0.0]]
 
@@ -60,7 +61,7 @@ def forward(kind: Kind) -> Callable[[Tensor, Tensor], Tensor]:
     return lambda direction, coefficients: kind(coefficients).project_direction(direction)[0]
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("name", SLOW_WITH_MANY)
 def test_inverse_and_forward_to_second_order(name: str) -> None:
     kind, coefficients, _ = lens_of(name)
     for function, points in ((inverse(kind), distorted(name)), (forward(kind), undistorted(name))):
@@ -89,7 +90,7 @@ def test_at_the_centre_among_invalid_points(name: str) -> None:
         assert second.isfinite().all()
 
 
-@pytest.mark.parametrize("name", ["brown5", "brown14", "fisheye"])
+@pytest.mark.parametrize("name", SLOW_WITH_MANY)
 def test_centre_against_finite_differences(name: str) -> None:
     """Exactly 0 and 1e-12 from it."""
     kind, coefficients, _ = lens_of(name)
@@ -99,7 +100,7 @@ def test_centre_against_finite_differences(name: str) -> None:
     assert gradgradcheck(inverse(kind), arguments, eps=1e-5, atol=1e-4, check_fwd_over_rev=True, fast_mode=True)
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("name", SLOW_WITH_MANY)
 def test_forward_at_the_centre_and_among_invalid_directions(name: str) -> None:
     kind, coefficients, _ = lens_of(name)
     bad = [[0, 0, -1], [0, 0, 0], [math.nan, 0, 1], [0, math.inf, 1]]

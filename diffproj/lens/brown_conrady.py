@@ -14,11 +14,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj import _pytree
-from diffproj._numerics import in_blocks, wants_derivative
+from diffproj._numerics import in_blocks
 from diffproj.lens import brown_domain
 from diffproj.lens.brown_equations import COUNTS, Terms, bend, radial
 from diffproj.lens.brown_inverse import newton, search, squared_domain, untilted
 from diffproj.lens.coefficients import CoefficientLens
+from diffproj.lens.compiling import derivative_wanted
 from diffproj.lens.plan import Plan
 from diffproj.lens.table import inverse_table
 
@@ -105,7 +106,7 @@ class BrownConrady(CoefficientLens):
             coefficients = self._usable(plan)
             x, y, valid = search(coefficients.detach(), plan, points.detach())
             x, y = torch.where(valid, x, 0), torch.where(valid, y, 0)
-            if wants_derivative(points, coefficients):
+            if derivative_wanted(points, coefficients):
                 terms = Terms.of(coefficients)
                 target = untilted(terms, torch.where(valid.unsqueeze(-1), points, 0))
                 x, y = newton(terms, target, x, y, steps=2)

@@ -6,6 +6,7 @@ from torch.utils._pytree import tree_map_only
 
 from diffproj._numerics import readable
 from diffproj.lens.brown_equations import Terms, bend, newton_direction
+from diffproj.lens.compiling import coordinates
 from diffproj.lens.plan import Plan
 from diffproj.lens.table import InverseTable
 
@@ -15,11 +16,12 @@ STEPS = {torch.float32: 3, torch.float64: 4}
 """Newton steps from the table's start to rounding, but for points next to a fold."""
 PATIENCE = 120
 """Steps for those: near a fold each of them only halves the distance to the solution."""
+BLIND_STEPS = 2
+"""More steps for all, where it cannot be seen whether there are any."""
 TOLERANCE = 2
 """How many roundings of the equations a solution may be off by."""
-
 LENIENCE = 8
-"""The patient search, which has done what can be done, is allowed this many times as much."""
+"""Where no one looks again, this many times as much is allowed."""
 ROUNDING = {dtype: (4 * torch.finfo(dtype).eps) ** 2 for dtype in STEPS}
 """The squared relative size of a step that rounding alone explains, where next to a pole no tolerance would do."""
 
@@ -56,7 +58,7 @@ def search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, Te
         `x`, `y` and whether they are the solution inside the domain; anything where they are not.
     """
     terms = Terms.of(coefficients)
-    x, y = points.unbind(-1)
+    x, y = coordinates(points)
     possible = None
     if terms.tilt is not None:
         x, y, inverse_depth = terms.tilt.undo(x, y)
@@ -65,12 +67,13 @@ def search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, Te
     rho_squared = torch.addcmul(x * x, y, y)
     ratio = InverseTable(plan.rho_max, plan.ratio).ratio_at(x, y, rho_squared.sqrt())
     look_again = readable(points, coefficients)
-    steps = STEPS[x.dtype] if look_again or torch.compiler.is_compiling() else 2 * STEPS[x.dtype]
+    steps = STEPS[x.dtype] + (0 if look_again else BLIND_STEPS)
     x, y = newton(terms, target, x * ratio, y * ratio, steps=steps)
     limit = (plan.reach * plan.reach).clamp_max(torch.finfo(x.dtype).max).unsqueeze(-1)
     possible = rho_squared <= limit if possible is None else possible & (rho_squared <= limit)
     domain_squared = squared_domain(plan)
-    tolerance_squared = (TOLERANCE * torch.finfo(x.dtype).eps * plan.noise).square().unsqueeze(-1) * rho_squared
+    tolerance = (TOLERANCE if look_again else LENIENCE * TOLERANCE) * torch.finfo(x.dtype).eps * plan.noise
+    tolerance_squared = tolerance.square().unsqueeze(-1) * rho_squared
     solved = _solves(terms, target, x, y, domain_squared, tolerance_squared) & possible
     if not look_again:
         return x, y, solved

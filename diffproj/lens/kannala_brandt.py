@@ -21,8 +21,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj import _pytree
-from diffproj._numerics import in_blocks, readable, wants_derivative
+from diffproj._numerics import in_blocks, readable
 from diffproj.lens.coefficients import CoefficientLens
+from diffproj.lens.compiling import coordinates, derivative_wanted
 from diffproj.lens.domain import first_failure
 from diffproj.lens.plan import Plan
 from diffproj.lens.polynomial import polynomial
@@ -119,7 +120,7 @@ class KannalaBrandt(CoefficientLens):
             sigma, valid = _search([column.detach() for column in k], plan, points.detach())
             x, y = torch.where(valid.unsqueeze(-1), points, 0).unbind(-1)
             rho_squared = x * x + y * y
-            if wants_derivative(points, self.coefficients):
+            if derivative_wanted(points, self.coefficients):
                 sigma = _newton(k, rho_squared, _newton(k, rho_squared, sigma))
             sine_over_angle, cosine = sine_over_angle_and_cosine(sigma * sigma * rho_squared)
             scale = sigma * sine_over_angle
@@ -188,7 +189,7 @@ def _newton(k: list[Tensor], rho_squared: Tensor, sigma: Tensor) -> Tensor:
 @torch.no_grad()
 def _search(k: list[Tensor], plan: Plan, points: Tensor) -> tuple[Tensor, Tensor]:
     """`sigma` without a tape, 1 where there is none in the domain; and whether there is one."""
-    x, y = points.unbind(-1)
+    x, y = coordinates(points)
     rho = torch.hypot(x, y)
     possible = (rho <= plan.reach.unsqueeze(-1)) & (plan.domain > 0).unsqueeze(-1)
     rho = torch.where(possible, rho, 0)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffproj._numerics import precise
 from diffproj.lens.table import NODES
 
 
@@ -53,9 +54,11 @@ def plan_of(name: str, coefficients: Tensor) -> Plan:
 
 
 def _rounded(name: str, coefficients: Tensor) -> Plan:
-    plan = _models[name](coefficients.double())
+    plan = _models[name](precise(coefficients))
     domain, *others = (part.to(coefficients.dtype) for part in plan)
-    domain = torch.where(domain.double() > plan.domain, torch.nextafter(domain, torch.zeros_like(domain)), domain)
+    domain = torch.where(
+        domain.to(plan.domain.dtype) > plan.domain, torch.nextafter(domain, torch.zeros_like(domain)), domain
+    )
     overflows = coefficients.abs().amax(-1) > torch.finfo(coefficients.dtype).max / 1e4
     return Plan(torch.where(overflows, 0, domain), *others)
 
