@@ -106,7 +106,7 @@ def readable(*tensors: Tensor) -> bool:
 
 
 def _transforming() -> bool:
-    return torch._C._functorch.peek_interpreter_stack() is not None
+    return torch._C._functorch.peek_interpreter_stack() is not None  # type: ignore[attr-defined]
 
 
 def index_batch(tensor: Tensor, index: Any, trailing: int) -> Tensor:
@@ -136,10 +136,13 @@ def linear(rows: Sequence[Sequence[Tensor]], components: Sequence[Tensor | None]
     Returns:
         `m` tensors `(*B, N)`: the components of the products.
     """
+    first, *others = components
+    if first is None:
+        raise ValueError("components: want a tensor in the first place, got None")
     products = []
     for row in rows:
-        product = components[0] * row[0]
-        for entry, component in zip(row[1:], components[1:], strict=True):
+        product = first * row[0]
+        for entry, component in zip(row[1:], others, strict=True):
             product = product + entry if component is None else torch.addcmul(product, component, entry)
         products.append(product)
     return products

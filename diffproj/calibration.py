@@ -5,7 +5,6 @@ held. Both minimise the reprojection error in pixels with OpenCV's solvers and r
 are computed by this package's own projection, so that they cross-check the solver.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Literal, Protocol, get_args, runtime_checkable
 
@@ -91,9 +90,11 @@ class Calibration:
             f"principal point  {K[0, 2]:10.3f} {K[1, 2]:10.3f} px",
         ]
         if isinstance(self.camera.distortion, BrownConrady):
-            names = "k1 k2 p1 p2 k3".split()
+            names = ["k1", "k2", "p1", "p2", "k3"]
             coefficients = self.camera.distortion.coefficients.tolist()
-            lines.append("lens             " + "  ".join(f"{n} {c:.5f}" for n, c in zip(names, coefficients, strict=False)))
+            lines.append(
+                "lens             " + "  ".join(f"{n} {c:.5f}" for n, c in zip(names, coefficients, strict=False))
+            )
         lines.append(f"RMS              {self.rms:10.4f} px over {int(self.views.visible.sum())} corners")
         width = max(map(len, self.views.names))
         per_view = zip(self.views.names, self.view_rms.tolist(), strict=True)
@@ -145,15 +146,14 @@ def calibrate(views: Views, board: PlanarTarget, distortion: LensModel = "brown5
     try:
         cameras = Camera.from_opencv(K, coefficients, np.array(rvecs), np.array(tvecs), views.size)
         calibration = Calibration(cameras[0].without_pose(), cameras, views.to(torch.float64), points)
-        worst = float(_deviations(calibration).amax() / calibration.camera.K[0, 0])
+        if float(_deviations(calibration).amax() / calibration.camera.K[0, 0]) < WORST_DEVIATION:
+            return calibration
     except ValueError:  # the solver ended at numbers that are no camera
-        worst = math.inf
-    if not worst < WORST_DEVIATION:
-        raise CalibrationError(
-            "calibrate: these views do not determine focal length and principal point; "
-            "add photographs with the board tilted by 20 to 50 degrees about both axes"
-        )
-    return calibration
+        pass
+    raise CalibrationError(
+        "calibrate: these views do not determine focal length and principal point; "
+        "add photographs with the board tilted by 20 to 50 degrees about both axes"
+    )
 
 
 def locate(views: Views, board: PlanarTarget, camera: Camera) -> Calibration:
@@ -272,5 +272,7 @@ def _checked_points(views: Views, board: PlanarTarget) -> Float[Tensor, "n 3"]:
         raise ValueError("board: want all points on z = 0")
     few = [name for name, count in zip(views.names, views.visible.sum(dim=-1).tolist(), strict=True) if count < 4]
     if few:
-        raise ValueError(f"views: want at least 4 visible corners in each, got fewer in {', '.join(few)}; leave them out")
+        raise ValueError(
+            f"views: want at least 4 visible corners in each, got fewer in {', '.join(few)}; leave them out"
+        )
     return points

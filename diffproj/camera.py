@@ -102,9 +102,7 @@ class Camera:
             _check_pose(R, t)
         self._assign(K, R, t, distortion, _checked_size(size))
 
-    def _assign(
-        self, K: Tensor, R: Tensor, t: Tensor, distortion: Lens | None, size: tuple[int, int] | None
-    ) -> None:
+    def _assign(self, K: Tensor, R: Tensor, t: Tensor, distortion: Lens | None, size: tuple[int, int] | None) -> None:
         check_same_kind(K=K, R=R, t=t, distortion=distortion)
         shapes = {"K": K.shape[:-2], "R": R.shape[:-2], "t": t.shape[:-1]}
         if distortion is not None:
@@ -114,8 +112,9 @@ class Camera:
         self.R = R.expand(*batch, 3, 3)
         self.t = t.expand(*batch, 3)
         # A lens that fits already stays the same object, with whatever it has computed about itself.
-        fits = distortion is None or distortion.batch_shape == batch
-        self.distortion = distortion if fits else distortion.expand(*batch)
+        if distortion is not None and distortion.batch_shape != batch:
+            distortion = distortion.expand(*batch)
+        self.distortion = distortion
         self.size = size
 
     @classmethod
@@ -203,7 +202,9 @@ class Camera:
             ValueError: the camera does not know its own size.
         """
         if self.size is None:
-            raise ValueError("resized: want a camera with a size, got size=None; give Camera(..., size=(width, height))")
+            raise ValueError(
+                "resized: want a camera with a size, got size=None; give Camera(..., size=(width, height))"
+            )
         width, height = _checked_size(size) or (0, 0)
         scale = (width / self.size[0], height / self.size[1])
         factors = self.K.new_tensor([[scale[0]], [scale[1]], [1.0]])
@@ -268,7 +269,9 @@ class Camera:
         """
         pixels = self._checked("pixels", pixels, 2)
         finite = pixels.isfinite().all(dim=-1)
-        offset = [torch.where(finite, x - c.unsqueeze(-1), 0.0) for x, c in zip(pixels.unbind(-1), self._c(), strict=True)]
+        offset = [
+            torch.where(finite, x - c.unsqueeze(-1), 0.0) for x, c in zip(pixels.unbind(-1), self._c(), strict=True)
+        ]
         xy = torch.stack(linear(entries(pixel_to_normalized(self.K)), offset), dim=-1)
         if self.distortion is None:
             return torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1), finite
@@ -356,7 +359,7 @@ class Camera:
         `dist` is empty for a pinhole. Whether the coefficients are the fisheye model's is for the caller to remember.
 
         Raises:
-            ValueError: the camera has skew or a turned image, which OpenCV would ignore, or a lens that is not OpenCV's.
+            ValueError: the camera has skew or a turned image, which OpenCV would ignore, or another library's lens.
         """
         if self.distortion is not None and not isinstance(self.distortion, BrownConrady | KannalaBrandt):
             raise ValueError(f"distortion: want a lens that OpenCV has, got {type(self.distortion).__name__}")

@@ -68,9 +68,13 @@ def _add_experiment(commands: "argparse._SubParsersAction[argparse.ArgumentParse
         help="corners measured in real photographs by the left or right camera of a stereo pair, which come with the "
         "package; or photographs rendered with known truth",
     )
-    source.add_argument("--images", nargs="+", type=Path, metavar="PHOTO", help="your own photographs, or folders of them")
+    source.add_argument(
+        "--images", nargs="+", type=Path, metavar="PHOTO", help="your own photographs, or folders of them"
+    )
     command.add_argument("--board", type=_board_size, default=(9, 6), metavar="CxR", help="inner corners of your board")
-    command.add_argument("--square", type=float, default=25.0, help="side of a square; its unit is the unit of all results")
+    command.add_argument(
+        "--square", type=float, default=25.0, help="side of a square; its unit is the unit of all results"
+    )
     command.add_argument("--distortion", choices=get_args(LensModel), default="brown5", help="the lens that is fitted")
     command.add_argument(
         "--split",
@@ -127,7 +131,8 @@ def _corners(options: argparse.Namespace) -> tuple[Views, Chessboard, tuple[list
         setup = synthetic.paper_setup()
         with Progress(console=Console(stderr=True), transient=True) as progress:
             task = progress.add_task("Rendering and finding corners")
-            images = [synthetic.photograph(camera, setup.board, seed=i).numpy() for i, camera in enumerate(setup.cameras)]
+            photographs = [setup.cameras[i] for i in range(len(setup.names))]
+            images = [synthetic.photograph(camera, setup.board, seed=i).numpy() for i, camera in enumerate(photographs)]
             views = detect(images, setup.board, lambda done, total: progress.update(task, completed=done, total=total))
         named = Views(views.pixels, views.visible, setup.names, views.size)
         count = len(setup.fit.R)

@@ -159,7 +159,9 @@ def parse_split(text: str, count: int) -> tuple[list[int], list[int]]:
     if outside:
         raise ValueError(f"split: want views from 1 to {count}, got {outside[0]}")
     if len(fit) < 2 or not test:
-        raise ValueError(f"split: want at least 2 views to fit and 1 to test, got {len(fit)} and {len(test)} of {count}")
+        raise ValueError(
+            f"split: want at least 2 views to fit and 1 to test, got {len(fit)} and {len(test)} of {count}"
+        )
     return fit, test
 
 

@@ -129,7 +129,7 @@ def _format(path: Path, format: str | None) -> Format:  # noqa: A002
 def _json_document(item: Camera | Calibration) -> dict[str, Any]:
     camera = item.camera if isinstance(item, Calibration) else item
     lens = camera.distortion
-    if lens is not None and type(lens).__name__ not in _LENSES:
+    if not (lens is None or (isinstance(lens, BrownConrady | KannalaBrandt) and type(lens).__name__ in _LENSES)):
         raise ValueError(f"distortion: want one of {', '.join(_LENSES)}, got {type(lens).__name__}")
     document: dict[str, Any] = {
         "format": JSON_FORMAT,
@@ -140,7 +140,9 @@ def _json_document(item: Camera | Calibration) -> dict[str, Any]:
             "K": camera.K.tolist(),
             "R": camera.R.tolist(),
             "t": camera.t.tolist(),
-            "lens": None if lens is None else {"model": type(lens).__name__, "coefficients": lens.coefficients.tolist()},
+            "lens": None
+            if lens is None
+            else {"model": type(lens).__name__, "coefficients": lens.coefficients.tolist()},
         },
     }
     if isinstance(item, Calibration):
@@ -165,7 +167,9 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or document.get("format") != JSON_FORMAT or "camera" not in document:
         raise ValueError(f"{path}: want a camera file of diffproj, got another JSON file")
     if document.get("version") != JSON_VERSION:
-        raise ValueError(f"{path}: want version {JSON_VERSION}, got {document.get('version')}; a newer diffproj reads it")
+        raise ValueError(
+            f"{path}: want version {JSON_VERSION}, got {document.get('version')}; a newer diffproj reads it"
+        )
     return document
 
 
@@ -194,7 +198,9 @@ def _tensor(numbers: Any, dtype: torch.dtype) -> Tensor:
 def _opencv_document(path: Path, item: Camera | Calibration) -> str:
     camera = item.camera if isinstance(item, Calibration) else item
     if camera.batch_shape:
-        raise ValueError(f"{path}: OpenCV's formats hold one camera, got batch shape {tuple(camera.batch_shape)}; use .json")
+        raise ValueError(
+            f"{path}: OpenCV's formats hold one camera, got batch shape {tuple(camera.batch_shape)}; use .json"
+        )
     K, dist, rvec, tvec = camera.to_opencv()
     if rvec.any() or tvec.any():
         raise ValueError(f"{path}: OpenCV's formats hold no pose; use .json, or save camera.without_pose()")

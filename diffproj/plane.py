@@ -187,7 +187,9 @@ class Plane:
         """
         if self.is_per_point:
             raise IndexError("plane: want a batch of planes to index, got planes per point; index normal and offset")
-        return self._unchecked(index_batch(self.normal, index, 1), index_batch(self.offset, index, 0), False, self.adopts)
+        return self._unchecked(
+            index_batch(self.normal, index, 1), index_batch(self.offset, index, 0), False, self.adopts
+        )
 
     def __repr__(self) -> str:
         if self.batch_shape or not readable(self.normal):

@@ -220,7 +220,10 @@ def test_invalid_points_are_finite_and_have_no_gradient(name: str, request: pyte
     good = torch.tensor([[300.0, 100], [200, 200]], dtype=D)
 
     def gradients(pixels: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        leaves = [pixels.clone().requires_grad_(), *(p.clone().requires_grad_() for p in (camera.K, camera.R, camera.t))]
+        leaves = [
+            pixels.clone().requires_grad_(),
+            *(p.clone().requires_grad_() for p in (camera.K, camera.R, camera.t)),
+        ]
         moved = dp.Camera(*leaves[1:], camera.distortion)
         points, valid = dp.back_project(leaves[0], moved, plane)
         return points, valid, list(torch.autograd.grad(points.square().sum(), leaves))
@@ -302,7 +305,9 @@ def test_explain_agrees_with_valid(lens_camera: dp.Camera) -> None:
 
 
 def test_a_camera_on_the_plane_sees_none_of_it(camera: dp.Camera, pixels: Tensor) -> None:
-    plane = dp.Plane(torch.tensor([0.2, 0.1, 1.0], dtype=D), (camera.center * torch.tensor([0.2, 0.1, 1.0], dtype=D)).sum())
+    plane = dp.Plane(
+        torch.tensor([0.2, 0.1, 1.0], dtype=D), (camera.center * torch.tensor([0.2, 0.1, 1.0], dtype=D)).sum()
+    )
     points, valid = dp.back_project(pixels, camera, plane)
     assert not valid.any()
     assert (points == 0).all()
@@ -313,14 +318,44 @@ def test_bad_input_is_refused_by_name(camera: dp.Camera, pixels: Tensor) -> None
     plane = dp.Plane.z(0.0)
     cases = [
         (TypeError, "pixels: want a torch.Tensor, got ndarray", lambda: dp.back_project(pixels.numpy(), camera, plane)),
-        (TypeError, "pixels: want a floating-point tensor, got torch.int64", lambda: dp.back_project(pixels.long(), camera, plane)),
+        (
+            TypeError,
+            "pixels: want a floating-point tensor, got torch.int64",
+            lambda: dp.back_project(pixels.long(), camera, plane),
+        ),
         (TypeError, "pixels: want torch.float64 as camera has", lambda: dp.back_project(pixels.float(), camera, plane)),
-        (ValueError, r"pixels: want shape \(\*B, N, 2\), got \(200, 3\)", lambda: dp.back_project(pixels.new_zeros(200, 3), camera, plane)),
-        (ValueError, r"pixels: want shape \(\*B, N, 2\), got \(2,\)", lambda: dp.back_project(pixels[0], camera, plane)),
-        (TypeError, "plane: want torch.float64 as camera has", lambda: dp.back_project(pixels, camera, dp.Plane.z(torch.tensor(0.0)))),
-        (ValueError, "pixels: want device cpu as camera has, got meta", lambda: dp.back_project(pixels.to("meta"), camera, plane)),
-        (ValueError, "batch shapes do not broadcast", lambda: dp.back_project(pixels.expand(2, 200, 2), camera, dp.Plane(pixels.new_ones(3, 3), 0.0))),
-        (ValueError, "the paper neglects the lens", lambda: dp.paper_route(pixels, dp.Camera(camera.K, distortion=dp.BrownConrady(torch.zeros(5, dtype=D))), plane)),
+        (
+            ValueError,
+            r"pixels: want shape \(\*B, N, 2\), got \(200, 3\)",
+            lambda: dp.back_project(pixels.new_zeros(200, 3), camera, plane),
+        ),
+        (
+            ValueError,
+            r"pixels: want shape \(\*B, N, 2\), got \(2,\)",
+            lambda: dp.back_project(pixels[0], camera, plane),
+        ),
+        (
+            TypeError,
+            "plane: want torch.float64 as camera has",
+            lambda: dp.back_project(pixels, camera, dp.Plane.z(torch.tensor(0.0))),
+        ),
+        (
+            ValueError,
+            "pixels: want device cpu as camera has, got meta",
+            lambda: dp.back_project(pixels.to("meta"), camera, plane),
+        ),
+        (
+            ValueError,
+            "batch shapes do not broadcast",
+            lambda: dp.back_project(pixels.expand(2, 200, 2), camera, dp.Plane(pixels.new_ones(3, 3), 0.0)),
+        ),
+        (
+            ValueError,
+            "the paper neglects the lens",
+            lambda: dp.paper_route(
+                pixels, dp.Camera(camera.K, distortion=dp.BrownConrady(torch.zeros(5, dtype=D))), plane
+            ),
+        ),
     ]
     for kind, message, call in cases:
         with pytest.raises(kind, match=message):

@@ -137,7 +137,11 @@ def test_bad_input_is_refused_by_name(simulated: tuple[dp.Camera, dp.Views, dp.C
     fisheye = dp.Camera(truth.K[0], distortion=dp.KannalaBrandt(torch.zeros(4, dtype=D)))
     cases = [
         (TypeError, "views: want dp.Views, got Tensor", lambda: dp.calibrate(views.pixels, board)),
-        (ValueError, "distortion: want one of none, brown4, brown5, got 'brown'", lambda: dp.calibrate(views, board, "brown")),
+        (
+            ValueError,
+            "distortion: want one of none, brown4, brown5, got 'brown'",
+            lambda: dp.calibrate(views, board, "brown"),
+        ),
         (ValueError, "views: want 40 corners .* got 54", lambda: dp.calibrate(views, dp.Chessboard(8, 5))),
         (ValueError, "views: want at least 2 to find the intrinsics, got 1", lambda: dp.calibrate(views[0], board)),
         (ValueError, "views: want at least one, got none", lambda: dp.locate(views[[]], board, truth[0])),

@@ -108,12 +108,16 @@ def test_a_turned_or_skewed_image_is_exact(lens_camera: dp.Camera, pixels: Tenso
     _, direction, turned_valid = turned.rays(moved)
     assert torch.equal(valid, turned_valid)
     torch.testing.assert_close(direction, want, rtol=0, atol=1e-14)
-    torch.testing.assert_close(turned.project(want * 100)[0], lens_camera.project(want * 100)[0] @ turn[:2, :2].T + turn[:2, 2])
+    torch.testing.assert_close(
+        turned.project(want * 100)[0], lens_camera.project(want * 100)[0] @ turn[:2, :2].T + turn[:2, 2]
+    )
 
 
 def test_points_that_no_camera_sees_are_invalid(K: Tensor) -> None:
     nan, inf = float("nan"), float("inf")
-    points = torch.tensor([[1, 2, 5.0], [1, 1, 0], [0, 0, 0], [1, 0, -5], [nan, 0, 5], [0, inf, 5], [0, 0, inf]], dtype=D)
+    points = torch.tensor(
+        [[1, 2, 5.0], [1, 1, 0], [0, 0, 0], [1, 0, -5], [nan, 0, 5], [0, inf, 5], [0, 0, inf]], dtype=D
+    )
     points.requires_grad_()
     pixels, valid = dp.Camera(K).project(points)
     assert valid.tolist() == [True] + [False] * 6
@@ -239,15 +243,27 @@ def test_bad_cameras_are_refused_by_name(K: Tensor) -> None:
         (ValueError, "R: want rotation matrices", lambda: dp.Camera(K, -eye)),
         (ValueError, "t: want finite", lambda: dp.Camera(K, eye, eye[0] / 0)),
         (TypeError, "R: want torch.float64 as K has, got torch.float32", lambda: dp.Camera(K, eye.float())),
-        (ValueError, "t: want device cpu as K has, got meta", lambda: dp.Camera(K, eye, torch.zeros(3, dtype=D, device="meta"))),
-        (ValueError, r"batch shapes do not broadcast: K \(2,\), R \(3,\)", lambda: dp.Camera(K.repeat(2, 1, 1), eye.repeat(3, 1, 1))),
+        (
+            ValueError,
+            "t: want device cpu as K has, got meta",
+            lambda: dp.Camera(K, eye, torch.zeros(3, dtype=D, device="meta")),
+        ),
+        (
+            ValueError,
+            r"batch shapes do not broadcast: K \(2,\), R \(3,\)",
+            lambda: dp.Camera(K.repeat(2, 1, 1), eye.repeat(3, 1, 1)),
+        ),
         (TypeError, "distortion: want a lens", lambda: dp.Camera(K, distortion=eye[0])),
         (ValueError, "size: want", lambda: dp.Camera(K, size=(640, 0))),
         (IndexError, "too many indices", lambda: dp.Camera(K)[0]),
         (ValueError, "resized: want a camera with a size", lambda: dp.Camera(K).resized((10, 10))),
         (ValueError, "R: want rotation matrices", lambda: dp.Camera(K).at(2 * eye, eye[0])),
         (ValueError, "size: want .* PinholeCamera needs it", lambda: dp.Camera(K).to_kornia()),
-        (ValueError, "K: want no skew", lambda: dp.Camera(K + 0.1 * eye.roll(1, 1) * eye.new_tensor([[1.0], [0], [0]])).to_opencv()),
+        (
+            ValueError,
+            "K: want no skew",
+            lambda: dp.Camera(K + 0.1 * eye.roll(1, 1) * eye.new_tensor([[1.0], [0], [0]])).to_opencv(),
+        ),
     ]
     for kind, message, call in cases:
         with pytest.raises(kind, match=message):

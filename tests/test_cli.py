@@ -33,7 +33,17 @@ def test_experiment_prints_the_table_and_writes_three_files(tmp_path: Path, caps
 
 
 def test_options_reach_the_experiment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ("--data", "right", "--distortion", "none", "--split", "1-10/12,13", "--strict", "--output", str(tmp_path))
+    options = (
+        "--data",
+        "right",
+        "--distortion",
+        "none",
+        "--split",
+        "1-10/12,13",
+        "--strict",
+        "--output",
+        str(tmp_path),
+    )
     code, out, _ = run(capsys, *options)
     assert code == 0
     assert "right14.jpg" in out
@@ -59,7 +69,17 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_own_photographs(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, err = run(
-        capsys, "--images", str(photographs), "--board", "8x5", "--split", "4", "--distortion", "none", "--output", str(tmp_path)
+        capsys,
+        "--images",
+        str(photographs),
+        "--board",
+        "8x5",
+        "--split",
+        "4",
+        "--distortion",
+        "none",
+        "--output",
+        str(tmp_path),
     )
     assert code == 0
     assert "6.png" in out

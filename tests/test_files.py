@@ -140,7 +140,9 @@ def test_files_that_are_something_else_are_named(tmp_path: Path, name: str, cont
         dp.load_camera(tmp_path / name)
 
 
-def test_calibrations_that_are_not_there_are_named(tmp_path: Path, camera: dp.Camera, calibration: dp.Calibration) -> None:
+def test_calibrations_that_are_not_there_are_named(
+    tmp_path: Path, camera: dp.Camera, calibration: dp.Calibration
+) -> None:
     dp.save_camera(tmp_path / "camera.json", camera)
     with pytest.raises(ValueError, match="want a calibration, got a camera alone"):
         dp.load_calibration(tmp_path / "camera.json")

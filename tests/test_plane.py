@@ -84,7 +84,11 @@ def test_bad_planes_are_refused_by_name() -> None:
         (ValueError, "batch shapes do not broadcast", lambda: dp.Plane(up.expand(2, 3), torch.zeros(3))),
         (ValueError, "per_point: want", lambda: dp.Plane.per_point(up, 1.0)),
         (ValueError, "points: want at least 3, got 2", lambda: dp.Plane.from_points(torch.rand(2, 3))),
-        (ValueError, "points: want three that are not on one line", lambda: dp.Plane.from_points(torch.arange(5.0)[:, None] * up)),
+        (
+            ValueError,
+            "points: want three that are not on one line",
+            lambda: dp.Plane.from_points(torch.arange(5.0)[:, None] * up),
+        ),
         (ValueError, "points: want finite", lambda: dp.Plane.from_points(torch.full((4, 3), float("nan")))),
         (TypeError, "plane: want a dp.Plane, got Tensor", lambda: dp.PlaneMap(dp.Camera(torch.eye(3)), up)),
     ]

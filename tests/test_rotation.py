@@ -11,8 +11,13 @@ D = torch.float64
 
 def test_is_the_product_of_rotations_about_x_y_z() -> None:
     psi, phi, theta = torch.randn(3, 50, dtype=D)
-    about = [axis_angle_to_rotation_matrix(angle[:, None] * axis) for angle, axis in zip((psi, phi, theta), torch.eye(3, dtype=D))]
-    torch.testing.assert_close(dp.rotation_from_euler(psi, phi, theta), about[0] @ about[1] @ about[2], atol=1e-15, rtol=0)
+    about = [
+        axis_angle_to_rotation_matrix(angle[:, None] * axis)
+        for angle, axis in zip((psi, phi, theta), torch.eye(3, dtype=D), strict=True)
+    ]
+    torch.testing.assert_close(
+        dp.rotation_from_euler(psi, phi, theta), about[0] @ about[1] @ about[2], atol=1e-15, rtol=0
+    )
 
 
 def test_angles_come_back() -> None:

@@ -43,7 +43,9 @@ def test_brightness_and_noise() -> None:
     assert clean.dtype == torch.uint8
     assert clean.shape == (480, 640)
     assert clean[0, 0].item() == round(synthetic.TABLE * 255)
-    inside = torch.tensor([[12.5, 12.5, 0], [12.5, 37.5, 0], [-37.5, 50, 0]], dtype=D)  # square (0, 0), the next, margin
+    inside = torch.tensor(
+        [[12.5, 12.5, 0], [12.5, 37.5, 0], [-37.5, 50, 0]], dtype=D
+    )  # square (0, 0), the next, margin
     u, v = camera.project(inside)[0].round().long().unbind(-1)
     assert clean[v, u].tolist() == [round(g * 255) for g in (synthetic.BLACK, synthetic.WHITE, synthetic.WHITE)]
     noisy = synthetic.photograph(camera, setup.board, noise=0.02, blur_px=0.0, seed=1)

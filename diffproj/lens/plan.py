@@ -66,7 +66,8 @@ def _rounded(name: str, coefficients: Tensor) -> Plan:
 @torch.library.custom_op("diffproj::lens_plan", mutates_args=())
 def _planned(coefficients: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     plan = _remembered(name, coefficients) if coefficients.device.type == "cpu" else _rounded(name, coefficients)
-    return plan.domain.clone(), plan.reach.clone(), plan.noise.clone(), plan.rho_max.clone(), plan.ratio.clone()
+    domain, reach, noise, rho_max, ratio = (part.clone(memory_format=torch.contiguous_format) for part in plan)
+    return domain, reach, noise, rho_max, ratio
 
 
 def _remembered(name: str, coefficients: Tensor) -> Plan:

@@ -14,7 +14,9 @@ def _fresh() -> None:
     torch._dynamo.reset()
 
 
-def project(K: Tensor, R: Tensor, t: Tensor, coefficients: Tensor | None, offset: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def project(
+    K: Tensor, R: Tensor, t: Tensor, coefficients: Tensor | None, offset: Tensor, pixels: Tensor
+) -> tuple[Tensor, Tensor]:
     lens = None if coefficients is None else dp.BrownConrady(coefficients)
     return dp.back_project(pixels, dp.Camera(K, R, t, lens), dp.Plane.z(offset))
 
