@@ -269,16 +269,12 @@ class Camera:
         """
         pixels = self._checked("pixels", pixels, 2)
         finite = pixels.isfinite().all(dim=-1)
-        offset = [
-            torch.where(finite, x - c.unsqueeze(-1), 0.0) for x, c in zip(pixels.unbind(-1), self._c(), strict=True)
-        ]
-        xy = torch.stack(linear(entries(pixel_to_normalized(self.K)), offset), dim=-1)
+        offset = torch.where(finite.unsqueeze(-1), pixels - self.K[..., None, :2, 2], 0.0)
+        xy = transform(pixel_to_normalized(self.K), offset)
         if self.distortion is None:
             return torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1), finite
         direction, valid = self.distortion.unproject(xy)
-        axis = torch.eye(3, dtype=self.dtype, device=self.device)[2]
-        valid = valid & finite
-        return torch.where(valid.unsqueeze(-1), direction, axis), valid
+        return direction, valid & finite
 
     def rays(
         self, pixels: Float[Tensor, "*#batch n 2"]
@@ -300,9 +296,6 @@ class Camera:
         direction = transform(self.R.mT, in_camera)
         direction = direction / direction.norm(dim=-1, keepdim=True)
         return self.center.unsqueeze(-2).expand_as(direction), direction, valid
-
-    def _c(self) -> tuple[Tensor, Tensor]:
-        return self.K[..., 0, 2], self.K[..., 1, 2]
 
     def _checked(self, name: str, value: object, length: int) -> Tensor:
         """Check points or pixels against the camera, lift half precision, expand to the common batch shape."""

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffproj.lens.polynomial import polynomial
+from diffproj.lens.polynomial import minus_product, polynomial
 
 COUNTS = (4, 5, 8, 12, 14)
 Columns = tuple[Tensor, ...]
@@ -165,8 +165,8 @@ def bend_off(terms: Terms, target: tuple[Tensor, Tensor], x: Tensor, y: Tensor) 
         torch.addcmul(y * slope_x, x, steep_y),
         torch.addcmul(factor, y, slope_y + steep_y),
     )
-    off_x = torch.addcmul(torch.addcmul(target[0], x, factor, value=-1), s, sideways_x, value=-1)
-    off_y = torch.addcmul(torch.addcmul(target[1], y, factor, value=-1), s, sideways_y, value=-1)
+    off_x = minus_product(minus_product(target[0], x, factor), s, sideways_x)
+    off_y = minus_product(minus_product(target[1], y, factor), s, sideways_y)
     return off_x, off_y, jacobian
 
 
@@ -175,9 +175,9 @@ def newton_direction(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """What is missing at `(x, y)`, and Newton's step there as numerators and their common denominator."""
     off_x, off_y, slope = bend_off(terms, target, x, y)
-    determinant = torch.addcmul(slope.xx * slope.yy, slope.xy, slope.yx, value=-1)
-    step_x = torch.addcmul(slope.yy * off_x, slope.xy, off_y, value=-1)
-    step_y = torch.addcmul(slope.xx * off_y, slope.yx, off_x, value=-1)
+    determinant = minus_product(slope.xx * slope.yy, slope.xy, slope.yx)
+    step_x = minus_product(slope.yy * off_x, slope.xy, off_y)
+    step_y = minus_product(slope.xx * off_y, slope.yx, off_x)
     return off_x, off_y, step_x, step_y, determinant
 
 
