@@ -59,8 +59,10 @@ def _rounded(name: str, coefficients: Tensor) -> Plan:
     domain = torch.where(
         domain.to(plan.domain.dtype) > plan.domain, torch.nextafter(domain, torch.zeros_like(domain)), domain
     )
-    overflows = coefficients.abs().amax(-1) > torch.finfo(coefficients.dtype).max / 1e4
-    return Plan(torch.where(overflows, 0, domain), *others)
+    limits = torch.finfo(coefficients.dtype)
+    overflows = coefficients.abs().amax(-1) > limits.max / 1e4
+    underflows = domain < limits.tiny**0.25  # the squares of errors would be lost
+    return Plan(torch.where(overflows | underflows, 0, domain), *others)
 
 
 @torch.library.custom_op("diffproj::lens_plan", mutates_args=())
