@@ -12,6 +12,7 @@ file is written whole or not at all.
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any, Literal
 
@@ -63,7 +64,7 @@ def save_camera(path: PathLike, camera: Camera | Calibration, format: Format | N
         raise TypeError(f"camera: want dp.Camera or dp.Calibration, got {type(camera).__name__}")
     path = Path(path)
     if _format(path, format) == "json":
-        content = json.dumps(_json_document(camera), indent=1)
+        content = _readable(json.dumps(_json_document(camera), indent=1))
     else:
         content = _opencv_document(path, camera)
     write_whole(path, content)
@@ -157,6 +158,11 @@ def _json_document(item: Camera | Calibration) -> dict[str, Any]:
             "visible": item.views.visible.tolist(),
         }
     return document
+
+
+def _readable(text: str) -> str:
+    """Indented JSON with each innermost list on one line. (A line break never stands inside a JSON string.)"""
+    return re.sub(r"\[[^\[\]{}]*\]", lambda match: re.sub(r"\s*\n\s*", " ", match[0]), text) + "\n"
 
 
 def _read_json(path: Path) -> dict[str, Any]:
