@@ -161,7 +161,7 @@ def _json_document(item: Camera | Calibration) -> dict[str, Any]:
 
 
 def _readable(text: str) -> str:
-    """Indented JSON with each innermost list on one line. (A line break never stands inside a JSON string.)"""
+    """Indented JSON with each innermost list on one line; a line break never stands inside a JSON string."""
     return re.sub(r"\[[^\[\]{}]*\]", lambda match: re.sub(r"\s*\n\s*", " ", match[0]), text) + "\n"
 
 
