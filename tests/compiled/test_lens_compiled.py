@@ -21,7 +21,9 @@ def points(count: int) -> Tensor:
     return torch.randn(count, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 0.6
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [name if name == "brown5" else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
+)
 def test_results_and_gradients(name: str) -> None:
     kind, values = CASES[name]
     coefficients = torch.tensor(values, dtype=torch.float64)
