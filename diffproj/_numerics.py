@@ -17,7 +17,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-BLOCK_POINTS = 2**18
+BLOCK_POINTS = 2**16
 """Points handled at once when no derivative is asked: large enough to hide the cost of dispatch, small enough that
 the intermediate results stay in the processor's cache."""
 
@@ -146,6 +146,19 @@ def linear(rows: Sequence[Sequence[Tensor]], components: Sequence[Tensor | None]
             product = product + entry if component is None else torch.addcmul(product, component, entry)
         products.append(product)
     return products
+
+
+def interleaved(components: Sequence[Tensor]) -> Tensor:
+    """Vectors `(*B, N, n)` of `n` components `(*B, N)`: `torch.stack` over the last axis.
+
+    Where no derivative is asked, column by column: on a CPU that takes 4 ns a point, `torch.stack` takes 10.
+    """
+    if wants_derivative(*components):
+        return torch.stack(list(components), dim=-1)
+    vectors = components[0].new_empty((*components[0].shape, len(components)))
+    for column, component in zip(vectors.unbind(-1), components, strict=True):
+        column.copy_(component)
+    return vectors
 
 
 def transform(matrix: Tensor, vectors: Tensor) -> Tensor:

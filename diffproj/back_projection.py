@@ -26,7 +26,17 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj import _pytree
-from diffproj._numerics import broadcast_batches, check_same_kind, dot, entries, in_blocks, linear, precise, rounding
+from diffproj._numerics import (
+    broadcast_batches,
+    check_same_kind,
+    dot,
+    entries,
+    in_blocks,
+    interleaved,
+    linear,
+    precise,
+    rounding,
+)
 from diffproj.camera import Camera, as_camera, pixel_to_normalized
 from diffproj.plane import Plane
 
@@ -120,12 +130,12 @@ class PlaneMap:
         valid = denominator > threshold  # false for NaN, too
         if seen is not None:
             valid = valid & seen
-        # Where there is no point, p becomes (0, 0, .) and the denominator infinite before anything is divided, so
-        # that neither values nor gradients of infinite or parallel rays ever arise.
-        sight = [component if component is None else torch.where(valid, component, 0.0) for component in sight]
+        # Where there is no point, the denominator becomes infinite and p finite before anything is divided, so that
+        # neither values nor gradients of infinite or parallel rays ever arise.
+        sight = [component if component is None else component.nan_to_num(0.0, 0.0, 0.0) for component in sight]
         *numerators, denominator = linear(rows, sight)
         inverse = torch.where(valid, denominator, torch.inf).reciprocal()
-        return torch.stack([numerator * inverse for numerator in numerators], dim=-1), valid
+        return interleaved([numerator * inverse for numerator in numerators]), valid
 
     def _explain(self, pixels: Tensor) -> tuple[Tensor]:
         sight, seen = self._sight(pixels)
