@@ -133,8 +133,8 @@ class Plane:
         Example:
             >>> corners = torch.tensor([[0.0, 0, 1], [4, 0, 1], [0, 4, 1], [4, 4, 1.4]], dtype=torch.float64)
             >>> plane = Plane.from_points(corners)
-            >>> round(float(plane.rms(corners)), 3)  # world units
-            0.099
+            >>> round(float(plane.rms(corners)), 4)  # world units
+            0.0998
         """
         points = check_tensor("points", points, "N", 3)
         if points.shape[-2] < 3:
