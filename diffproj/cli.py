@@ -58,7 +58,6 @@ def _add_experiment(commands: "argparse._SubParsersAction[argparse.ArgumentParse
             "back on the board's plane and compares it with its known place. Prints Table 1 and writes table1.csv, "
             "fig7.png and camera.json (the whole calibration) to the output folder."
         ),
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     source = command.add_mutually_exclusive_group()
     source.add_argument(
@@ -66,16 +65,20 @@ def _add_experiment(commands: "argparse._SubParsersAction[argparse.ArgumentParse
         choices=["left", "right", "synthetic"],
         default="left",
         help="corners measured in real photographs by the left or right camera of a stereo pair, which come with the "
-        "package; or photographs rendered with known truth",
+        "package; or photographs rendered with known truth (default: left)",
     )
     source.add_argument(
         "--images", nargs="+", type=Path, metavar="PHOTO", help="your own photographs, or folders of them"
     )
-    command.add_argument("--board", type=_board_size, default=(9, 6), metavar="CxR", help="inner corners of your board")
     command.add_argument(
-        "--square", type=float, default=25.0, help="side of a square; its unit is the unit of all results"
+        "--board", type=_board_size, default=(9, 6), metavar="CxR", help="inner corners of your board (default: 9x6)"
     )
-    command.add_argument("--distortion", choices=get_args(LensModel), default="brown5", help="the lens that is fitted")
+    command.add_argument(
+        "--square", type=float, default=25.0, help="side of a square; its unit is the unit of all results (default: 25)"
+    )
+    command.add_argument(
+        "--distortion", choices=get_args(LensModel), default="brown5", help="the lens that is fitted (default: brown5)"
+    )
     command.add_argument(
         "--split",
         metavar="N or LIST/LIST",
@@ -86,7 +89,11 @@ def _add_experiment(commands: "argparse._SubParsersAction[argparse.ArgumentParse
         "--strict", action="store_true", help="find each pose from every second corner and measure the others"
     )
     command.add_argument(
-        "--output", type=Path, default=Path("diffproj-experiment"), metavar="FOLDER", help="where the files go"
+        "--output",
+        type=Path,
+        default=Path("diffproj-experiment"),
+        metavar="FOLDER",
+        help="where the files go (default: diffproj-experiment)",
     )
     command.set_defaults(run=_experiment)
 
