@@ -20,11 +20,12 @@ Conventions, which hold everywhere:
 
 from diffproj.back_projection import PlaneMap, Reason, back_project, explain
 from diffproj.board import BoardNotFoundError, BoardNotFoundWarning, Chessboard, Views, detect, example_views
-from diffproj.calibration import Calibration, CalibrationError, calibrate, locate
+from diffproj.calibration import Calibration, CalibrationError, Covariance, Status, calibrate, locate, refine
 from diffproj.camera import Camera
 from diffproj.experiment import Experiment, run_experiment
 from diffproj.files import load_calibration, load_camera, save_camera
 from diffproj.lens import BrownConrady, KannalaBrandt, Lens
+from diffproj.losses import Cauchy, Huber, Loss, SoftL1
 from diffproj.paper_route import paper_route
 from diffproj.plane import Plane
 from diffproj.rotation import euler_from_rotation, rotation_from_euler
@@ -38,13 +39,19 @@ __all__ = [
     "Calibration",
     "CalibrationError",
     "Camera",
+    "Cauchy",
     "Chessboard",
+    "Covariance",
     "Experiment",
+    "Huber",
     "KannalaBrandt",
     "Lens",
+    "Loss",
     "Plane",
     "PlaneMap",
     "Reason",
+    "SoftL1",
+    "Status",
     "Views",
     "back_project",
     "calibrate",
@@ -56,6 +63,7 @@ __all__ = [
     "load_camera",
     "locate",
     "paper_route",
+    "refine",
     "rotation_from_euler",
     "run_experiment",
     "save_camera",

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from diffproj._atomic import write_whole
 from diffproj.board import Views
-from diffproj.calibration import Calibration
+from diffproj.calibration import Calibration, Covariance
 from diffproj.camera import Camera
 from diffproj.lens import BrownConrady, KannalaBrandt
 
@@ -57,7 +57,7 @@ def save_camera(path: PathLike, camera: Camera | Calibration, format: Format | N
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     dp.save_camera(f"{folder}/camera.json", calibration)
         ...     again = dp.load_calibration(f"{folder}/camera.json")
-        >>> again.rms == calibration.rms
+        >>> bool(again.rms == calibration.rms)
         True
     """
     if not isinstance(camera, Camera | Calibration):
@@ -109,7 +109,25 @@ def load_calibration(path: PathLike) -> Calibration:
         R, t, points, pixels = (_tensor(found[key], torch.float64) for key in ("R", "t", "points", "pixels"))
         visible = torch.tensor(found["visible"], dtype=torch.bool)
         views = Views(pixels, visible, found["names"], _size(found["size"]))
-        return Calibration(camera, camera.at(R, t), views, points)
+        used, rejected = (torch.tensor(found[key], dtype=torch.bool) for key in ("used", "rejected"))
+        status, iterations = (torch.tensor(found[key]) for key in ("status", "iterations"))
+        bow = None if found["bow"] is None else _tensor(found["bow"], torch.float64)
+        posed = camera if not camera.batch_shape else camera[..., None]
+        covariance = _covariance_from_fields(found["covariance"])
+        return Calibration(
+            camera,
+            posed.at(R, t),
+            views,
+            points,
+            used,
+            rejected,
+            status,
+            iterations,
+            bow,
+            found["objective"],
+            tuple(found["causes"]),
+            None if covariance is None else lambda: covariance,
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
 
@@ -148,7 +166,11 @@ def _json_document(item: Camera | Calibration) -> dict[str, Any]:
     }
     if isinstance(item, Calibration):
         document["calibration"] = {
-            "rms": item.rms,
+            "rms": item.rms.tolist(),
+            "status": item.status.tolist(),
+            "iterations": item.iterations.tolist(),
+            "objective": item.objective,
+            "bow": None if item.bow is None else item.bow.tolist(),
             "R": item.cameras.R.tolist(),
             "t": item.cameras.t.tolist(),
             "points": item.points.tolist(),
@@ -156,8 +178,34 @@ def _json_document(item: Camera | Calibration) -> dict[str, Any]:
             "size": item.views.size,
             "pixels": item.views.pixels.tolist(),
             "visible": item.views.visible.tolist(),
+            "used": item.used.tolist(),
+            "rejected": item.rejected.tolist(),
+            "causes": item.causes,
+            "covariance": _covariance_fields(item),
         }
     return document
+
+
+def _covariance_fields(item: Calibration) -> dict[str, Any] | None:
+    """The blocks of the covariance; what is infinite is 0 here and known by the masks, for JSON has no infinity."""
+    if item._covariance is None:
+        return None
+    known = item.covariance
+    fields = {key: getattr(known, f"_{key}").tolist() for key in ("follow", "mixed", "alone")}
+    fields |= {key: getattr(known, key).tolist() for key in ("undetermined", "undetermined_views")}
+    shared = torch.where(known.shared.isfinite(), known.shared, 0.0)
+    return {"names": known.names, "shared": shared.tolist(), **fields}
+
+
+def _covariance_from_fields(fields: dict[str, Any] | None) -> Covariance | None:
+    if fields is None:
+        return None
+    unknown, unknown_views = (
+        torch.tensor(fields[key], dtype=torch.bool) for key in ("undetermined", "undetermined_views")
+    )
+    shared, *blocks = (_tensor(fields[key], torch.float64) for key in ("shared", "follow", "mixed", "alone"))
+    infinite = torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(shared))
+    return Covariance(tuple(fields["names"]), shared + infinite, unknown, unknown_views, *blocks)
 
 
 def _readable(text: str) -> str:
@@ -223,7 +271,7 @@ def _opencv_document(path: Path, item: Camera | Calibration) -> str:
         _, _, rvecs, tvecs = item.cameras.to_opencv()
         storage.write("nframes", len(item.views))
         storage.write("extrinsic_parameters", np.concatenate([rvecs, tvecs], axis=-1))
-        storage.write("avg_reprojection_error", item.rms)
+        storage.write("avg_reprojection_error", float(item.rms))
         storage.write("per_view_reprojection_errors", item.view_rms.numpy().reshape(-1, 1))
     return storage.releaseAndGetString()
 

@@ -5,6 +5,7 @@ board's plane, where the chessboard says whether it is black or white. Averaging
 Gaussian blur stands for the optics and Gaussian noise for the sensor.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -167,6 +168,71 @@ def corner_views(camera: Camera, board: Chessboard, *, noise_px: float = 0.2, se
         last = torch.tensor(camera.size, dtype=pixels.dtype) - 0.5
         visible = visible & ((pixels >= -0.5) & (pixels <= last)).all(dim=-1)
     return Views(pixels, visible, size=camera.size)
+
+
+def random_cameras(
+    camera: Camera,
+    board: Chessboard,
+    views: int,
+    *,
+    tilt: float = math.radians(40),
+    distance: tuple[float, float] = (1.5, 3.0),
+    seed: int = 0,
+) -> Camera:
+    """The camera at random poses from which it sees the whole board, batch shape `(*B, V)`.
+
+    Args:
+        camera: of batch shape `*B` and known size; its pose does not matter.
+        board: the board, in either frame.
+        views: V.
+        tilt: the board's tilts about x and y, and turns about z, are uniform up to this in radians.
+        distance: of the board's middle from the camera, uniform between these multiples of the board's longer side.
+        seed: of the draws.
+
+    Raises:
+        ValueError: the camera has no size, or sees the whole board from hardly any such pose.
+
+    Example:
+        >>> setup = paper_setup()
+        >>> random_cameras(setup.fit[0], setup.board, 20).batch_shape
+        torch.Size([20])
+    """
+    if camera.size is None:
+        raise ValueError("camera: want a size, got None; give Camera(..., size=(width, height))")
+    generator = torch.Generator().manual_seed(seed)
+    points = board.points.to(camera.dtype)
+    middle, extent = points.mean(dim=0), float((points.amax(dim=0) - points.amin(dim=0)).amax())
+    upright = torch.eye(3, dtype=camera.dtype)
+    if board.axes == "paper":
+        upright = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=camera.dtype)
+    singles = [camera] if not camera.batch_shape else [camera[i] for i in _indices(camera.batch_shape)]
+    rotations, shifts = [], []
+    for single in singles:
+        R, t = torch.zeros(0, 3, 3, dtype=camera.dtype), torch.zeros(0, 3, dtype=camera.dtype)
+        for _ in range(100):
+            count = 8 * views
+            draw = torch.rand(count, 6, generator=generator, dtype=camera.dtype)
+            turned = rotation_from_euler(*((2 * draw[:, :3] - 1) * tilt).unbind(-1)) @ upright
+            depth = (distance[0] + (distance[1] - distance[0]) * draw[:, 3]) * extent
+            # The middle of the board falls anywhere on the image.
+            width, height = single.size or (0, 0)
+            where = draw[:, 4:] * torch.tensor([width - 1.0, height - 1.0], dtype=camera.dtype)
+            direction, valid = single.without_pose().directions(where)
+            direction = direction / direction.norm(dim=-1, keepdim=True)
+            shift = direction * depth.unsqueeze(-1) - turned @ middle
+            pixels, seen = single.at(turned, shift).project(points)
+            last = torch.tensor([width - 1.0, height - 1.0], dtype=camera.dtype)
+            whole = valid & (seen & (pixels >= 0).all(-1) & (pixels <= last).all(-1)).all(-1)
+            R, t = torch.cat([R, turned[whole]]), torch.cat([t, shift[whole]])
+            if len(R) >= views:
+                break
+        else:
+            raise ValueError("distance: the camera sees the whole board from hardly any such pose; move it away")
+        rotations.append(R[:views])
+        shifts.append(t[:views])
+    R = torch.stack(rotations).reshape(*camera.batch_shape, views, 3, 3)
+    t = torch.stack(shifts).reshape(*camera.batch_shape, views, 3)
+    return (camera if not camera.batch_shape else camera[..., None]).at(R, t)
 
 
 def _at_poses(camera: Camera, board: Chessboard, poses: tuple[tuple[float, ...], ...]) -> Camera:

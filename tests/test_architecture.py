@@ -9,7 +9,8 @@ PACKAGE = Path(diffproj.__file__).parent
 
 LEVELS = (
     ("_numerics", "_pytree", "_atomic"),
-    ("rotation", "interop", "lens"),
+    ("losses", "rotation", "interop", "lens"),
+    ("solver",),
     ("camera", "plane"),
     ("back_projection", "paper_route"),
     ("board",),

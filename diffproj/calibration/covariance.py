@@ -1,0 +1,203 @@
+"""The covariance of a calibration: of intrinsics, lens and every pose together, kept in blocks.
+
+Let the normal equations at the minimum have the blocks `U, E_v, W_v` (see `diffproj.solver`), and let the scores, the
+gradients of the residuals' cost, have covariances `M`. By first order of the minimiser
+
+    dx   = -S^-1 sum u_v              u_v = g_v - F_v h_v     F_v = E_v W_v^-1     S = U - sum E_v W_v^-1 E_v^T
+    dz_v = -W_v^-1 h_v - F_v^T dx
+
+so that only a few small blocks for each view are needed for any entry of the whole covariance, which for a thousand
+views would have 36 million. Two forms:
+
+* least squares with equal weights: `M = sigma^2` times the normal equations themselves, sigma^2 the residual variance
+  `sum |e|^2 / (2 n - parameters)`;
+* with weights, a robust loss or the plane objective: the sandwich form, M from the residuals themselves (White 1980),
+  and the second derivative of the loss in the normal equations (Huber 1981).
+
+A prior counts as a measurement whose variance is what it says.
+
+A parameter that the corners do not determine has an infinite variance, and covariance 0 with all others.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from diffproj.solver import Equations
+
+SINGULAR = 2e-15
+"""Eigenvalue of the reduced equations, relative to the unreduced ones, at and below which it is rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """Covariance of shared parameters and poses, for batch shape `*B`.
+
+    A pose is perturbed by `R <- exp(omega) R`, `t <- t + tau`: its six coordinates are omega in radians (about the
+    camera's axes) and tau in world units.
+
+    Attributes:
+        names: of the s shared parameters: `f_x f_y c_x c_y`, the lens's, the bow's.
+        shared: their covariance `(*B, s, s)`; rows of fixed parameters are 0.
+        undetermined: which of them the corners do not determine `(*B, s)`.
+        undetermined_views: which poses they do not determine `(*B, V)`.
+    """
+
+    names: tuple[str, ...]
+    shared: Float[Tensor, "*batch s s"]
+    undetermined: Bool[Tensor, "*batch s"]
+    undetermined_views: Bool[Tensor, "*batch v"]
+    _follow: Tensor  # F_v^T in shared coordinates (*B, V, 6, s): how the pose follows the shared parameters
+    _mixed: Tensor  # Cov(W_v^-1 h_v, dx), (*B, V, 6, s)
+    _alone: Tensor  # Cov(W_v^-1 h_v), (*B, V, 6, 6)
+
+    @property
+    def deviations(self) -> dict[str, Float[Tensor, "*batch"]]:
+        """The standard deviation of each shared parameter, by name."""
+        spread = self.shared.diagonal(dim1=-2, dim2=-1).sqrt()
+        return dict(zip(self.names, spread.unbind(-1), strict=True))
+
+    def between(self, view: int, other: int) -> Float[Tensor, "*batch 6 6"]:
+        """The covariance of two poses, or of one."""
+        F, G = self._follow[..., view, :, :], self._follow[..., other, :, :]
+        Q, P = self._mixed[..., view, :, :], self._mixed[..., other, :, :]
+        blocks = F @ _finite(self.shared) @ G.mT - Q @ G.mT - F @ P.mT
+        if view % self._alone.shape[-3] == other % self._alone.shape[-3]:
+            blocks = blocks + self._alone[..., view, :, :]
+        return blocks
+
+    def cross(self, view: int) -> Float[Tensor, "*batch 6 s"]:
+        """The covariance of a pose (rows) with the shared parameters (columns)."""
+        return self._mixed[..., view, :, :] - self._follow[..., view, :, :] @ _finite(self.shared)
+
+    def view(self, view: int) -> Float[Tensor, "*batch sp sp"]:
+        """The joint covariance of the shared parameters and the pose of one view, `(*B, s + 6, s + 6)`."""
+        cross, pose = self.cross(view), self.between(view, view)
+        unknown = self.undetermined_views[..., view, None, None]
+        infinite = torch.diag_embed(torch.full_like(pose[..., 0], torch.inf))
+        pose, cross = torch.where(unknown, infinite, pose), torch.where(unknown, 0.0, cross)
+        return torch.cat([torch.cat([self.shared, cross.mT], dim=-1), torch.cat([cross, pose], dim=-1)], dim=-2)
+
+    def full(self) -> Float[Tensor, "*batch all all"]:
+        """The whole covariance `(*B, s + 6 V, s + 6 V)`: shared parameters, then the poses in order.
+
+        Infinite variances stand on the diagonal only. Its size grows with the square of the number of views.
+        """
+        V = self._alone.shape[-3]
+        F, Q = self._follow.flatten(-3, -2), self._mixed.flatten(-3, -2)
+        known = self.undetermined_views.repeat_interleave(6, dim=-1).logical_not().to(F.dtype)
+        poses = F @ _finite(self.shared) @ F.mT - Q @ F.mT - F @ Q.mT
+        poses = poses + torch.stack(
+            [torch.nn.functional.pad(self._alone[..., v, :, :], (6 * v, 6 * (V - 1 - v))) for v in range(V)], dim=-3
+        ).flatten(-3, -2)
+        cross = (Q - F @ _finite(self.shared)) * known.unsqueeze(-1)
+        poses = poses * known.unsqueeze(-1) * known.unsqueeze(-2)
+        poses = poses + torch.diag_embed(torch.where(known > 0, 0.0, torch.inf))
+        return torch.cat([torch.cat([self.shared, cross.mT], dim=-1), torch.cat([cross, poses], dim=-1)], dim=-2)
+
+
+def _finite(covariance: Tensor) -> Tensor:
+    return torch.where(covariance.isinf(), 0.0, covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """The covariance of the scores, view by view: shared with shared `(P, V, s, s)`, with local, local with local."""
+
+    U: Tensor
+    E: Tensor
+    W: Tensor
+
+
+def covariance(
+    equations: Equations,
+    names: Sequence[str],
+    variance: Tensor,
+    *,
+    basis: Tensor | None = None,
+    precision: Tensor | None = None,
+    scores: Scores | None = None,
+) -> Covariance:
+    """The covariance of P calibrations, from their normal equations.
+
+    Args:
+        equations: undamped, at the minimum, the prior's precision included in U.
+        names: of the s shared parameters.
+        variance: of a residual's component, `(P,)`; not used with `scores`.
+        basis: along which the shared parameters move `(P, s, q)`.
+        precision: the prior's `(P, s, s)`.
+        scores: for the sandwich form.
+    """
+    U, E, W = equations.U, equations.E, equations.W
+    if basis is not None:
+        T = basis.mT
+        U, E = T @ U @ basis, T.unsqueeze(1) @ E
+        precision = None if precision is None else T @ precision @ basis
+        if scores is not None:
+            scores = Scores(T.unsqueeze(1) @ scores.U @ basis.unsqueeze(1), T.unsqueeze(1) @ scores.E, scores.W)
+    inverse_W, unknown_views = _local_inverse(W)
+    F = E @ inverse_W  # (P, V, q, 6)
+    S = U - (F @ E.mT).sum(1)
+    inverse_S, unknown = _inverse(S, U.diagonal(dim1=-2, dim2=-1))
+    prior = torch.zeros_like(S) if precision is None else precision
+    if scores is None:
+        v = variance[:, None, None]
+        middle = v * (S - prior) + prior
+        mixed = torch.zeros_like(F.mT)
+        alone = v.unsqueeze(1) * inverse_W
+    else:
+        leaning = F @ scores.E.mT
+        middle = (scores.U - leaning - leaning.mT + F @ scores.W @ F.mT).sum(1) + prior
+        mixed = inverse_W @ (scores.E.mT - scores.W @ F.mT) @ inverse_S.unsqueeze(1)
+        alone = inverse_W @ scores.W @ inverse_W
+    shared = inverse_S @ middle @ inverse_S
+    follow = F.mT
+    if basis is not None:
+        # In all coordinates the poses follow the free directions: any left inverse of the basis does.
+        left = torch.linalg.pinv(basis)
+        shared, mixed, follow = basis @ shared @ basis.mT, mixed @ basis.mT.unsqueeze(1), follow @ left.unsqueeze(1)
+        unknown = (basis.abs() @ unknown.to(basis).unsqueeze(-1)).squeeze(-1) > 0
+    shared = (shared + shared.mT) / 2
+    shared = torch.where(unknown.unsqueeze(-1) | unknown.unsqueeze(-2), 0.0, shared)
+    shared = shared + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(shared))
+    return Covariance(tuple(names), shared, unknown, unknown_views, follow, mixed, (alone + alone.mT) / 2)
+
+
+def reshaped(covariance: Covariance, batch: Sequence[int]) -> Covariance:
+    """The covariance of `(P, ...)` problems with the batch shape `*B` in the place of P."""
+    parts = {
+        name: getattr(covariance, name).unflatten(0, batch) if batch else getattr(covariance, name).squeeze(0)
+        for name in ("shared", "undetermined", "undetermined_views", "_follow", "_mixed", "_alone")
+    }
+    return Covariance(covariance.names, **parts)
+
+
+def _inverse(S: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+    """The inverse `(P, q, q)` where there is one, and which unknowns have none `(P, q)`; `size` scales the axes."""
+    sound = S.isfinite().all(-1).all(-1)
+    S = torch.where(sound[:, None, None], S, torch.eye(S.shape[-1], dtype=S.dtype, device=S.device))
+    scale = torch.where((size > 0) & size.isfinite(), size, 1.0).rsqrt()
+    values, vectors = torch.linalg.eigh(S * scale.unsqueeze(-1) * scale.unsqueeze(-2))
+    lost = values <= SINGULAR
+    inverse = (
+        vectors @ torch.diag_embed(torch.where(lost, 0.0, torch.where(lost, 1.0, values).reciprocal())) @ vectors.mT
+    )
+    unknown = ((vectors.square() * lost.unsqueeze(-2)).sum(-1) > 1e-6) | ~sound.unsqueeze(-1)
+    return inverse * scale.unsqueeze(-1) * scale.unsqueeze(-2), unknown
+
+
+def _local_inverse(W: Tensor) -> tuple[Tensor, Tensor]:
+    """The inverses of the poses' blocks `(P, V, 6, 6)`, 0 where there is none, and where that is."""
+    size = W.diagonal(dim1=-2, dim2=-1)
+    scale = torch.where((size > 0) & size.isfinite(), size, 1.0).rsqrt()
+    scaled = W * scale.unsqueeze(-1) * scale.unsqueeze(-2)
+    L, failed = torch.linalg.cholesky_ex(torch.where(scaled.isfinite(), scaled, 0.0))
+    # A pivot is what is left of a unit diagonal: one that is rounding says that the pose is not determined.
+    unknown = (failed > 0) | (L.diagonal(dim1=-2, dim2=-1).square() <= 1e-13).any(-1)
+    identity = torch.eye(W.shape[-1], dtype=W.dtype, device=W.device)
+    L = torch.where(unknown[..., None, None], identity, L)
+    inverse = torch.cholesky_inverse(L) * scale.unsqueeze(-1) * scale.unsqueeze(-2)
+    return torch.where(unknown[..., None, None], 0.0, inverse), unknown

@@ -1,0 +1,87 @@
+"""What calibration is given, checked: views, board and weights."""
+
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from diffproj._numerics import precise
+from diffproj.board import Views
+from diffproj.calibration.fit import Task
+from diffproj.calibration.reprojection import LensModel
+
+
+@runtime_checkable
+class PlanarTarget(Protocol):
+    """What is calibrated against: anything with points, such as `Chessboard`."""
+
+    @property
+    def points(self) -> Float[Tensor, "n 3"]:
+        """World points `(N, 3)` on the plane z = 0, in the order of the views' corners."""
+        ...
+
+
+class Data:
+    """Views and board, checked, in float64, with the cameras' axes flattened to P.
+
+    Attributes:
+        views, board: as given.
+        batch: `*B`.
+        points: the board's `(N, 3)`, without graph.
+        pixels: `(P, V, N, 2)`, without graph.
+        used: `(P, V, N)`: seen, in a view with at least 4 corners.
+        weights: `(P, V, N)`, without graph, or `None`.
+        given_points, given_pixels, given_weights: with graph, and with `*B` in front.
+
+    Raises:
+        TypeError: views are no `Views`.
+        ValueError: views, board and weights do not fit together, or the board is of no use.
+    """
+
+    def __init__(self, views: Views, board: PlanarTarget, weights: Tensor | None) -> None:
+        if not isinstance(views, Views):
+            raise TypeError(f"views: want dp.Views, got {type(views).__name__}; dp.Views(pixels, size=...) makes them")
+        if len(views) == 0:
+            raise ValueError("views: want at least one, got none")
+        self.views, self.board, self.batch = views, board, views.batch_shape
+        self.given_points = precise(board.points.to(views.device))
+        self.given_pixels = precise(views.pixels)
+        points = self.given_points.detach()
+        count = views.pixels.shape[-2]
+        if points.shape != (count, 3):
+            raise ValueError(
+                f"views: want {points.shape[0]} corners in each as the board has, got {count}; "
+                "do columns and rows of the board fit?"
+            )
+        _check_points(points)
+        self.points = points
+        self.pixels = self.given_pixels.detach().reshape(-1, *views.pixels.shape[-3:])
+        visible = views.visible.reshape(self.pixels.shape[:-1])
+        self.used = visible & (visible.sum(-1, keepdim=True) >= 4)
+        self.given_weights, self.weights = None, None
+        if weights is not None:
+            try:
+                self.given_weights = precise(torch.as_tensor(weights).to(views.device)).expand(views.visible.shape)
+            except RuntimeError:
+                want, got = tuple(views.visible.shape), tuple(weights.shape)
+                raise ValueError(f"weights: want a shape that broadcasts to {want}, got {got}") from None
+            if not bool((self.given_weights.detach()[views.visible] >= 0).all()):
+                raise ValueError("weights: want numbers of at least 0, got negative ones or NaN")
+            self.weights = self.given_weights.detach().reshape(visible.shape)
+
+    def task(self, model: LensModel, **options: Any) -> Task:
+        """What is to be minimised on these corners."""
+        return Task(self.points, self.pixels, self.used, model, weights=self.weights, **options)
+
+
+def _check_points(points: Tensor) -> None:
+    if not bool(points.isfinite().all()) or bool((points[:, 2] != 0).any()):
+        raise ValueError("board: want finite points, all on z = 0")
+    apart = torch.cdist(points, points) + torch.eye(len(points), dtype=points.dtype, device=points.device).mul(1e300)
+    extent = (points - points.mean(0)).abs().amax()
+    if len(points) < 4 or bool(apart.amin() <= 1e-9 * extent):
+        i, j = divmod(int(apart.argmin()), len(points)) if len(points) > 1 else (0, 0)
+        raise ValueError(f"board: want at least 4 points, all distinct, got {len(points)} with {i} and {j} alike")
+    if float(torch.linalg.svdvals(points[:, :2] - points[:, :2].mean(0))[1]) <= 1e-9 * float(extent):
+        raise ValueError("board: want points that do not lie on one line")

@@ -1,0 +1,261 @@
+"""From a start to a calibration: solve, reject outliers, solve again, and say how it ended.
+
+Everything here works on P cameras side by side, batch axes flattened. `Task` holds what is to be minimised; `fit` runs
+the solver over it in blocks of cameras that stay in the processor's cache.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration import covariance as covariances
+from diffproj.calibration.board_error import BoardError
+from diffproj.calibration.covariance import Covariance, Scores
+from diffproj.calibration.reprojection import POSE, LensModel, Reprojection, shared_names
+from diffproj.calibration.result import Objective
+from diffproj.losses import Loss
+from diffproj.solver import Equations, Prior, Solution, Status, solve
+
+BLOCK_CORNERS = 6000
+"""Corners solved at once on a CPU: eight cameras of 13 views, whose panels stay in the cache."""
+ROUNDS = 10
+"""Of rejecting outliers, at most."""
+NEGLIGIBLE_PX = 1e-11
+"""Residuals of this size are rounding of pixel coordinates."""
+
+Progress = Callable[[int, int], Any]
+"""Called with how many steps were done and how many there are at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is minimised, for P cameras of V views with N corners.
+
+    Attributes:
+        points: the board's points `(N, 3)`.
+        pixels: `(P, V, N, 2)`.
+        used: `(P, V, N)`.
+        lens, bow: the model.
+        objective: on the image or on the board.
+        weights: `(P, V, N)`, or `None` for 1 everywhere.
+        loss: a robust loss, or `None` for least squares.
+        prior: on the shared parameters.
+        basis: along which they move.
+    """
+
+    points: Tensor
+    pixels: Tensor
+    used: Tensor
+    lens: LensModel
+    bow: bool = False
+    objective: Objective = "image"
+    weights: Tensor | None = None
+    loss: Loss | None = None
+    prior: Prior | None = None
+    basis: Tensor | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the shared parameters."""
+        return shared_names(self.lens, self.bow)
+
+    @property
+    def problem(self) -> Reprojection:
+        """Residuals and Jacobians."""
+        kind = BoardError if self.objective == "plane" else Reprojection
+        return kind(self.points, self.pixels, self.used, self.lens, self.bow)
+
+    def part(self, where: slice) -> "Task":
+        """Some of the cameras."""
+        cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}
+        cut |= {name: None if (whole := getattr(self, name)) is None else whole[where] for name in ("weights", "basis")}
+        prior = None if self.prior is None else Prior(*(part[where] for part in self.prior))
+        return replace(self, **cut, prior=prior)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where P cameras ended.
+
+    Attributes:
+        task: what was minimised, with the corners that were used in the end.
+        solution: the solver's.
+        rejected: outliers `(P, V, N)`.
+    """
+
+    task: Task
+    solution: Solution
+    rejected: Tensor
+
+    def residual_variance(self) -> Tensor:
+        """`sum |e|^2 / (2 n - parameters)` of the least-squares problem, `(P,)`; NaN where nothing is left over."""
+        cost = self.solution.cost
+        if self.task.prior is not None:
+            off = self.solution.shared - self.task.prior.mean
+            cost = cost - (off.unsqueeze(-2) @ self.task.prior.precision @ off.unsqueeze(-1)).flatten() / 2
+        spare = self.degrees_of_freedom()
+        return torch.where(spare > 0, 2 * cost / spare, torch.nan)
+
+    def degrees_of_freedom(self) -> Tensor:
+        """Residuals less parameters `(P,)`."""
+        used = self.task.used
+        shared = self.task.names if self.task.basis is None else range(self.task.basis.shape[-1])
+        return 2 * used.sum((-2, -1)) - len(shared) - POSE * used.any(-1).sum(-1)
+
+    def plain_covariance(self) -> Covariance:
+        """As if all corners weighed the same."""
+        prior = self.task.prior
+        return covariances.covariance(
+            self.solution.equations,
+            self.task.names,
+            self.residual_variance(),
+            basis=self.task.basis,
+            precision=None if prior is None else prior.precision,
+        )
+
+    def covariance(self) -> Covariance:
+        """The form that fits the task: see `diffproj.calibration.covariance`."""
+        task = self.task
+        if task.weights is None and task.loss is None and task.objective == "image":
+            return self.plain_covariance()
+        shared, local = self.solution.shared, self.solution.local
+        panel = task.problem.linearise(shared, local)
+        rows, residual = panel[:, :, :-1], panel[:, :, -1]
+        score = (rows * residual.unsqueeze(2)).sum(3)  # (P, V, s + 6, N): of each corner, without its weight
+        squared = residual.square().sum(2)
+        weight = torch.ones_like(squared) if task.weights is None else task.weights
+        slope, bend = _derivatives(task.loss, squared)
+        flat = rows.flatten(-2)
+        both = (weight * slope).unsqueeze(2)
+        H = (flat * both.repeat(1, 1, 1, 2)) @ flat.mT + (score * (2 * weight * bend).unsqueeze(2)) @ score.mT
+        n = 2 * task.used.sum((-2, -1))
+        correction = (n / self.degrees_of_freedom().clamp(min=1))[:, None, None, None]
+        M = (score * both.square()) @ score.mT * correction
+        s = len(task.names)
+        U = H[..., :s, :s].sum(1)
+        precision = None if task.prior is None else task.prior.precision
+        return covariances.covariance(
+            Equations(
+                U if precision is None else U + precision,
+                H[..., :s, s:],
+                H[..., s:, s:],
+                *self.solution.equations[3:],
+            ),
+            task.names,
+            torch.ones_like(U[:, 0, 0]),
+            basis=task.basis,
+            precision=precision,
+            scores=Scores(M[..., :s, :s], M[..., :s, s:], M[..., s:, s:]),
+        )
+
+
+def fit(
+    task: Task,
+    shared: Tensor,
+    local: tuple[Tensor, ...],
+    *,
+    reject: float | None = None,
+    max_iterations: int = 50,
+    tolerance: float = 1e-13,
+    progress: Progress | None = None,
+) -> Fit:
+    """Minimise; with `reject`, leave out corners whose residual exceeds so many robust deviations, and repeat.
+
+    The robust deviation of a camera is 1.4826 times the median of its residuals' components (Rousseeuw and Leroy 1987).
+    """
+    given = task.used
+    options = {"max_iterations": max_iterations, "tolerance": tolerance}
+    blocks = _blocks(task)
+
+    def attempt(task: Task, shared: Tensor, local: tuple[Tensor, ...]) -> Solution:
+        tell = progress or _tell_nobody
+        total = len(blocks) * max_iterations
+        parts = []
+        for number, where in enumerate(blocks):
+            report = partial(_report, tell, number * max_iterations, total)
+            parts.append(_solve(task.part(where), shared[where], tuple(z[where] for z in local), report, **options))
+        tell(total, total)
+        return parts[0] if len(parts) == 1 else _joined(parts)
+
+    solution = attempt(task, shared, local)
+    iterations = solution.iterations
+    if reject is not None:
+        for _ in range(ROUNDS):
+            # Views that fell below four corners keep the pose that they had.
+            kept = _without_outliers(replace(task, used=given), solution, reject)
+            if torch.equal(kept, task.used):
+                break
+            task = replace(task, used=kept)
+            solution = attempt(task, solution.shared, solution.local)
+            iterations = iterations + solution.iterations
+    return Fit(task, solution._replace(iterations=iterations), given & ~task.used)
+
+
+def _tell_nobody(done: int, total: int) -> None:
+    pass
+
+
+def _report(tell: Progress, before: int, total: int, step: int, _: Tensor) -> None:
+    tell(before + step, total)
+
+
+def _solve(task: Task, shared: Tensor, local: tuple[Tensor, ...], report: Any, **options: Any) -> Solution:
+    size = task.used.sum((-2, -1)).amax().clamp(min=1).item()
+    unit = NEGLIGIBLE_PX if task.objective == "image" else 1e-13 * float(task.points.abs().amax())
+    return solve(
+        task.problem,
+        shared,
+        local,
+        local_size=POSE,
+        weights=task.weights,
+        loss=task.loss,
+        prior=task.prior,
+        basis=task.basis,
+        negligible=size * unit**2,
+        progress=report,
+        **options,
+    )
+
+
+def _blocks(task: Task) -> list[slice]:
+    P, V, N, _ = task.pixels.shape
+    length = P if task.pixels.device.type != "cpu" else max(1, min(P, BLOCK_CORNERS // max(1, V * N)))
+    return [slice(start, start + length) for start in range(0, P, length)]
+
+
+def _joined(parts: list[Solution]) -> Solution:
+    return Solution(
+        torch.cat([part.shared for part in parts]),
+        tuple(torch.cat(pieces) for pieces in zip(*(part.local for part in parts), strict=True)),
+        torch.cat([part.cost for part in parts]),
+        torch.cat([part.status for part in parts]),
+        torch.cat([part.iterations for part in parts]),
+        Equations(*(torch.cat(pieces) for pieces in zip(*(part.equations for part in parts), strict=True))),
+    )
+
+
+def _without_outliers(task: Task, solution: Solution, limit: float) -> Tensor:
+    """Which of the given corners are no outliers, at least four in a view or none `(P, V, N)`."""
+    residual = task.problem.linearise(solution.shared, solution.local)[:, :, -1]
+    components = torch.where(task.used.unsqueeze(2), residual.abs(), torch.nan)
+    sigma = 1.4826 * components.flatten(1).nanmedian(-1).values
+    kept = task.used & (residual.square().sum(2) <= (limit * sigma[:, None, None]).square())
+    return kept & (kept.sum(-1, keepdim=True) >= 4)
+
+
+def _derivatives(loss: Loss | None, squared: Tensor) -> tuple[Tensor, Tensor]:
+    """First and second derivative of the loss by the squared residual."""
+    if loss is None:
+        return torch.ones_like(squared), torch.zeros_like(squared)
+    with torch.enable_grad():
+        e2 = squared.detach().requires_grad_()
+        slope = loss.weight(e2)
+        bend = torch.autograd.grad(slope.sum(), e2, allow_unused=True)[0] if slope.requires_grad else None
+    return slope.detach(), torch.zeros_like(squared) if bend is None else bend
+
+
+__all__ = ["Fit", "Progress", "Status", "Task", "fit"]

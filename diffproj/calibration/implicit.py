@@ -1,0 +1,88 @@
+"""Gradients through the minimum, by the implicit function theorem.
+
+At a minimum the gradient of the cost by the parameters theta vanishes whatever the data d are, so that
+
+    d theta / d d = -H^-1 d(gradient) / d d        H = the exact second derivative of the cost
+
+which `theta - H^-1 gradient(theta, d)`, with theta and H cut from the graph, has as its first derivative; its value is
+theta to rounding. H has the arrow shape of the normal equations and is reduced block by block in the same way.
+"""
+
+import torch
+from torch import Tensor
+
+from diffproj.back_projection import back_project
+from diffproj.calibration.board_error import assembled
+from diffproj.calibration.data import Data
+from diffproj.calibration.fit import Fit, Task
+from diffproj.calibration.reprojection import POSE, bow_shape, moved
+from diffproj.plane import Plane
+from diffproj.solver import Prior
+
+
+def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
+    """The same fit with shared parameters and poses that carry gradients to pixels, points, weights and prior."""
+    task, solution = found.task, found.solution
+    P, V = task.pixels.shape[:2]
+    s = len(task.names)
+    pixels = data.given_pixels.reshape(task.pixels.shape)
+    weights = None if data.given_weights is None else data.given_weights.reshape(task.used.shape)
+    with torch.enable_grad():
+        # Each view has its own copy of the shared parameters, so that one backward pass gives a row of every block.
+        theta = solution.shared.new_zeros(P, V, s + POSE, requires_grad=True)
+        cost = _costs(task, solution.shared.unsqueeze(1) + theta[..., :s], theta[..., s:], pixels, data, weights, found)
+        gradient = torch.autograd.grad(cost.sum(), theta, create_graph=True)[0]
+        H = torch.stack(
+            [torch.autograd.grad(gradient[..., i].sum(), theta, retain_graph=True)[0] for i in range(s + POSE)], dim=-2
+        ).detach()
+        U, g = H[..., :s, :s].sum(1), gradient[..., :s].sum(1)
+        if prior is not None:
+            U = U + prior.precision.detach()
+            g = g + (prior.precision @ (solution.shared - prior.mean).unsqueeze(-1)).squeeze(-1)
+        E, W, h = H[..., :s, s:], H[..., s:, s:], gradient[..., s:]
+        if task.basis is not None:
+            T = task.basis.mT
+            U, E, g = T @ U @ task.basis, T.unsqueeze(1) @ E, (T @ g.unsqueeze(-1)).squeeze(-1)
+        # A view that takes no part has W = 0 and h = 0: its pose stays.
+        idle = ~task.used.any(-1)[..., None, None] * torch.eye(POSE, dtype=W.dtype, device=W.device)
+        F = torch.linalg.solve_ex((W + idle).mT, E.mT)[0].mT
+        S = U - (F @ E.mT).sum(1)
+        reduced = g - (F @ h.unsqueeze(-1)).squeeze(-1).sum(1)
+        dx = -torch.linalg.solve_ex(S, reduced.unsqueeze(-1))[0]
+        dz = -torch.linalg.solve_ex(W + idle, h.unsqueeze(-1) + E.mT @ dx.unsqueeze(1))[0].squeeze(-1)
+        if task.basis is not None:
+            dx = task.basis @ dx
+        shared = solution.shared + _gradient_only(dx.squeeze(-1))
+        local = moved(solution.local, _gradient_only(dz))
+    return Fit(task, solution._replace(shared=shared, local=local), found.rejected)
+
+
+def _gradient_only(step: Tensor) -> Tensor:
+    """Zero with the step's derivative: the solver's minimum stays what it is, bit for bit."""
+    return step - step.detach()
+
+
+def _costs(
+    task: Task, shared: Tensor, step: Tensor, pixels: Tensor, data: Data, weights: Tensor | None, found: Fit
+) -> Tensor:
+    """The cost of each view `(P, V)`, a graph on shared `(P, V, s)`, pose step, pixels, points and weights."""
+    flat = shared.flatten(0, 1)
+    local = tuple(z.unsqueeze(1) for z in moved(found.solution.local, step))
+    cameras = assembled(task.lens, flat, tuple(z.flatten(0, 2).unsqueeze(1) for z in local))
+    points = data.given_points.expand(len(flat), 1, -1, 3)
+    if task.bow:
+        z = (flat[:, None, -2:, None] * bow_shape(data.given_points)).sum(2)
+        points = points + torch.nn.functional.pad(z.unsqueeze(-1), (2, 0))
+    seen = torch.where(task.used.unsqueeze(-1), pixels, 0.0).flatten(0, 1).unsqueeze(1)
+    if task.objective == "plane":
+        landed, valid = back_project(seen, cameras, Plane.z(0.0))
+        residual = (landed - points)[..., :2]
+    else:
+        projected, valid = cameras.project(points)
+        residual = projected - seen
+    counts = (task.used.flatten(0, 1).unsqueeze(1) & valid).unsqueeze(-1)
+    squared = torch.where(counts, residual, 0.0).square().sum(-1)
+    value = squared if task.loss is None else task.loss.value(squared)
+    if weights is not None:
+        value = value * weights.flatten(0, 1).unsqueeze(1)
+    return value.sum((-2, -1)).unflatten(0, task.used.shape[:2]) / 2

@@ -1,0 +1,96 @@
+"""The solver's starting point: from a camera that is known roughly, or from nothing but the size of the image."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration import start
+from diffproj.calibration.board_error import assembled
+from diffproj.calibration.data import Data
+from diffproj.calibration.reprojection import COEFFICIENTS, LensModel, lens_model
+from diffproj.camera import Camera
+
+
+def from_camera(camera: Camera, data: Data, bow: bool) -> tuple[Tensor, tuple[Tensor, Tensor], LensModel]:
+    """Shared parameters and poses to start from."""
+    model = lens_model(camera.distortion)
+    camera = camera.detach().to(data.points.device, data.points.dtype)
+    if bool((camera.K[..., 0, 1] != 0).any() or (camera.K[..., 1, 0] != 0).any()):
+        raise ValueError("camera: want no skew, got K[..., 0, 1] or K[..., 1, 0] other than 0")
+    posed = len(camera.batch_shape) == len(data.batch) + 1
+    intrinsics = camera[..., 0] if posed else camera
+    try:
+        if posed:
+            camera = camera.at(camera.R.expand(*data.batch, len(data.views), 3, 3), camera.t)
+        K = intrinsics.K.expand(*data.batch, 3, 3).reshape(-1, 3, 3)
+        parts = [K.diagonal(dim1=-2, dim2=-1)[:, :2], K[:, :2, 2]]
+        if intrinsics.distortion is not None:
+            coefficients: Tensor = intrinsics.distortion.coefficients  # type: ignore[attr-defined]
+            parts.append(coefficients.expand(*data.batch, -1).reshape(len(K), -1))
+    except (RuntimeError, ValueError):
+        shape = tuple(camera.batch_shape)
+        raise ValueError(
+            f"camera: want a batch shape that broadcasts to {tuple(data.batch)} or is {(*data.batch, len(data.views))} "
+            f"with the poses to start from, got {shape}"
+        ) from None
+    shared = torch.cat([*parts, K.new_zeros(len(K), 2 * bow)], dim=-1)
+    if posed:
+        return shared, (camera.R.reshape(-1, len(data.views), 3, 3), camera.t.reshape(-1, len(data.views), 3)), model
+    upright = torch.eye(3, dtype=K.dtype, device=K.device).expand(*data.used.shape[:2], 3, 3)
+    views = assembled(model, shared, (upright, torch.zeros_like(upright[..., 0])))
+    direction, valid = views.directions(data.pixels)
+    ahead = valid & (direction[..., 2] > 0.25 * direction.norm(dim=-1))
+    xy = direction[..., :2] / torch.where(ahead, direction[..., 2], 1.0).unsqueeze(-1)
+    H = start.homographies(data.points, xy, data.used & ahead)
+    return shared, start.poses(H, data.points), model
+
+
+def from_nothing(
+    data: Data, model: LensModel, size: tuple[int, int], tied: bool, bow: bool
+) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """Shared parameters and poses to start from, with nothing known but the size of the image."""
+    middle = data.pixels.new_tensor([(size[0] - 1) / 2, (size[1] - 1) / 2]).expand(len(data.pixels), 2)
+    rest = middle.new_zeros(len(middle), COEFFICIENTS[model] + 2 * bow)
+    if model == "fisheye":
+        return _fisheye(data, middle, rest, float(max(size)), bow)
+    return _perspective(data, middle, rest, size, tied, model != "none")
+
+
+def _perspective(
+    data: Data, middle: Tensor, rest: Tensor, size: tuple[int, int], tied: bool, bent: bool
+) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """Straighten the image with a lens of one number, then Zhang's equations."""
+    radius = 0.5 * math.hypot(*size)
+    lam = (
+        start.division(data.points, data.pixels, data.used, middle, radius) if bent else torch.zeros_like(middle[:, 0])
+    )
+    pixels = start.without_division(data.pixels, middle, lam, radius) if bent else data.pixels
+    H = start.homographies(data.points, pixels, data.used)
+    f = start.focal_lengths(H, middle, float(max(size)), data.used.any(-1), tied)
+    upper = (H[..., :2, :] - middle[:, None, :, None] * H[..., 2:, :]) / f[:, None, :, None]
+    pose = start.poses(torch.cat([upper, H[..., 2:, :]], dim=-2), data.points)
+    if bent:
+        # distorted = centred (1 + lambda |distorted|^2) = centred (1 + k1 r^2 + 2 k1^2 r^4 + ...)
+        k1 = lam * (f.mean(-1) / radius).square()
+        rest = torch.cat([k1.unsqueeze(-1), 2 * k1.square().unsqueeze(-1), rest[:, 2:]], dim=-1)
+    return torch.cat([f, middle, rest], dim=-1), pose
+
+
+def _fisheye(
+    data: Data, middle: Tensor, rest: Tensor, longer: float, bow: bool
+) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """Of equidistant lenses with several focal lengths, the one whose poses explain the corners best."""
+    problem = data.task("fisheye", bow=bow).problem
+    tries = []
+    for scale in start.FISHEYE_SCALE:
+        f = middle.new_full((len(middle), 1), scale * longer / torch.pi)
+        xy, inside = start.equidistant_rays(data.pixels, middle, f[:, 0])
+        pose = start.poses(start.homographies(data.points, xy, data.used & inside), data.points)
+        shared = torch.cat([f, f, middle, rest], dim=-1)
+        cost = problem.linearise(shared, pose)[:, :, -1].square().sum((1, 2, 3))
+        tries.append((torch.where(cost.isfinite(), cost, torch.inf), shared, *pose))
+    costs, *starts = (torch.stack(parts) for parts in zip(*tries, strict=True))
+    best = costs.argmin(0), torch.arange(len(middle), device=middle.device)
+    shared, R, t = (candidates[best] for candidates in starts)
+    return shared, (R, t)

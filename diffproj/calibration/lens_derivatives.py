@@ -1,0 +1,157 @@
+"""Forward lens equations with their derivatives in closed form, written into the rows of a panel.
+
+For the solver's inner loop: points in the camera frame `(P, V, 3, N)`, component by component, with one lens for each
+of P problems. Each function writes the derivatives of the distorted point by the coefficients and by the point in the
+camera frame into tensors that the caller owns, `(P, V, k, 2, N)` and `(P, V, 3, 2, N)`, and returns the distorted
+point `(P, V, 2, N)` on the normalised plane.
+
+No domain is asked: a solver may pass through lenses that fold somewhere, as long as it does not end there. The
+equations are those of `diffproj.lens`, which the tests hold these to.
+"""
+
+import torch
+from torch import Tensor
+
+
+def pinhole(X_cam: Tensor, by_point: Tensor) -> Tensor:
+    """No lens: `(x, y) / z`."""
+    inverse_depth = X_cam[:, :, 2].reciprocal()
+    xy = X_cam[:, :, :2] * inverse_depth.unsqueeze(2)
+    by_point.zero_()
+    by_point[:, :, 0, 0] = inverse_depth
+    by_point[:, :, 1, 1] = inverse_depth
+    torch.mul(xy, -inverse_depth.unsqueeze(2), out=by_point[:, :, 2])
+    return xy
+
+
+def brown_conrady(coefficients: Tensor, X_cam: Tensor, by_coefficient: Tensor, by_point: Tensor) -> Tensor:
+    """Brown-Conrady with 4, 5, 8, 12 or 14 coefficients `(P, k)`; the equations stand in `lens.brown_equations`."""
+    count = coefficients.shape[-1]
+    k = [column[:, None, None] for column in coefficients.unbind(-1)]
+    inverse_depth = X_cam[:, :, 2].reciprocal()
+    xy = X_cam[:, :, :2] * inverse_depth.unsqueeze(2)
+    x, y = xy.unbind(2)
+    product, s = x * y, xy.square().sum(2)
+
+    # Radial: rows k1, k2, k3 are x s, x s^2, x s^3 over the denominator; k4, k5, k6 those times -g.
+    above = [k[0], k[1], *k[4:5]]
+    growth, slope = _polynomial(s, above), _polynomial(s, [(power + 1) * a for power, a in enumerate(above)])
+    g = torch.addcmul(torch.ones_like(s), growth, s)
+    rows = by_coefficient
+    s_row = s.unsqueeze(2)
+    first = xy
+    if count >= 8:
+        below = k[5:8]
+        inverse = torch.addcmul(torch.ones_like(s), _polynomial(s, below), s).reciprocal()
+        below_slope = _polynomial(s, [(power + 1) * b for power, b in enumerate(below)])
+        g = g * inverse
+        slope = (slope - g * below_slope) * inverse
+        first = xy * inverse.unsqueeze(2)
+    torch.mul(first, s_row, out=rows[:, :, 0])
+    torch.mul(rows[:, :, 0], s_row, out=rows[:, :, 1])
+    if count >= 5:
+        torch.mul(rows[:, :, 1], s_row, out=rows[:, :, 4])
+    if count >= 8:
+        minus_g = -g.unsqueeze(2)
+        for power, row in ((0, 5), (1, 6), (4, 7)):
+            torch.mul(rows[:, :, power], minus_g, out=rows[:, :, row])
+
+    # Tangential: p1 gives (2 x y, s + 2 y^2), p2 gives (s + 2 x^2, 2 x y).
+    twice = 2 * product
+    rows[:, :, 2, 0] = twice
+    torch.add(s, y.square(), alpha=2, out=rows[:, :, 2, 1])
+    torch.add(s, x.square(), alpha=2, out=rows[:, :, 3, 0])
+    rows[:, :, 3, 1] = twice
+    p1, p2 = k[2], k[3]
+    factor = g + 2 * (p1 * y + p2 * x)
+    distorted = xy * factor.unsqueeze(2)
+    sideways = torch.stack([p2, p1], dim=2)
+    steep = 2 * sideways
+    if count >= 12:
+        prism = torch.stack([k[8], k[10]], dim=2), torch.stack([k[9], k[11]], dim=2)
+        sideways = sideways + prism[0] + prism[1] * s_row
+        steep = 2 * sideways + 2 * prism[1] * s_row
+        for row, (component, power) in enumerate(((0, s), (0, s * s), (1, s), (1, s * s)), start=8):
+            rows[:, :, row, component] = power
+            rows[:, :, row, 1 - component] = 0.0
+    distorted = torch.addcmul(distorted, s_row, sideways)
+
+    # d(x', y') = factor dxy + xy (2 g' xy + (2 p2, 2 p1)) . dxy + steep xy . dxy
+    toward = torch.addcmul(2 * torch.stack([p2, p1], dim=2), xy, 2 * slope.unsqueeze(2))
+    by_x = torch.addcmul(xy * toward[:, :, :1], steep, x.unsqueeze(2))
+    by_y = torch.addcmul(xy * toward[:, :, 1:], steep, y.unsqueeze(2))
+    by_x[:, :, 0] += factor
+    by_y[:, :, 1] += factor
+    if count == 14:
+        distorted, by_x, by_y = _tilt(k[12], k[13], distorted, by_x, by_y, rows)
+    by_x *= inverse_depth.unsqueeze(2)
+    by_y *= inverse_depth.unsqueeze(2)
+    by_point[:, :, 0], by_point[:, :, 1] = by_x, by_y
+    torch.mul(by_x, x.unsqueeze(2), out=by_point[:, :, 2])
+    by_point[:, :, 2].addcmul_(by_y, y.unsqueeze(2)).neg_()
+    return distorted
+
+
+def fisheye(coefficients: Tensor, X_cam: Tensor, by_coefficient: Tensor, by_point: Tensor) -> Tensor:
+    """Kannala-Brandt with 4 coefficients `(P, 4)`; the equations stand in `lens.kannala_brandt`."""
+    k = [column[:, None, None] for column in coefficients.unbind(-1)]
+    xy, z = X_cam[:, :, :2], X_cam[:, :, 2]
+    side = torch.hypot(*xy.unbind(2))
+    apart = side > 0
+    safe = torch.where(apart, side, 1.0)
+    unit = xy / safe.unsqueeze(2)
+    length_squared = side.square() + z.square()
+    theta = torch.atan2(side, z)
+    square = theta.square()
+    profile = _polynomial(square, k)
+    slope = _polynomial(square, [odd * column for odd, column in zip((3, 5, 7, 9), k, strict=True)])
+    theta_d = torch.addcmul(theta, profile * square, theta)
+    slope = 1 + slope * square
+
+    power = theta
+    for row in range(4):
+        power = power * square
+        torch.mul(unit, power.unsqueeze(2), out=by_coefficient[:, :, row])
+    # Across the direction from the axis the point moves with theta_d / side, along it with the slope.
+    across = torch.where(apart, theta_d / safe, z.reciprocal())
+    along = slope * z / length_squared
+    torch.mul(unit, (unit[:, :, 0] * (along - across)).unsqueeze(2), out=by_point[:, :, 0])
+    torch.mul(unit, (unit[:, :, 1] * (along - across)).unsqueeze(2), out=by_point[:, :, 1])
+    by_point[:, :, 0, 0] += across
+    by_point[:, :, 1, 1] += across
+    torch.mul(unit, (-side * slope / length_squared).unsqueeze(2), out=by_point[:, :, 2])
+    return unit * theta_d.unsqueeze(2)
+
+
+def _polynomial(s: Tensor, columns: list[Tensor]) -> Tensor:
+    """`c_0 + c_1 s + ...` of at least two columns, by Horner's rule."""
+    value = torch.addcmul(columns[-2], columns[-1], s)
+    for column in reversed(columns[:-2]):
+        value = torch.addcmul(column, value, s)
+    return value
+
+
+def _tilt(
+    tau_x: Tensor, tau_y: Tensor, xy: Tensor, by_x: Tensor, by_y: Tensor, rows: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The point on the tilted sensor, and derivatives taken on by the tilt's own Jacobian `(P, V, 2, 2, N)`."""
+    x, y = xy.unbind(2)
+    cos_x, sin_x, cos_y, sin_y = tau_x.cos(), tau_x.sin(), tau_y.cos(), tau_y.sin()
+    inverse = (sin_y * x - cos_y * sin_x * y + cos_x * cos_y).reciprocal()
+    X, Y = cos_x * x * inverse, (cos_y * y - sin_x * sin_y * x) * inverse
+    xx, xy_ = (cos_x - X * sin_y) * inverse, X * cos_y * sin_x * inverse
+    yx, yy = -(sin_x + Y) * sin_y * inverse, (1 + Y * sin_x) * cos_y * inverse
+
+    def onward(vectors: Tensor) -> Tensor:
+        u, v = vectors.unbind(-2)
+        return torch.stack([xx * u + xy_ * v, yx * u + yy * v], dim=-2)
+
+    for row in range(12):
+        rows[:, :, row] = onward(rows[:, :, row])
+    fall = -cos_y * (cos_x * y + sin_x)  # dW / dtau_x
+    rows[:, :, 12, 0] = (-sin_x * x - X * fall) * inverse
+    rows[:, :, 12, 1] = (-cos_x * sin_y * x - Y * fall) * inverse
+    fall = cos_y * x + sin_y * (sin_x * y - cos_x)  # dW / dtau_y
+    rows[:, :, 13, 0] = -X * fall * inverse
+    rows[:, :, 13, 1] = (-sin_y * y - sin_x * cos_y * x - Y * fall) * inverse
+    return torch.stack([X, Y], dim=2), onward(by_x), onward(by_y)

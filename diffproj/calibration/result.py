@@ -1,0 +1,186 @@
+"""`Calibration`: a camera with the poses of its views, what is left over, how it ended, and how sure it is."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from diffproj.board import Views
+from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.reprojection import COEFFICIENT_NAMES, bow_shape
+from diffproj.camera import Camera
+from diffproj.lens import BrownConrady, KannalaBrandt
+from diffproj.solver import Status
+
+Objective = Literal["image", "plane"]
+"""What is minimised: the distance on the image in pixels, or on the board in world units."""
+
+SENTENCES = {
+    Status.CONVERGED: "converged: no step lowers the error any more",
+    Status.MAX_ITERATIONS: "was still falling when the iterations ended: raise max_iterations, or look for mixed-up "
+    "corners",
+    Status.DIVERGED: "found no step that lowers the error: look for mixed-up corners, or start closer",
+    Status.DEGENERATE: "the views do not determine the camera",
+}
+
+
+class CalibrationError(RuntimeError):
+    """The corners do not determine the camera, or the solver did not converge; the message says which and why.
+
+    Attributes:
+        calibration: where it ended, or `None` where there is nothing to show.
+    """
+
+    def __init__(self, message: str, calibration: "Calibration | None" = None) -> None:
+        super().__init__(message)
+        self.calibration = calibration
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A camera with the poses of the views that it was found from, and those views.
+
+    Many cameras side by side have a batch shape `*B`; for one camera it is empty.
+
+    Attributes:
+        camera: intrinsics and lens with the world frame in the camera, batch shape `*B`: what one saves.
+        cameras: the same camera at the pose of each view, batch shape `(*B, V)`: `X_cam = R X_board + t`. Where no
+            corner of a view was used, its pose is only a place holder.
+        views: the corners that were given.
+        points: the board's corners `(N, 3)` in world units, as if it were flat.
+        used: which corners were used `(*B, V, N)`: seen, not rejected as outliers, and in a view with at least 4.
+        rejected: which corners were rejected as outliers `(*B, V, N)`.
+        status: how it ended, `Status` codes `(*B,)`.
+        iterations: how many steps the solver tried `(*B,)`.
+        bow: how far the middle of the board stands off its edges along x and y `(*B, 2)` in world units, where it was
+            fitted.
+        objective: what was minimised.
+        causes: for each camera that did not converge, the cause in words; `*B` flattened.
+    """
+
+    camera: Camera
+    cameras: Camera
+    views: Views
+    points: Float[Tensor, "n 3"]
+    used: Bool[Tensor, "*batch v n"]
+    rejected: Bool[Tensor, "*batch v n"]
+    status: Int[Tensor, "*batch"]
+    iterations: Int[Tensor, "*batch"]
+    bow: Float[Tensor, "*batch 2"] | None = None
+    objective: Objective = "image"
+    causes: tuple[str, ...] = ()
+    _covariance: Callable[[], Covariance] | None = None
+
+    @property
+    def board_points(self) -> Float[Tensor, "*batch n 3"]:
+        """The board's corners `(*B, N, 3)` in world units with its bow, where one was fitted."""
+        points = self.points.expand(*self.views.batch_shape, -1, -1)
+        if self.bow is None:
+            return points
+        z = (self.bow.unsqueeze(-1) * bow_shape(self.points)).sum(-2)
+        return points + torch.nn.functional.pad(z.unsqueeze(-1), (2, 0))
+
+    @property
+    def residuals(self) -> Float[Tensor, "*batch v n 2"]:
+        """Projected minus seen corners `(*B, V, N, 2)` in pixels; zero where a corner was not used."""
+        return self._residuals()[0]
+
+    @property
+    def view_rms(self) -> Float[Tensor, "*batch v"]:
+        """RMS reprojection error of each view `(*B, V)` in pixels; NaN where no corner was used."""
+        residuals, count = self._residuals()
+        return (residuals.square().sum(dim=(-2, -1)) / count).sqrt()
+
+    @property
+    def rms(self) -> Float[Tensor, "*batch"]:
+        """RMS reprojection error `(*B,)` in pixels as OpenCV defines it: `sqrt(sum |e|^2 / number of points)`."""
+        residuals, count = self._residuals()
+        return (residuals.square().sum(dim=(-3, -2, -1)) / count.sum(-1)).sqrt()
+
+    def _residuals(self) -> tuple[Tensor, Tensor]:
+        """The residuals, and how many corners of each view there are; one beyond the lens's fold does not count."""
+        projected, valid = self.cameras.project(self.board_points.unsqueeze(-3))
+        counts = self.used & valid
+        return torch.where(counts.unsqueeze(-1), projected - self.views.pixels, 0.0), counts.sum(-1)
+
+    @property
+    def converged(self) -> Bool[Tensor, "*batch"]:
+        """Whether it ended at a minimum that the views determine `(*B,)`."""
+        return self.status == Status.CONVERGED
+
+    @property
+    def message(self) -> str:
+        """How it ended, in a sentence; for many cameras, how many converged and what became of the others."""
+        codes = [Status(code) for code in self.status.flatten().tolist()]
+        causes = [cause or SENTENCES[code] for code, cause in zip(codes, self._causes(), strict=True)]
+        beyond = (self.used.sum(-1) - self._residuals()[1]).sum(-1).flatten().tolist()
+        causes = [
+            f"{cause}; {count} corners lie beyond the fold of the lens: fit one with fewer coefficients" * bool(count)
+            or cause
+            for cause, count in zip(causes, beyond, strict=True)
+        ]
+        if not self.views.batch_shape:
+            return causes[0]
+        failed = [f"camera {i}: {c}" for i, (s, c) in enumerate(zip(codes, causes, strict=True)) if s]
+        return "; ".join([f"{len(codes) - len(failed)} of {len(codes)} cameras converged", *failed])
+
+    @cached_property
+    def covariance(self) -> Covariance:
+        """The joint covariance of intrinsics, lens, bow and every pose; computed at the first call.
+
+        Raises:
+            ValueError: the calibration came from a file without one.
+        """
+        if self._covariance is None:
+            raise ValueError("covariance: want a calibration that was computed here, got one from a file without it")
+        return self._covariance()
+
+    def summary(self) -> str:
+        """One camera as a text for people: parameters with deviations, RMS of each view, how it ended.
+
+        Raises:
+            ValueError: there are many cameras.
+        """
+        if self.views.batch_shape:
+            raise ValueError(f"summary: want one camera, got batch shape {tuple(self.views.batch_shape)}; see message")
+        deviations = self.covariance.deviations if self._covariance is not None else {}
+        K = self.camera.K
+
+        def line(title: str, names: tuple[str, ...], values: list[float], form: str, unit: str) -> str:
+            pairs = zip(names, values, strict=True)
+            texts = (f"{value:{form}}{_spread(deviations.get(name), form)}" for name, value in pairs)
+            return f"{title:<16}{'  '.join(texts)}{unit}"
+
+        lines = [
+            line("focal lengths", ("f_x", "f_y"), K.diagonal()[:2].tolist(), "10.3f", " px"),
+            line("principal point", ("c_x", "c_y"), K[:2, 2].tolist(), "10.3f", " px"),
+        ]
+        lens = self.camera.distortion
+        if isinstance(lens, BrownConrady | KannalaBrandt):
+            names = ("k1", "k2", "k3", "k4") if isinstance(lens, KannalaBrandt) else COEFFICIENT_NAMES
+            for name, value in zip(names, lens.coefficients.tolist(), strict=False):
+                lines.append(line(f"lens {name}", (name,), [value], "10.5f", ""))
+        if self.bow is not None:
+            lines.append(line("bow along x, y", ("bow_x", "bow_y"), self.bow.tolist(), "10.4f", " world units"))
+        lines.append(f"{'RMS':<16}{float(self.rms):10.4f} px over {int(self.used.sum())} corners")
+        width = max(map(len, self.views.names), default=0)
+        seen, used = self.views.visible.sum(-1).tolist(), self.used.sum(-1).tolist()
+        for view, (name, rms) in enumerate(zip(self.views.names, self.view_rms.tolist(), strict=True)):
+            out = self.rejected[view].nonzero().flatten().tolist()
+            remark = f"  without corners {', '.join(map(str, out))}" if out and used[view] else ""
+            text = f"{rms:.4f} px{remark}" if used[view] else f"left out: {seen[view] - len(out)} corners, 4 are needed"
+            lines.append(f"  {name:<{width}}  {text}")
+        return "\n".join([*lines, self.message])
+
+    def _causes(self) -> tuple[str, ...]:
+        return self.causes or ("",) * max(1, self.status.numel())
+
+
+def _spread(deviation: Tensor | None, form: str) -> str:
+    if deviation is None or not float(deviation) > 0:
+        return ""
+    return " (not determined)" if bool(deviation.isinf()) else f" ± {float(deviation):.{form.split('.')[1]}}"

@@ -1,0 +1,104 @@
+"""How a calibration ended, in words: which views contradict the board, and what the views do not determine."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from diffproj.board import Chessboard
+from diffproj.calibration.fit import Fit
+from diffproj.solver import Status
+
+WORST_DEVIATION = 0.1
+"""Standard deviation of a focal length or principal point, relative to the focal length, beyond which the views are
+said not to determine it."""
+WORST_FIT = 0.1
+"""RMS residual of a view, relative to how far its corners spread, beyond which they are not the board's."""
+PARALLEL = math.radians(15)
+"""Boards closer than this to parallel say little of the focal length, and are found tilted at random."""
+
+
+def verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor, tuple[str, ...]]:
+    """The status `(P,)` of each camera, and for those that did not converge the cause; empty where there is none."""
+    task, solution = found.task, found.solution
+    used = task.used.any(-1)
+    R, t = solution.local
+    known = found.plain_covariance()
+    unpoised = used & known.undetermined_views
+    mirrored = ~unpoised & _mirrored(R, t, task.points, used, board)
+    misfits = ~unpoised & used & (_relative_error(found) > WORST_FIT)
+    unknown = known.undetermined.clone()
+    deviation = known.shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, :4]
+    unknown[:, :4] |= ~(deviation <= WORST_DEVIATION * solution.shared[:, :1].abs())
+    none = ~used.any(-1)
+    finite = solution.cost.isfinite()
+    redundant = (found.degrees_of_freedom() > 0) | (task.prior is not None)
+    if task.basis is not None and task.basis.shape[-1] == 0:  # poses alone: four corners have two residuals to spare
+        unknown[:] = False
+    status = solution.status
+    degenerate = none | mirrored.any(-1) | misfits.any(-1) | unknown.any(-1) | unpoised.any(-1) | ~redundant
+    status = torch.where(degenerate & finite & (status != Status.DIVERGED), Status.DEGENERATE, status)
+    causes = [""] * len(status)
+    if not bool(status.any()):
+        return status, tuple(causes)
+    for p in status.nonzero().flatten().tolist():
+        if bool(none[p]):
+            causes[p] = "no view shows at least 4 corners"
+        elif not bool(finite[p]):
+            causes[p] = "the corners are not finite, or the start puts the board behind the camera"
+        elif bool(unpoised[p].any()):
+            causes[p] = f"the corners of {_listed(names, unpoised[p])} do not determine a pose: do they lie on a line?"
+        elif bool(misfits[p].any()):
+            causes[p] = (
+                f"the corners of {_listed(names, misfits[p])} do not lie as the board's do: "
+                "are its columns and rows right, and is no corner mixed up?"
+            )
+        elif bool(mirrored[p].any()):
+            causes[p] = (
+                f"{_listed(names, mirrored[p])} show{'s' * (int(mirrored[p].sum()) == 1)} the board mirrored: "
+                "number the corners of each row from the other end"
+            )
+        elif not bool(redundant[p]) or bool(unknown[p].any()):
+            lacking = [name for name, lost in zip(task.names, unknown[p].tolist(), strict=True) if lost]
+            causes[p] = _undetermined(lacking, R[p, used[p]], t[p, used[p]], task.points)
+    return status, tuple(causes)
+
+
+def _relative_error(found: Fit) -> Tensor:
+    """RMS residual of each view, reweighted, over the spread of what it is measured against `(P, V)`."""
+    task = found.task
+    count = task.used.sum(-1).clamp(min=1)
+    seen = task.pixels if task.objective == "image" else task.points[:, :2].expand_as(task.pixels)
+    seen = torch.where(task.used.unsqueeze(-1), seen, 0.0)
+    middle = seen.sum(-2) / count.unsqueeze(-1)
+    spread = torch.where(task.used.unsqueeze(-1), seen - middle.unsqueeze(-2), 0.0).square().sum((-2, -1)) / count
+    return (2 * found.solution.equations.c / count / spread.clamp(min=1e-30)).sqrt()
+
+
+def _mirrored(R: Tensor, t: Tensor, points: Tensor, used: Tensor, board: object) -> Tensor:
+    """Which views are of the board's other side `(P, V)`: than it prints, or where it does not say, than most."""
+    middle = R @ points.mean(0) + t
+    away = (R[..., 2] * middle).sum(-1) > 0  # the board's z points away from the camera
+    if isinstance(board, Chessboard):
+        expected = torch.full_like(away[:, :1], board.axes == "opencv")
+    else:
+        expected = 2 * (away & used).sum(-1, keepdim=True) >= used.sum(-1, keepdim=True)
+    return used & (away != expected)
+
+
+def _undetermined(lacking: list[str], R: Tensor, t: Tensor, points: Tensor) -> str:
+    what = f"the views do not determine {', '.join(lacking)}" if lacking else "there are fewer corners than parameters"
+    normals = R[..., 2]
+    if len(normals) == 1:
+        sight = R[0] @ points.mean(0) + t[0]
+        cosine = (normals[0] * sight).sum().abs() / sight.norm()
+        why = "the only view is seen face on" if cosine > math.cos(PARALLEL) else "one view alone says too little"
+        return f"{what}: {why}; add views tilted by 20 to 50 degrees about both axes, or fix the principal point"
+    across = torch.linalg.cross(normals, normals[:1].expand_as(normals)).norm(dim=-1)
+    if bool((across < math.sin(PARALLEL)).all()):
+        what += ": all views are parallel"
+    return f"{what}; add photographs with the board tilted by 20 to 50 degrees about both axes"
+
+
+def _listed(names: tuple[str, ...], chosen: Tensor) -> str:
+    return ", ".join(names[i] for i in chosen.nonzero().flatten().tolist())

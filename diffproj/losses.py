@@ -1,0 +1,91 @@
+"""Robust losses: how much a residual counts, as a function of its squared length.
+
+A loss is a function rho of `e2 = |e|^2 (...,)`, in squared units of the residual (px^2 for the image objective), with
+`rho(0) = 0` and `rho'(0) = 1`, so that small residuals count as in least squares; its derivative is the weight that an
+iteratively reweighted solver gives to a residual. All are differentiable twice where `e2` is 0 as well.
+
+Sources: Huber 1964; Triggs, McLauchlan, Hartley and Fitzgibbon 2000, "Bundle adjustment", section 3.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@runtime_checkable
+class Loss(Protocol):
+    """What the solver asks of a loss; one of your own needs these two methods alone."""
+
+    def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """`rho(e2)`, in the unit of `squared`."""
+        ...
+
+    def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """`rho'(e2)`, between 0 and 1."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Scaled:
+    scale: float
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.scale, int | float) and math.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(f"scale: want a positive number in the residual's unit, got {self.scale!r}")
+
+
+class Huber(_Scaled):
+    """Quadratic up to `scale`, linear beyond: an outlier pulls, but no harder than one at `scale`.
+
+    Example:
+        >>> Huber(1.0).value(torch.tensor([0.25, 9.0]))
+        tensor([0.2500, 5.0000])
+    """
+
+    def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """`e2`, and `2 scale |e| - scale^2` beyond `scale`."""
+        far = squared > self.scale**2
+        return torch.where(far, 2 * self.scale * torch.where(far, squared, 1).sqrt() - self.scale**2, squared)
+
+    def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """1, and `scale / |e|` beyond `scale`."""
+        far = squared > self.scale**2
+        return torch.where(far, self.scale / torch.where(far, squared, 1).sqrt(), torch.ones_like(squared))
+
+
+class SoftL1(_Scaled):
+    """`2 scale^2 (sqrt(1 + e2 / scale^2) - 1)`: as Huber's, but smooth.
+
+    Example:
+        >>> SoftL1(1.0).weight(torch.tensor([0.0, 8.0]))
+        tensor([1.0000, 0.3333])
+    """
+
+    def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """`2 scale^2 (sqrt(1 + e2 / scale^2) - 1)`, without cancellation."""
+        return 2 * squared / (1 + (1 + squared / self.scale**2).sqrt())
+
+    def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """`1 / sqrt(1 + e2 / scale^2)`."""
+        return (1 + squared / self.scale**2).rsqrt()
+
+
+class Cauchy(_Scaled):
+    """`scale^2 log(1 + e2 / scale^2)`: far outliers lose all pull. Not convex: it wants a fair start.
+
+    Example:
+        >>> Cauchy(1.0).weight(torch.tensor([0.0, 1.0, 99.0]))
+        tensor([1.0000, 0.5000, 0.0100])
+    """
+
+    def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """`scale^2 log(1 + e2 / scale^2)`."""
+        return self.scale**2 * (squared / self.scale**2).log1p()
+
+    def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """`1 / (1 + e2 / scale^2)`."""
+        return 1 / (1 + squared / self.scale**2)

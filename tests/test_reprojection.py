@@ -1,0 +1,141 @@
+"""The panels that the calibration's solver works on: residuals and closed-form Jacobians of both objectives."""
+
+import pytest
+import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
+import diffproj as dp
+from diffproj.calibration.board_error import BoardError, assembled
+from diffproj.calibration.reprojection import (
+    COEFFICIENTS,
+    LensModel,
+    Reprojection,
+    bow_shape,
+    lens_model,
+    make_lens,
+    moved,
+    shared_names,
+)
+
+D = torch.float64
+P, V = 2, 3
+
+
+def situation(lens: LensModel, bow: bool) -> tuple[dp.Chessboard, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+    """Shared parameters, board and poses at random; every coefficient differs from 0."""
+    board = dp.Chessboard(columns=5, rows=4, square=40.0)
+    intrinsics = torch.tensor([500.0, 510, 320, 240], dtype=D) + torch.randn(P, 4, dtype=D)
+    coefficients = 0.02 * torch.randn(P, COEFFICIENTS[lens], dtype=D) + 0.01
+    shared = torch.cat([intrinsics, coefficients, 3 * torch.randn(P, 2 * bow, dtype=D)], dim=-1)
+    R = axis_angle_to_rotation_matrix(0.3 * torch.randn(P * V, 3, dtype=D)).reshape(P, V, 3, 3)
+    t = 20 * torch.randn(P, V, 3, dtype=D) + torch.tensor([-80.0, -60, 500], dtype=D)
+    return board, shared, (R, t)
+
+
+def residual(
+    kind: type[Reprojection],
+    board: dp.Chessboard,
+    pixels: torch.Tensor,
+    lens: LensModel,
+    bow: bool,
+    shared: torch.Tensor,
+    local: tuple[torch.Tensor, ...],
+) -> torch.Tensor:
+    """`(P, V, 2, N)` through the public camera and the public back-projection."""
+    cameras = assembled(lens, shared, local)
+    points = board.points.expand(P, 1, -1, 3)
+    if bow:
+        z = (shared[:, None, -2:, None] * bow_shape(board.points)).sum(2)
+        points = points + torch.nn.functional.pad(z.unsqueeze(-1), (2, 0))
+    if kind is BoardError:
+        landed, valid = dp.back_project(pixels, cameras, dp.Plane.z(0.0))
+        assert valid.all()
+        return (landed - board.points)[..., :2].mT
+    projected, valid = cameras.project(points)
+    assert valid.all()
+    return (projected - pixels).mT
+
+
+@pytest.mark.parametrize("lens", list(COEFFICIENTS))
+@pytest.mark.parametrize(("kind", "bow"), [(Reprojection, False), (Reprojection, True), (BoardError, False)])
+def test_jacobians_are_autograds(kind: type[Reprojection], lens: LensModel, bow: bool) -> None:
+    board, shared, local = situation(lens, bow)
+    cameras = assembled(lens, shared, local)
+    pixels = cameras.project(board.points)[0] + torch.randn(P, V, len(board), 2, dtype=D)
+    problem = kind(board.points, pixels, torch.ones(pixels.shape[:-1], dtype=torch.bool), lens, bow)
+    panel = problem.linearise(shared, local).clone()
+    torch.testing.assert_close(
+        panel[:, :, -1], residual(kind, board, pixels, lens, bow, shared, local), rtol=0, atol=1e-10
+    )
+    s = len(shared_names(lens, bow))
+    # Each direction at once, for every camera and view: a step along it moves all of them.
+    zero = torch.zeros(P, V, 6, dtype=D)
+    for row in range(s + 6):
+        direction = torch.nn.functional.one_hot(torch.tensor(row), s + 6).to(D)
+
+        def along(step: torch.Tensor, direction: torch.Tensor = direction) -> torch.Tensor:
+            pose = moved(local, zero + step * direction[s:])
+            return residual(kind, board, pixels, lens, bow, shared + step * direction[:s], pose)
+
+        _, want = torch.func.jvp(along, (torch.zeros((), dtype=D),), (torch.ones((), dtype=D),))
+        scale = float(want.abs().amax()) + 1e-12
+        torch.testing.assert_close(
+            panel[:, :, row], want, rtol=0, atol=1e-11 * scale, msg=lambda m, row=row: f"{row}: {m}"
+        )
+        step = 1e-5 * max(1.0, float(shared[:, row].abs().amax())) if row < s else 1e-5
+        nudge = torch.tensor(step, dtype=D)
+        finite = (along(nudge) - along(-nudge)) / (2 * step)
+        torch.testing.assert_close(panel[:, :, row], finite, rtol=0, atol=2e-5 * scale)
+
+
+def test_unused_corners_are_zero_and_behind_is_no_cost() -> None:
+    board, shared, (R, t) = situation("brown5", bow=False)
+    used = torch.rand(P, V, len(board)) > 0.3
+    pixels = torch.rand(P, V, len(board), 2, dtype=D)
+    away = t.clone()
+    away[0, 0, 2] = -500
+    panel = Reprojection(board.points, pixels, used, "brown5").linearise(shared, (R, away))
+    assert (panel.movedim(-1, 2)[~used] == 0).all()
+    assert panel[0, 0].isnan().any()
+    assert panel[0, 1:].isfinite().all()
+    assert panel[1].isfinite().all()
+    # Corners that do not count may be anywhere.
+    nowhere = torch.zeros_like(used)
+    assert (
+        Reprojection(board.points, pixels, nowhere, "fisheye").linearise(shared[:, :8], (R, away))[..., -7:, :, :] == 0
+    ).all()
+
+
+def test_fisheye_on_the_axis_and_sideways() -> None:
+    points = torch.tensor([[0.0, 0, 0], [1e-12, 0, 0], [3000.0, 0, 0], [0, 3000, 0]], dtype=D)
+    shared = torch.tensor([[300.0, 310, 320, 240, 0.02, -0.01, 0.003, 0.001]], dtype=D)
+    R, t = torch.eye(3, dtype=D).expand(1, 1, 3, 3), torch.tensor([[[0.0, 0, 2]]], dtype=D)
+    problem = Reprojection(points, torch.zeros(1, 1, 4, 2, dtype=D), torch.ones(1, 1, 4, dtype=torch.bool), "fisheye")
+    panel = problem.linearise(shared, (R, t)).clone()
+    assert panel.isfinite().all()
+
+    def project(tau: torch.Tensor) -> torch.Tensor:
+        return assembled("fisheye", shared, (R, t + tau)).project(points)[0].mT
+
+    want = torch.func.jacfwd(project)(torch.zeros(1, 1, 3, dtype=D))[0, 0, :, :, 0, 0].permute(2, 0, 1)
+    torch.testing.assert_close(panel[0, 0, -4:-1], want, rtol=1e-12, atol=1e-12)
+
+
+def test_moved_is_the_exponential_to_second_order() -> None:
+    R = axis_angle_to_rotation_matrix(torch.randn(5, 3, dtype=D))
+    t = torch.randn(5, 3, dtype=D)
+    for size in (1e-3, 2.0):
+        step = size * torch.randn(5, 6, dtype=D)
+        turned, shifted = moved((R, t), step)
+        torch.testing.assert_close(turned @ turned.mT, torch.eye(3, dtype=D).expand(5, 3, 3), rtol=0, atol=1e-14)
+        assert torch.equal(shifted, t + step[:, 3:])
+        if size < 1:
+            exact = axis_angle_to_rotation_matrix(step[:, :3]) @ R
+            assert float((turned - exact).abs().amax()) < step[:, :3].norm(dim=-1).amax() ** 3
+
+
+def test_lens_models_by_name() -> None:
+    for name, count in COEFFICIENTS.items():
+        assert lens_model(make_lens(name, torch.zeros(count, dtype=D))) == name
+    with pytest.raises(TypeError, match="camera: want a pinhole"):
+        lens_model("brown5")
