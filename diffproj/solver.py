@@ -51,6 +51,8 @@ LAST_PROMISE = 1e-8
 """A step that promises to lower the cost by less than this part of it may be the last one."""
 FASTEST = 0.02
 """By how much promises shrink from step to step at best, as far as is believed: near the end they do so evenly."""
+ROUNDING = 1e-12
+"""The part of the cost below which a sum of many squares is rounding."""
 SMALLEST_DAMPING = 1e-15
 LARGEST_DAMPING = 1e14
 """Where no step lowers the cost even with this, none will."""
@@ -210,6 +212,7 @@ class _Pace:
         self.status = np.where(self.active, Status.MAX_ITERATIONS, Status.DIVERGED)
         self.iterations = np.zeros(cost.shape, dtype=np.int64)
         self.before = np.full_like(cost, np.inf)
+        self.failed = np.zeros(cost.shape, dtype=bool)
 
     def settle(self, prospect: np.ndarray, tolerance: float, negligible: float) -> np.ndarray:
         """Stop those that have nothing left to gain, which are returned, and those that are stuck."""
@@ -218,7 +221,9 @@ class _Pace:
             after = prospect * np.clip(prospect / self.before, FASTEST, 1)
         self.before = np.where(self.active, prospect, self.before)
         small = (after <= tolerance * self.cost) & (prospect <= LAST_PROMISE * self.cost)
-        done = self.active & (small | (self.cost <= negligible))
+        # Where a promise is rounding of the cost, whether a trial is better is chance: a failure ends it.
+        exhausted = (self.failed & (prospect <= ROUNDING * self.cost)) | (prospect <= 1e-3 * ROUNDING * self.cost)
+        done = self.active & (small | exhausted | (self.cost <= negligible))
         stuck = self.active & ~done & (self.damping > LARGEST_DAMPING)
         self.status[done], self.status[stuck] = Status.CONVERGED, Status.DIVERGED
         self.active &= ~(done | stuck)
@@ -232,7 +237,7 @@ class _Pace:
         it. Successes and failures in a row gather pace; in a bent valley, where they alternate, both are small.
         """
         better = self.active & (cost <= self.cost) & np.isfinite(promise)  # false where the trial is NaN
-        worse = self.active & ~better
+        worse = self.failed = self.active & ~better
         with np.errstate(all="ignore"):
             model = 1 - (2 * (self.cost - cost) / promise - 1) ** 3
         factor = np.where(better, np.maximum(np.minimum(model, 2), 1 / self.fall), np.where(worse, self.rise, 1))

@@ -1,0 +1,142 @@
+"""The differentiable optimum: gradients of `refine` against finite differences of re-solving."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+import diffproj as dp
+from diffproj import synthetic
+
+D = torch.float64
+
+
+def situation(outliers: bool = False) -> tuple[dp.Camera, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A start, the corners, their visibility and the board's points: small, so that re-solving is fast."""
+    board = dp.Chessboard(columns=5, rows=4, square=40.0)
+    K = torch.tensor([[533.0, 0, 322], [0, 534, 238], [0, 0, 1]], dtype=D)
+    lens = dp.BrownConrady(torch.tensor([-0.2, 0.05, 0.001, -0.001], dtype=D))
+    truth = synthetic.random_cameras(dp.Camera(K, distortion=lens, size=(640, 480)), board, 6, seed=1)
+    views = synthetic.corner_views(truth, board, noise_px=0.3, seed=1)
+    pixels, visible = views.pixels.clone(), views.visible.clone()
+    visible[2, :7] = False
+    visible[5, 3:] = False  # too few corners: no part
+    if outliers:
+        wrong = torch.rand(visible.shape) < 0.05
+        pixels[wrong] += 15 * torch.randn(int(wrong.sum()), 2, dtype=D)
+    return truth[0].without_pose(), pixels, visible, board.points
+
+
+class Target:
+    def __init__(self, points: torch.Tensor) -> None:
+        self.points = points
+
+
+def answer(calibration: dp.Calibration) -> torch.Tensor:
+    """Numbers of every kind of parameter: intrinsics, lens, a pose, the bow."""
+    K = calibration.camera.K
+    lens = calibration.camera.distortion
+    assert isinstance(lens, dp.BrownConrady)
+    parts = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *(100 * lens.coefficients)]
+    parts += [*calibration.cameras.t[1], *(100 * calibration.cameras.R[3].flatten())]
+    parts += [] if calibration.bow is None else list(100 * calibration.bow)
+    return torch.stack(parts)
+
+
+def check(solve: Callable[[torch.Tensor, bool], dp.Calibration], value: torch.Tensor, step: float) -> None:
+    """The directional derivative of every number against a central difference, to 1e-4 of the largest of its kind."""
+    direction = torch.randn_like(value)
+    argument = value.clone().requires_grad_()
+    found = answer(solve(argument, True))
+    rows = [torch.autograd.grad(x, argument, retain_graph=True)[0] for x in found]
+    got = torch.stack([(row * direction).sum() for row in rows])
+    with torch.no_grad():
+        ahead, behind = (answer(solve(value + sign * step * direction, False)) for sign in (1, -1))
+    want = (ahead - behind) / (2 * step)
+    torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-5 * float(want.abs().amax()))
+
+
+CASES: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "bow": {"bow": True},
+    "fixed": {"fixed": ("c_x", "p1"), "tied_focal": True},
+    "huber": {"loss": dp.Huber(0.5)},
+    "cauchy": {"loss": dp.Cauchy(1.0)},
+    "plane": {"objective": "plane"},
+}
+
+
+STEPS = {"huber": 3e-5}
+"""Steps in px; a longer one takes corners across Huber's kink, where the gradient changes by a jump."""
+
+
+@pytest.mark.parametrize("case", list(CASES))
+def test_gradient_by_pixels(case: str) -> None:
+    robust = case in ("huber", "cauchy")
+    camera, pixels, visible, points = situation(outliers=robust)
+
+    def solve(pixels: torch.Tensor, differentiable: bool) -> dp.Calibration:
+        views = dp.Views(pixels, visible, size=(640, 480))
+        return dp.refine(
+            camera,
+            views,
+            Target(points),
+            differentiable=differentiable,
+            tolerance=1e-17,
+            max_iterations=2000,
+            **CASES[case],
+        )
+
+    check(solve, pixels, STEPS.get(case, 5e-3))
+
+
+def test_gradient_by_board_points() -> None:
+    camera, pixels, visible, points = situation()
+    in_plane = torch.tensor([1.0, 1.0, 0.0], dtype=D)
+
+    def solve(points: torch.Tensor, differentiable: bool) -> dp.Calibration:
+        views = dp.Views(pixels, visible, size=(640, 480))
+        return dp.refine(camera, views, Target(points * in_plane), differentiable=differentiable, tolerance=1e-17)
+
+    check(solve, points, 5e-3)
+
+
+@pytest.mark.parametrize("loss", [None, dp.Huber(0.5)])
+def test_gradient_by_weights(loss: dp.Loss | None) -> None:
+    camera, pixels, visible, points = situation(outliers=loss is not None)
+    weights = 0.5 + torch.rand(visible.shape, dtype=D)
+
+    def solve(weights: torch.Tensor, differentiable: bool) -> dp.Calibration:
+        views = dp.Views(pixels, visible, size=(640, 480))
+        options = {"weights": weights, "loss": loss, "tolerance": 1e-17, "max_iterations": 2000}
+        return dp.refine(camera, views, Target(points), differentiable=differentiable, **options)
+
+    check(solve, weights, 3e-5 if loss else 1e-3)
+
+
+def test_gradient_by_priors() -> None:
+    camera, pixels, visible, points = situation()
+
+    def solve(values: torch.Tensor, differentiable: bool) -> dp.Calibration:
+        views = dp.Views(pixels, visible, size=(640, 480))
+        priors = {"focal": (values[:2], values[2].abs()), "k2": values[3]}
+        return dp.refine(camera, views, Target(points), priors=priors, differentiable=differentiable, tolerance=1e-17)
+
+    check(solve, torch.tensor([530.0, 540, 2.0, 0.05], dtype=D), 1e-5)
+
+
+def test_values_are_those_of_the_solver_and_batches_keep_apart() -> None:
+    camera, pixels, visible, points = situation()
+    both = torch.stack([pixels, pixels + 0.1 * torch.randn_like(pixels)]).requires_grad_()
+    views = dp.Views(both, visible.expand(2, -1, -1), size=(640, 480))
+    plain = dp.refine(camera, views, Target(points))
+    found = dp.refine(camera, views, Target(points), differentiable=True)
+    assert torch.equal(found.camera.K.detach(), plain.camera.K)
+    assert torch.equal(found.cameras.R.detach(), plain.cameras.R)
+    assert not plain.camera.K.requires_grad
+    gradient = torch.autograd.grad(found.camera.K[0, 0, 0], both)[0]
+    assert (gradient[1] == 0).all()
+    assert (gradient[0][~visible] == 0).all()
+    assert (gradient[0, 5] == 0).all()
+    assert gradient[0, 0].abs().max() > 0
