@@ -24,6 +24,7 @@ from diffproj.calibration import Calibration, CalibrationError, Covariance, Stat
 from diffproj.camera import Camera
 from diffproj.experiment import Experiment, run_experiment
 from diffproj.files import load_calibration, load_camera, save_camera
+from diffproj.learnable import LearnableCamera, image_residuals, plane_residuals
 from diffproj.lens import BrownConrady, KannalaBrandt, Lens
 from diffproj.losses import Cauchy, Huber, Loss, SoftL1
 from diffproj.paper_route import paper_route
@@ -45,6 +46,7 @@ __all__ = [
     "Experiment",
     "Huber",
     "KannalaBrandt",
+    "LearnableCamera",
     "Lens",
     "Loss",
     "Plane",
@@ -59,10 +61,12 @@ __all__ = [
     "euler_from_rotation",
     "example_views",
     "explain",
+    "image_residuals",
     "load_calibration",
     "load_camera",
     "locate",
     "paper_route",
+    "plane_residuals",
     "refine",
     "rotation_from_euler",
     "run_experiment",

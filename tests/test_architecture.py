@@ -14,7 +14,7 @@ LEVELS = (
     ("camera", "plane"),
     ("back_projection", "paper_route"),
     ("board",),
-    ("calibration", "synthetic"),
+    ("calibration", "learnable", "synthetic"),
     ("experiment", "files"),
     ("figures",),
     ("cli",),

@@ -1,0 +1,208 @@
+"""`LearnableCamera`: a camera whose parameters a PyTorch optimiser moves, and the residuals that it moves them by.
+
+The parameters are chosen so that steps of one size mean much the same for each of them, and none can leave its range:
+
+* focal lengths through their logarithm, `f = f_0 exp(log_focal)`;
+* the principal point in units of the focal length, `c = c_0 + f_0 principal_point`;
+* the lens's coefficients as they are, `k = k_0 + distortion`;
+* poses on their manifold, `R = exp(rotation) R_0`, and `t = t_0 + |t_0| translation`.
+
+All are zero at first: the camera that the module was made from. What is not learned is a buffer, saved and moved along.
+"""
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from torch import Tensor, nn
+
+from diffproj.back_projection import back_project
+from diffproj.board import Views
+from diffproj.camera import Camera, as_camera
+from diffproj.lens import BrownConrady, KannalaBrandt
+from diffproj.plane import Plane
+
+PARTS = ("focal", "principal_point", "distortion", "pose")
+"""What may be learned."""
+
+
+@runtime_checkable
+class HasPoints(Protocol):
+    """Anything with world points, such as `Chessboard`."""
+
+    @property
+    def points(self) -> Float[Tensor, "n 3"]:
+        """World points `(N, 3)`."""
+        ...
+
+
+class LearnableCamera(nn.Module):
+    """A camera, or a batch of them, as a module: calling it gives a `Camera` that carries gradients.
+
+    Intrinsics and lens that are the same for a whole batch of poses, as those of `Calibration.cameras`, are one
+    parameter: axes over which the camera was only expanded stay so.
+
+    Args:
+        camera: the start. Its tensors are copied; its dtype and device are the module's.
+        learn: which parts are learned, of `"focal"`, `"principal_point"`, `"distortion"` and `"pose"`; all that the
+            camera has if left out.
+
+    Raises:
+        TypeError: no camera, or one with a lens of another library.
+        ValueError: an unknown part, `"distortion"` of a pinhole, or a K with skew.
+
+    Example:
+        >>> import diffproj as dp
+        >>> views, board = dp.example_views("left"), dp.Chessboard()
+        >>> rough = dp.calibrate(views, board, "brown4")
+        >>> learnable = LearnableCamera(rough.cameras, learn=("focal", "pose"))
+        >>> optimiser = torch.optim.LBFGS(learnable.parameters(), line_search_fn="strong_wolfe")
+        >>> def loss():
+        ...     optimiser.zero_grad()
+        ...     error, valid = image_residuals(learnable(), views, board)
+        ...     cost = error[valid].square().sum()
+        ...     cost.backward()
+        ...     return cost
+        >>> _ = optimiser.step(loss)
+        >>> learnable().K.shape
+        torch.Size([13, 3, 3])
+    """
+
+    def __init__(self, camera: Camera | PinholeCamera, learn: Sequence[str] | None = None) -> None:
+        super().__init__()
+        camera = as_camera(camera).detach()
+        lens = camera.distortion
+        if lens is not None and not isinstance(lens, BrownConrady | KannalaBrandt):
+            raise TypeError(f"camera: want a lens of diffproj, got {type(lens).__name__}")
+        if bool((camera.K[..., 0, 1] != 0).any() or (camera.K[..., 1, 0] != 0).any()):
+            raise ValueError("camera: want no skew, got K[..., 0, 1] or K[..., 1, 0] other than 0")
+        available = [part for part in PARTS if lens is not None or part != "distortion"]
+        learn = tuple(available if learn is None else [learn] if isinstance(learn, str) else learn)
+        unknown = [part for part in learn if part not in available]
+        if unknown:
+            raise ValueError(f"learn: want parts of {', '.join(available)}, got {unknown[0]!r}")
+        self.learn, self.size, self.batch_shape = learn, camera.size, camera.batch_shape
+        self._lens = None if lens is None else type(lens)
+        K = _unexpanded(camera.K, 2)
+        focal, center = K.diagonal(dim1=-2, dim2=-1)[..., :2], K[..., :2, 2]
+        self.register_buffer("focal_0", focal.clone())
+        self.register_buffer("principal_point_0", center.clone())
+        self.register_buffer("R_0", camera.R.clone())
+        self.register_buffer("t_0", camera.t.clone())
+        coefficients = focal[..., :0] if lens is None else _unexpanded(lens.expand(*self.batch_shape).coefficients, 1)
+        self.register_buffer("coefficients_0", coefficients.clone())
+        self._own("log_focal", focal, "focal")
+        self._own("principal_point", center, "principal_point")
+        self._own("distortion", coefficients, "distortion")
+        self._own("rotation", camera.t, "pose")
+        self._own("translation", camera.t, "pose")
+
+    focal_0: Tensor
+    principal_point_0: Tensor
+    R_0: Tensor
+    t_0: Tensor
+    coefficients_0: Tensor
+    log_focal: Tensor
+    principal_point: Tensor
+    distortion: Tensor
+    rotation: Tensor
+    translation: Tensor
+
+    def _own(self, name: str, like: Tensor, part: str) -> None:
+        zero = torch.zeros_like(like, memory_format=torch.contiguous_format)
+        if part in self.learn:
+            self.register_parameter(name, nn.Parameter(zero))
+        else:
+            self.register_buffer(name, zero)
+
+    def forward(self) -> Camera:
+        """The camera as it is now, with the batch shape of the one it was made from."""
+        focal = self.focal_0 * self.log_focal.exp()
+        center = self.principal_point_0 + self.focal_0 * self.principal_point
+        bottom = torch.zeros_like(focal[..., :1])
+        rows = [
+            torch.cat([focal[..., :1], bottom, center[..., :1]], dim=-1),
+            torch.cat([bottom, focal[..., 1:], center[..., 1:]], dim=-1),
+            torch.cat([bottom, bottom, torch.ones_like(bottom)], dim=-1),
+        ]
+        K = torch.stack(rows, dim=-2).expand(*self.batch_shape, 3, 3)
+        turn = axis_angle_to_rotation_matrix(self.rotation.reshape(-1, 3)).reshape(self.R_0.shape)
+        # Elementwise, as everywhere: under autocast a matrix product would round the pose to 8 bits.
+        R = (turn.unsqueeze(-1) * self.R_0.unsqueeze(-3)).sum(-2)
+        t = self.t_0 + self.t_0.norm(dim=-1, keepdim=True) * self.translation
+        lens = None
+        if self._lens is not None:
+            lens = self._lens(self.coefficients_0 + self.distortion).expand(*self.batch_shape)
+        return Camera._unchecked(K, R, t, lens, self.size)
+
+    def extra_repr(self) -> str:
+        """What `print` shows between the brackets."""
+        lens = "pinhole" if self._lens is None else self._lens.__name__
+        return f"batch_shape={tuple(self.batch_shape)}, {lens}, learn={self.learn}"
+
+
+def image_residuals(
+    camera: Camera | PinholeCamera, views: Views, board: HasPoints
+) -> tuple[Float[Tensor, "*batch v n 2"], Bool[Tensor, "*batch v n"]]:
+    """Projected minus seen corners in pixels, with gradients to camera, corners and board points.
+
+    Args:
+        camera: at the pose of each view, batch shape `(*B, V)`.
+        views: corners `(*B, V, N, 2)`.
+        board: anything with `.points (N, 3)`.
+
+    Returns:
+        Residuals `(*B, V, N, 2)`, zero with zero gradient where not valid; and `valid`: seen, and projected.
+
+    Example:
+        >>> import diffproj as dp
+        >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+        >>> error, valid = image_residuals(calibration.cameras, calibration.views, dp.Chessboard())
+        >>> torch.equal(error, calibration.residuals)
+        True
+    """
+    camera = as_camera(camera)
+    projected, valid = camera.project(_points(board, camera))
+    valid = valid & views.visible
+    return torch.where(valid.unsqueeze(-1), projected - views.pixels.to(projected), 0.0), valid
+
+
+def plane_residuals(
+    camera: Camera | PinholeCamera, views: Views, board: HasPoints
+) -> tuple[Float[Tensor, "*batch v n 3"], Bool[Tensor, "*batch v n"]]:
+    """Corners put back on the board's plane z = 0, minus where the board has them, in world units.
+
+    Args:
+        camera: at the pose of each view, batch shape `(*B, V)`.
+        views: corners `(*B, V, N, 2)`.
+        board: anything with `.points (N, 3)` on z = 0.
+
+    Returns:
+        Residuals `(*B, V, N, 3)`, zero with zero gradient where not valid; and `valid`: seen, and put back.
+
+    Example:
+        >>> import diffproj as dp
+        >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+        >>> error, valid = plane_residuals(calibration.cameras, calibration.views, dp.Chessboard())
+        >>> bool(valid.all()), bool(error.norm(dim=-1).mean() < 0.2)  # millimetres
+        (True, True)
+    """
+    camera = as_camera(camera)
+    points, valid = back_project(views.pixels.to(camera.K), camera, Plane.z(0.0))
+    valid = valid & views.visible
+    return torch.where(valid.unsqueeze(-1), points - _points(board, camera), 0.0), valid
+
+
+def _points(board: HasPoints, camera: Camera) -> Tensor:
+    return board.points.to(camera.K)
+
+
+def _unexpanded(tensor: Tensor, trailing: int) -> Tensor:
+    """The tensor with length 1 along the batch axes over which it was only expanded."""
+    for axis in range(tensor.ndim - trailing):
+        if tensor.shape[axis] > 1 and tensor.stride(axis) == 0:
+            tensor = tensor.narrow(axis, 0, 1)
+    return tensor

@@ -1,0 +1,194 @@
+"""`LearnableCamera` and the residual functions: plain PyTorch reaches the solver's minimum."""
+
+import copy
+import io
+import pickle
+from collections.abc import Callable
+
+import pytest
+import torch
+
+import diffproj as dp
+from diffproj import synthetic
+
+D = torch.float64
+BOARD = dp.Chessboard()
+
+
+@pytest.fixture(scope="module")
+def rough() -> tuple[dp.Camera, dp.Views, dp.Calibration]:
+    """A camera some way off the minimum, the views, and the minimum."""
+    K = torch.tensor([[533.0, 0, 342], [0, 534, 235], [0, 0, 1]], dtype=D)
+    lens = dp.BrownConrady(torch.tensor([-0.25, 0.05, 0.001, 0.0002], dtype=D))
+    truth = synthetic.random_cameras(dp.Camera(K, distortion=lens, size=(640, 480)), BOARD, 5)
+    views = synthetic.corner_views(truth, BOARD)
+    best = dp.calibrate(views, BOARD, "brown4")
+    off = best.camera.K + torch.tensor([[8.0, 0, 4], [0, -6, -5], [0, 0, 0]], dtype=D)
+    camera = dp.Camera(off, best.cameras.R, best.cameras.t + 3.0, dp.BrownConrady(torch.zeros(4, dtype=D)), (640, 480))
+    return camera, views, best
+
+
+def cost(learnable: dp.LearnableCamera, views: dp.Views) -> torch.Tensor:
+    error, valid = dp.image_residuals(learnable(), views, BOARD)
+    return error.square().sum() / valid.sum()
+
+
+def pinhole() -> tuple[dp.Camera, dp.Views, dp.Chessboard, dp.Calibration]:
+    """The same without a lens and with a small board: well determined, and quick to step."""
+    board = dp.Chessboard(columns=4, rows=4, square=50.0)
+    K = torch.tensor([[533.0, 0, 322], [0, 534, 238], [0, 0, 1]], dtype=D)
+    truth = synthetic.random_cameras(dp.Camera(K, size=(640, 480)), board, 6, distance=(2.0, 3.0), seed=1)
+    views = synthetic.corner_views(truth, board)
+    best = dp.calibrate(views, board, "none")
+    off = best.camera.K + torch.tensor([[8.0, 0, 4], [0, -6, -5], [0, 0, 0]], dtype=D)
+    return dp.Camera(off, best.cameras.R, best.cameras.t + 3.0), views, board, best
+
+
+def by_lbfgs(learnable: dp.LearnableCamera, value: Callable[[], torch.Tensor], iterations: int) -> float:
+    options = {"max_iter": iterations, "tolerance_grad": 1e-13, "tolerance_change": 1e-18, "history_size": 100}
+    optimiser = torch.optim.LBFGS(learnable.parameters(), line_search_fn="strong_wolfe", **options)
+
+    def closure() -> torch.Tensor:
+        optimiser.zero_grad()
+        now = value()
+        now.backward()
+        return now
+
+    optimiser.step(closure)
+    return float(value().detach())
+
+
+def test_lbfgs_reaches_the_solvers_minimum() -> None:
+    camera, views, board, best = pinhole()
+    learnable = dp.LearnableCamera(_one_intrinsics(camera))
+    mean = by_lbfgs(learnable, lambda: dp.image_residuals(learnable(), views, board)[0].square().sum() / (6 * 16), 1500)
+    assert mean**0.5 == pytest.approx(float(best.rms), rel=1e-7)
+    assert (learnable().K[0] - best.camera.K).abs().max() < 0.01
+
+
+def test_adam_reaches_the_solvers_minimum() -> None:
+    camera, views, board, best = pinhole()
+    learnable = dp.LearnableCamera(_one_intrinsics(camera))
+    steps = 1500
+    optimiser = torch.optim.Adam(learnable.parameters(), lr=1e-2, betas=(0.9, 0.99))
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=1e-2, total_steps=steps, cycle_momentum=False)
+    for _ in range(steps):
+        optimiser.zero_grad()
+        error, valid = dp.image_residuals(learnable(), views, board)
+        (error.square().sum() / valid.sum()).backward()
+        optimiser.step()
+        schedule.step()
+    error, _ = dp.image_residuals(learnable(), views, board)
+    assert (error.detach().square().sum() / (6 * 16)).sqrt().item() == pytest.approx(float(best.rms), rel=1e-3)
+
+
+def test_a_lens_is_learned_along(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
+    camera, views, best = rough
+    learnable = dp.LearnableCamera(_one_intrinsics(camera))
+    assert by_lbfgs(learnable, lambda: cost(learnable, views), 150) ** 0.5 == pytest.approx(float(best.rms), rel=0.02)
+
+
+def _one_intrinsics(camera: dp.Camera) -> dp.Camera:
+    """The same camera with intrinsics and lens expanded over the views, so that they are learned as one."""
+    return camera[0].at(camera.R, camera.t)
+
+
+def test_the_plane_objective_by_lbfgs() -> None:
+    _, views, board, best = pinhole()
+    want = dp.refine(best.camera, views, board, objective="plane")
+    learnable = dp.LearnableCamera(best.cameras)
+    total = by_lbfgs(learnable, lambda: dp.plane_residuals(learnable(), views, board)[0].square().sum(), 1500)
+    error, _ = dp.plane_residuals(want.cameras, views, board)
+    assert total == pytest.approx(error.square().sum().item(), rel=1e-6)
+
+
+def test_starts_as_the_camera_it_was_made_from(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
+    camera, _, best = rough
+    for given in (camera, best.cameras, best.camera, dp.Camera(camera.K[0])):
+        now = dp.LearnableCamera(given)()
+        assert now.batch_shape == given.batch_shape
+        assert torch.equal(now.K, given.K)
+        torch.testing.assert_close(now.R, given.R, rtol=0, atol=1e-15)
+        assert torch.equal(now.t, given.t)
+        assert now.size == given.size
+    shared = dp.LearnableCamera(best.cameras)
+    assert {n: tuple(p.shape) for n, p in shared.named_parameters()} == {
+        "log_focal": (1, 2),
+        "principal_point": (1, 2),
+        "distortion": (1, 4),
+        "rotation": (5, 3),
+        "translation": (5, 3),
+    }
+    assert dp.LearnableCamera(dp.Camera(camera.K[0], size=(640, 480)).to_kornia())().batch_shape == (1,)
+
+
+@pytest.mark.parametrize("learn", [("focal",), ("pose", "distortion"), ()])
+def test_only_what_is_learned_moves(learn: tuple[str, ...], rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
+    camera, views, _ = rough
+    learnable = dp.LearnableCamera(camera, learn)
+    names = {"focal": {"log_focal"}, "pose": {"rotation", "translation"}, "distortion": {"distortion"}}
+    assert {n for n, _ in learnable.named_parameters()} == set().union(*(names[part] for part in learn))
+    if not learn:
+        return
+    optimiser = torch.optim.SGD(learnable.parameters(), lr=1e-8)
+    cost(learnable, views).backward()
+    optimiser.step()
+    now = learnable()
+    assert torch.equal(now.K, camera.K) != ("focal" in learn)
+    assert torch.equal(now.t, camera.t) != ("pose" in learn)
+
+
+def test_gradients_are_finite_differences(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
+    _, views, best = rough
+    learnable = dp.LearnableCamera(best.cameras)
+    names = [name for name, _ in learnable.named_parameters()]
+    values = [p.detach().clone() + 0.01 * torch.randn_like(p) for p in learnable.parameters()]
+
+    def value(*parameters: torch.Tensor) -> torch.Tensor:
+        now = torch.func.functional_call(learnable, dict(zip(names, parameters, strict=True)), ())
+        error, _ = dp.image_residuals(now, views[:5], BOARD)
+        return (error * torch.linspace(-1, 1, 2 * 54, dtype=D).reshape(54, 2)).sum()
+
+    assert torch.autograd.gradcheck(value, [v.requires_grad_() for v in values], fast_mode=True)
+
+
+def test_saved_moved_and_copied(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
+    camera, _, best = rough
+    learnable = dp.LearnableCamera(camera, ("focal", "pose"))
+    with torch.no_grad():
+        learnable.log_focal += 0.1
+        learnable.rotation += 0.2
+    stream = io.BytesIO()
+    torch.save(learnable.state_dict(), stream)
+    stream.seek(0)
+    other = dp.LearnableCamera(best.cameras[:5].at(camera.R, camera.t), ("focal", "pose"))
+    fresh = dp.LearnableCamera(
+        dp.Camera(camera.K, distortion=camera.distortion).at(camera.R.mT, camera.t), ("focal", "pose")
+    )
+    fresh.load_state_dict(torch.load(stream, weights_only=True))
+    for again in (fresh, copy.deepcopy(learnable), pickle.loads(pickle.dumps(learnable))):  # noqa: S301
+        assert torch.equal(again().K, learnable().K)
+        assert torch.equal(again().R, learnable().R)
+    assert other.to(torch.float32)().dtype == torch.float32
+    assert "learn=('focal', 'pose')" in repr(learnable)
+
+
+def test_residuals_honour_what_is_seen(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
+    camera, views, _ = rough
+    hidden = torch.rand(5, 54) < 0.4
+    views = views.hiding(hidden)
+    for residuals in (dp.image_residuals, dp.plane_residuals):
+        error, valid = residuals(camera, views, BOARD)
+        assert torch.equal(valid, ~hidden)
+        assert (error[hidden] == 0).all()
+
+
+@pytest.mark.plain
+def test_bad_input_is_refused_by_name(camera: dp.Camera) -> None:
+    with pytest.raises(ValueError, match="learn: want parts of focal, principal_point, pose, got 'distortion'"):
+        dp.LearnableCamera(camera, ("distortion",))
+    with pytest.raises(TypeError, match="camera: want dp.Camera"):
+        dp.LearnableCamera("camera")
+    skewed = dp.Camera(camera.K + torch.tensor([[0.0, 1, 0], [0, 0, 0], [0, 0, 0]], dtype=D))
+    with pytest.raises(ValueError, match="camera: want no skew"):
+        dp.LearnableCamera(skewed)
