@@ -56,6 +56,21 @@ def test_forward_is_opencvs(coefficients: list[float]) -> None:
 
 
 @SETTINGS
+@given(st.tuples(small, small, small, small))
+def test_fisheye_forward_is_opencvs(shares: tuple[float, ...]) -> None:
+    coefficients = [share * size for share, size in zip(shares, (0.1, 0.1, 0.05, 0.01), strict=True)]
+    lens = KannalaBrandt(torch.tensor(coefficients, dtype=torch.float64))
+    plane = disc(min(0.99 * float(lens.domain), 1.4))
+    theta = plane.norm(dim=-1, keepdim=True)
+    direction = torch.cat([plane / theta * theta.sin(), theta.cos()], dim=-1)
+    xy_distorted, valid = lens.project_direction(direction)
+    zero = np.zeros(3)
+    pixels, _ = cv2.fisheye.projectPoints(direction.numpy()[None], zero, zero, np.eye(3), np.array(coefficients))
+    assert valid.all()
+    assert (size(torch.from_numpy(pixels[0]) - xy_distorted) < 1e-12 * (1 + size(xy_distorted))).all()
+
+
+@SETTINGS
 @given(sane_lenses())
 def test_every_point_of_the_disc_is_found(coefficients: list[float]) -> None:
     lens = BrownConrady(torch.tensor(coefficients, dtype=torch.float64))

@@ -20,7 +20,6 @@ from diffproj.lens.brown_equations import COUNTS, Terms, bend, radial
 from diffproj.lens.brown_inverse import newton, search, squared_domain, untilted
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.compiling import derivative_wanted
-from diffproj.lens.plan import Plan
 from diffproj.lens.table import inverse_table
 
 
@@ -58,7 +57,7 @@ class BrownConrady(CoefficientLens):
         The largest around the axis on which the symmetric part of the Jacobian is positive definite, rounded inward.
         Infinite where the lens has no fold.
         """
-        return self._plan().domain
+        return self._domain()
 
     def distort(self, xy: Float[Tensor, "*batch n 2"]) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
         """Undistorted points to distorted ones, both on the normalised plane.
@@ -70,14 +69,14 @@ class BrownConrady(CoefficientLens):
             Distorted points, and `valid`: inside the domain and finite. (0, 0) with zero gradient where not.
         """
         xy = self._checked("xy", xy, 2)
-        plan = self._plan()
+        domain = self._domain()
 
         def forward(points: Tensor) -> tuple[Tensor, Tensor]:
             x, y = points.unbind(-1)
             s = (x * x + y * y).detach()
-            valid = (s <= squared_domain(plan)) & (s < torch.inf)
+            valid = (s <= squared_domain(domain)) & (s < torch.inf)
             x, y = torch.where(valid, x, 0), torch.where(valid, y, 0)
-            terms = Terms.of(self._usable(plan))
+            terms = Terms.of(self._usable(domain))
             x, y = bend(terms, x, y)
             if terms.tilt is not None:
                 x, y = terms.tilt.apply(x, y)
@@ -103,7 +102,7 @@ class BrownConrady(CoefficientLens):
         plan = self._plan()
 
         def backward(points: Tensor) -> tuple[Tensor, Tensor]:
-            coefficients = self._usable(plan)
+            coefficients = self._usable(plan.domain)
             x, y, valid = search(coefficients.detach(), plan, points.detach())
             x, y = torch.where(valid, x, 0), torch.where(valid, y, 0)
             if derivative_wanted(points, coefficients):
@@ -142,13 +141,16 @@ class BrownConrady(CoefficientLens):
         return torch.nn.functional.pad(xy, (0, 1), value=1.0), valid
 
     @staticmethod
-    def _work_out(coefficients: Tensor) -> Plan:
-        domain = brown_domain.domain_radius(coefficients)
+    def _find_domain(coefficients: Tensor) -> Tensor:
+        return brown_domain.domain_radius(coefficients)
+
+    @staticmethod
+    def _tabulate(coefficients: Tensor, domain: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         terms = Terms.of(torch.where((domain > 0).unsqueeze(-1), coefficients, 0))
         end = brown_domain.table_radius(terms, domain)
         table = inverse_table(lambda r: r * radial(terms, r * r), end, brown_domain.sway(terms, end))
         reach, noise = brown_domain.reach(terms, domain), brown_domain.cancellation(terms, end)
-        return Plan(domain, reach, noise, table.rho_max, table.ratio)
+        return reach, noise, table.rho_max, table.ratio
 
 
 _pytree.register(BrownConrady, children=("coefficients",))

@@ -10,7 +10,8 @@ Without prism and tilt the worst direction is known in closed form. In polar coo
     [[g + r dg/dr + 3 e c,  e sin],
      [e sin,                g + e c]]
 
-and its determinant is a parabola in `c`. With prism or tilt the directions are sampled, finer with each round.
+and its determinant is a parabola in `c`. With prism or tilt it is a trigonometric polynomial,
+whose smallest value is searched.
 """
 
 import math
@@ -18,7 +19,7 @@ import math
 import torch
 from torch import Tensor
 
-from diffproj.lens.brown_equations import Jacobian, Terms, bend, denominator, radial, radial_slope, tilted_jacobian
+from diffproj.lens.brown_equations import Terms, bend, denominator, radial, radial_slope, term_growth, tilted
 from diffproj.lens.domain import first_failure, radius_grid
 from diffproj.lens.polynomial import polynomial
 
@@ -31,10 +32,14 @@ HORIZON = 0.125
 WIDEST = 8.0
 """Tables end here at the latest: 83 degrees from the axis."""
 EDGE_POINTS = 360
-SECTORS, RAYS = 8, 9
-NARROWING = 2
-"""By how much the sectors get narrower from round to round. The radii get 10 times closer: the worst ray, which moves
-with the radius, cannot get lost."""
+DEGREE = 8
+"""Of the determinant as a trigonometric polynomial, when it is multiplied by the fourth power of the depth."""
+SAMPLES, COARSE, FINE = 20, 64, 256
+"""In how many directions it is evaluated, and in how many it is then known: at first and later."""
+POLISHING = 3
+"""Newton steps from the fine grid's smallest value."""
+LENSES = 8
+"""Handled at once."""
 DEGREES = (2, 4, 1, 1, 6, 2, 4, 6, 1, 3, 1, 3)
 """The power of the radius that each coefficient up to the tilt is multiplied with, relative to the point."""
 
@@ -51,12 +56,19 @@ def length_scale(coefficients: Tensor) -> Tensor:
 
 def domain_radius(coefficients: Tensor) -> Tensor:
     """The radius of the disc `(*B,)` for coefficients `(*B, k)` in float64; 0 where they are not finite."""
+    if coefficients.ndim > 1 and coefficients.shape[-1] > 8:  # in blocks that stay in the processor's cache
+        blocks = coefficients.flatten(0, -2).split(LENSES)
+        return torch.cat([_domain_radius(block) for block in blocks]).reshape(coefficients.shape[:-1])
+    return _domain_radius(coefficients)
+
+
+def _domain_radius(coefficients: Tensor) -> Tensor:
     scale = length_scale(coefficients)
     grid = scale.unsqueeze(-1) * radius_grid(coefficients)
     if coefficients.shape[-1] <= 8:
         radius, failed = first_failure(_ClosedForm(coefficients), grid)
     else:
-        radius, failed = first_failure(_Sampled(coefficients), grid, nodes=32, rounds=12)
+        radius, failed = first_failure(_Circles(coefficients), grid, nodes=32, rounds=8)
     radius = torch.where(failed, radius, math.inf)
     return torch.where(radius > 1e-9 * scale, radius, 0)  # not NaN, and sound at the very centre
 
@@ -77,37 +89,61 @@ class _ClosedForm:
         return (along > 0) & (factor > 0) & (determinant > 0) & _off_pole(self.terms, s)
 
 
-class _Sampled:
-    """Smallest eigenvalues on rays from the centre: all around at first, then close to the worst ray of each sector.
+class _Circles:
+    """The same for lenses with prism or tilt, by the smallest value of the determinant on each circle.
 
-    The worst ray is that on the last circle that was sound. The worst directions may come in pairs that are almost
-    equally bad, hence the sectors.
+    Times a power of the depth behind the tilt the determinant is, on a circle around the axis, a trigonometric
+    polynomial of degree 8: a few of its values tell all others. Its smallest value on a fine grid, between whose nodes
+    parabolas are laid, is improved by Newton's method.
     """
 
     def __init__(self, coefficients: Tensor):
-        kind = {"dtype": coefficients.dtype, "device": coefficients.device}
         self.terms = Terms.of(coefficients.unsqueeze(-2))
-        self.fan = torch.linspace(-math.pi / SECTORS, math.pi / SECTORS, RAYS, **kind)
-        middle = torch.arange(SECTORS, **kind) * (2 * math.pi / SECTORS)
-        self.towards = middle.expand(*coefficients.shape[:-1], SECTORS)
+        kind = {"dtype": coefficients.dtype, "device": coefficients.device}
+        angle = torch.arange(SAMPLES, **kind) * (2 * math.pi / SAMPLES)
+        self.cosine, self.sine = angle.cos(), angle.sin()
+        self.orders = torch.arange(DEGREE + 1, **kind)
+        weight = (2 - (self.orders == 0).to(angle)) / SAMPLES
+        turned = angle.unsqueeze(-1) * self.orders
+        self.analysis = torch.cat([turned.cos() * weight, turned.sin() * weight], dim=-1)  # values to a polynomial
+        turned = self.orders.unsqueeze(-1) * (torch.arange(FINE, **kind) * (2 * math.pi / FINE))
+        self.synthesis = torch.cat([turned.cos(), turned.sin()], dim=-2)  # a polynomial to values
+        self.doubling = self.analysis @ self.synthesis[:, :: FINE // COARSE]
 
     def __call__(self, radius: Tensor, number: int) -> Tensor:
-        angles = self.towards.unsqueeze(-1) + self.fan / NARROWING**number  # (*B, sectors, rays)
-        eigenvalue = self._smallest_eigenvalue(radius.unsqueeze(-1), angles.flatten(-2).unsqueeze(-2))
-        worst, ray = eigenvalue.unflatten(-1, (SECTORS, RAYS)).min(-1)  # (*B, M, sectors)
-        good = (worst > 0).all(-1)
-        last_good = ((~good).to(torch.uint8).argmax(-1) - 1).clamp_min(0)[..., None, None]
-        ray = ray.gather(-2, last_good.expand(*good.shape[:-1], 1, SECTORS)).squeeze(-2)
-        self.towards = angles.gather(-1, ray.unsqueeze(-1)).squeeze(-1)
-        return good
+        radius = radius.unsqueeze(-1)  # (*B, M, 1)
+        there = tilted(self.terms, radius * self.cosine, radius * self.sine)
+        xx, xy, yx, yy = (part * there.depth for part in there.jacobian)
+        trace, mixed = xx + yy, (xy + yx) / 2
+        size = trace.abs().amax(-1, keepdim=True)
+        determinant = (xx / size) * (yy / size) - (mixed / size) ** 2
+        good = self._positive(determinant) if number else (determinant @ self.doubling > 0).all(-1)
+        good &= (trace > 0).all(-1) & _off_pole(self.terms, radius * radius).all(-1)
+        if self.terms.tilt is None:
+            return good
+        x, y = bend(self.terms, radius * self.cosine, radius * self.sine)
+        x, y = (part @ self.doubling for part in (x, y))
+        return good & (self.terms.tilt.clearance(x, y) > HORIZON).all(-1)
 
-    def _smallest_eigenvalue(self, radius: Tensor, angle: Tensor) -> Tensor:
-        """That of the symmetric part, times something positive; negative where the lens has no value."""
-        jacobian, depth = tilted_jacobian(self.terms, radius * angle.cos(), radius * angle.sin())
-        eigenvalue = _smallest_eigenvalue(jacobian)
-        eigenvalue = torch.where(depth > HORIZON, eigenvalue, depth - 2)
-        sound = _off_pole(self.terms, radius * radius) & ~eigenvalue.isnan()
-        return torch.where(sound, eigenvalue, -math.inf)
+    def _positive(self, samples: Tensor) -> Tensor:
+        """Whether trigonometric polynomials are positive all around."""
+        waves = samples @ self.analysis
+        values = waves @ self.synthesis
+        before, after = values.roll(1, -1), values.roll(-1, -1)
+        rise, bend_up = (after - before) / 2, after - 2 * values + before
+        ahead = torch.where(bend_up > rise.abs(), -rise / bend_up, 0)
+        index = (values + rise * ahead / 2).argmin(-1, keepdim=True)
+        angle = (index + ahead.gather(-1, index)) * (2 * math.pi / FINE)
+        cosines, sines = waves.split(DEGREE + 1, dim=-1)
+        for _ in range(POLISHING):
+            turned = angle * self.orders
+            cosine, sine = turned.cos(), turned.sin()
+            slope = (self.orders * (sines * cosine - cosines * sine)).sum(-1, keepdim=True)
+            curvature = -(self.orders**2 * (cosines * cosine + sines * sine)).sum(-1, keepdim=True)
+            angle = angle - torch.where(curvature > 0, slope / curvature, 0).clamp(-math.pi / FINE, math.pi / FINE)
+        turned = angle * self.orders
+        polished = (cosines * turned.cos() + sines * turned.sin()).sum(-1)
+        return (polished > 0) & (values > 0).all(-1)
 
 
 def _off_pole(terms: Terms, s: Tensor) -> Tensor:
@@ -116,11 +152,6 @@ def _off_pole(terms: Terms, s: Tensor) -> Tensor:
     if terms.below is None:
         return below > 0
     return below > POLE * (1 + s * polynomial(s, [column.abs() for column in terms.below]))
-
-
-def _smallest_eigenvalue(jacobian: Jacobian) -> Tensor:
-    mean = (jacobian.xx + jacobian.yy) / 2
-    return mean - torch.hypot((jacobian.xx - jacobian.yy) / 2, (jacobian.xy + jacobian.yx) / 2)
 
 
 # ------------------------------------------------------------------------------------------------ what goes with it
@@ -161,8 +192,4 @@ def reach(terms: Terms, domain: Tensor) -> Tensor:
 def cancellation(terms: Terms, radius: Tensor) -> Tensor:
     """How much larger than the radial factor its terms get up to `radius`: the factor by which rounding grows."""
     s = (torch.linspace(0, 1, 64, dtype=radius.dtype, device=radius.device) * radius.unsqueeze(-1)) ** 2
-    below = denominator(terms, s)
-    growth = (1 + s * polynomial(s, [column.abs() for column in terms.above])) / (below * radial(terms, s))
-    if terms.below is not None:
-        growth = growth + (1 + s * polynomial(s, [column.abs() for column in terms.below])) / below
-    return growth.amax(-1).nan_to_num(1.0).clamp(1, 64)
+    return term_growth(terms, s).amax(-1).nan_to_num(1.0).clamp(1, 64)

@@ -41,6 +41,11 @@ class Tilt(NamedTuple):
         """`W`: positive for points in front of the tilted sensor's horizon."""
         return self.sin_y * x - self.cos_y * self.sin_x * y + self.cos_x * self.cos_y
 
+    def clearance(self, x: Tensor, y: Tensor) -> Tensor:
+        """The depth relative to its terms: close to 0 near the tilted sensor's horizon."""
+        terms = self.sin_y * x, self.cos_y * self.sin_x * y, self.cos_x * self.cos_y
+        return self.depth(x, y) / sum(term.abs() for term in terms)
+
     def apply(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """`(X, Y) / W`."""
         depth = self.depth(x, y)
@@ -142,6 +147,15 @@ def radial_slope(terms: Terms, s: Tensor, factor: Tensor) -> Tensor:
     return (slope - factor * polynomial(s, terms.below_slope)) / denominator(terms, s)
 
 
+def term_growth(terms: Terms, s: Tensor) -> Tensor:
+    """How much larger than the radial factor its terms get at squared radii `s`: by this much rounding grows."""
+    below = denominator(terms, s)
+    growth = (1 + s * polynomial(s, [column.abs() for column in terms.above])) / (below * radial(terms, s))
+    if terms.below is not None:
+        growth = growth + (1 + s * polynomial(s, [column.abs() for column in terms.below])) / below
+    return growth
+
+
 def bend(terms: Terms, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """`(x', y')`: everything but the tilt."""
     s = torch.addcmul(x * x, y, y)
@@ -186,13 +200,28 @@ def _tangential_factor(terms: Terms, x: Tensor, y: Tensor) -> Tensor:
     return torch.addcmul(torch.addcmul(terms.one, x, terms.two_p2), y, terms.two_p1)
 
 
-def tilted_jacobian(terms: Terms, x: Tensor, y: Tensor) -> tuple[Jacobian, Tensor]:
-    """Derivatives of the whole lens times the depth `W`, and the depth relative to its terms (1 without a tilt)."""
+class Tilted(NamedTuple):
+    """The whole lens at a point, and its slope.
+
+    Attributes:
+        x, y: where the point goes.
+        jacobian: the derivatives of that, times the depth.
+        depth: `W`, 1 without a tilt.
+    """
+
+    x: Tensor
+    y: Tensor
+    jacobian: Jacobian
+    depth: Tensor
+
+
+def tilted(terms: Terms, x: Tensor, y: Tensor) -> Tilted:
+    """The whole lens, tilt and all, with its derivatives."""
     zero = torch.zeros_like(x)
     x_off, y_off, bent = bend_off(terms, (zero, zero), x, y)
     tilt = terms.tilt
     if tilt is None:
-        return bent, torch.ones_like(x)
+        return Tilted(-x_off, -y_off, bent, torch.ones_like(x))
     depth = tilt.depth(-x_off, -y_off)
     x_tilted, y_tilted = tilt.apply(-x_off, -y_off)
     down = tilt.cos_y * tilt.sin_x
@@ -204,5 +233,4 @@ def tilted_jacobian(terms: Terms, x: Tensor, y: Tensor) -> tuple[Jacobian, Tenso
         yx * bent.xx + yy * bent.yx,
         yx * bent.xy + yy * bent.yy,
     )
-    size = (tilt.sin_y * x_off).abs() + (down * y_off).abs() + (tilt.cos_x * tilt.cos_y).abs()
-    return chained, depth / size
+    return Tilted(x_tilted, y_tilted, chained, depth)

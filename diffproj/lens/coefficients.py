@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from diffproj._numerics import broadcast_batches, check_same_kind, check_tensor, index_batch, readable
-from diffproj.lens.plan import AXES, Plan, know, plan_of
+from diffproj.lens.plan import AXES, Model, Plan, domain_of, know, plan_of
 
 L = TypeVar("L", bound="CoefficientLens")
 
@@ -34,7 +34,9 @@ class CoefficientLens(ABC):
 
     def _assign(self, coefficients: Any) -> None:
         self.coefficients = coefficients
-        self._remembered: tuple[int, Plan] | None = None
+        self._version = -1
+        self._known_domain: Tensor | None = None
+        self._known_plan: Plan | None = None
         self._origin: tuple[CoefficientLens, Callable[[Tensor, int], Tensor]] | None = None
 
     @classmethod
@@ -97,29 +99,48 @@ class CoefficientLens(ABC):
     # ----------------------------------------------------------------------------------------------------- the plan
 
     def __init_subclass__(cls) -> None:
-        know(cls.__name__, cls._work_out)
+        know(cls.__name__, Model(cls._find_domain, cls._tabulate))
 
     @staticmethod
     @abstractmethod
-    def _work_out(coefficients: Tensor) -> Plan:
-        """The plan for coefficients in float64; its domain is 0 where they are of no use."""
+    def _find_domain(coefficients: Tensor) -> Tensor:
+        """The domain `(*B,)` for coefficients in float64; 0 where they are of no use."""
+
+    @staticmethod
+    @abstractmethod
+    def _tabulate(coefficients: Tensor, domain: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The other parts of the plan, in float64; anything where the domain is 0."""
+
+    def _domain(self) -> Tensor:
+        """The domain, all that the way forward needs; remembered for as long as nobody writes to the coefficients."""
+        name = type(self).__name__
+        if not readable(self.coefficients):
+            return domain_of(name, self.coefficients)
+        if self._origin is not None:
+            origin, rearrange = self._origin
+            return rearrange(origin._domain(), 0)
+        version = 0 if self.coefficients.is_inference() else self.coefficients._version
+        if self._known_domain is None or self._version != version:
+            with torch.inference_mode(False), torch.no_grad():
+                self._version, self._known_domain, self._known_plan = version, domain_of(name, self.coefficients), None
+        return self._known_domain
 
     def _plan(self) -> Plan:
-        """The plan, remembered for as long as nobody writes to the coefficients."""
+        """The whole plan, which the way back needs, remembered likewise."""
+        name, domain = type(self).__name__, self._domain()
         if not readable(self.coefficients):
-            return plan_of(type(self).__name__, self.coefficients)
+            return plan_of(name, self.coefficients, domain)
         if self._origin is not None:
             origin, rearrange = self._origin
             return Plan(*(rearrange(part, axes) for part, axes in zip(origin._plan(), AXES, strict=True)))
-        version = 0 if self.coefficients.is_inference() else self.coefficients._version
-        if self._remembered is None or self._remembered[0] != version:
+        if self._known_plan is None:
             with torch.inference_mode(False), torch.no_grad():
-                self._remembered = version, plan_of(type(self).__name__, self.coefficients)
-        return self._remembered[1]
+                self._known_plan = plan_of(name, self.coefficients, domain)
+        return self._known_plan
 
-    def _usable(self, plan: Plan) -> Tensor:
+    def _usable(self, domain: Tensor) -> Tensor:
         """The coefficients, zero where the lens is of no use, so that no NaN gets into a gradient."""
-        return torch.where((plan.domain > 0).unsqueeze(-1), self.coefficients, 0)
+        return torch.where((domain > 0).unsqueeze(-1), self.coefficients, 0)
 
     def _checked(self, name: str, points: Tensor, size: int) -> Tensor:
         """Points in the lens's own kind, with all batch axes."""

@@ -1,5 +1,8 @@
 """What a lens does differently inside a compiled graph."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -44,3 +47,11 @@ def _apart(points: Tensor) -> Tensor:
 @_apart.register_fake
 def _apart_shape(points: Tensor) -> Tensor:
     return points.new_empty((points.shape[-1], *points.shape[:-1]))
+
+
+def with_batch_in_front(info: Any, in_dims: Sequence[int | None], *tensors: Tensor) -> list[Tensor]:
+    """Tensors that `vmap` hands to an opaque operation, with the axis it maps over in front of each."""
+    return [
+        tensor.expand(info.batch_size, *tensor.shape) if axis is None else tensor.movedim(axis, 0)
+        for tensor, axis in zip(tensors, in_dims, strict=False)
+    ]

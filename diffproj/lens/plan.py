@@ -5,12 +5,13 @@ the same coefficients would be worked out anew in each call.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffproj._numerics import precise
+from diffproj.lens.compiling import with_batch_in_front
 from diffproj.lens.table import NODES
 
 
@@ -35,65 +36,110 @@ class Plan(NamedTuple):
 AXES = (0, 0, 0, 1, 1)
 """How many axes each part has behind those of the batch."""
 
-Model = Callable[[Tensor], Plan]
+
+class Model(NamedTuple):
+    """How a kind of lens works out its plan, from coefficients in float64.
+
+    Attributes:
+        domain: takes coefficients `(*B, k)` to the domain; 0 where they are of no use.
+        rest: takes coefficients and domain to the other parts.
+    """
+
+    domain: Callable[[Tensor], Tensor]
+    rest: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
+
 
 _models: dict[str, Model] = {}
-_recent: list[tuple[str, Tensor, Plan]] = []
-RECENT = 8
+_recent: list[tuple[str, tuple[Tensor, ...], tuple[Tensor, ...]]] = []
+RECENT = 16
 
 
 def know(name: str, model: Model) -> None:
-    """Register under a name how a plan is worked out for coefficients in float64."""
+    """Register under a name how a plan is worked out."""
     _models[name] = model
 
 
-def plan_of(name: str, coefficients: Tensor) -> Plan:
-    """The plan for coefficients `(*B, k)`, in their type; the domain is rounded inward, and 0 for those of no use."""
+def domain_of(name: str, coefficients: Tensor) -> Tensor:
+    """The domain for coefficients `(*B, k)`, in their type and rounded inward; 0 for those of no use."""
     coefficients = coefficients.detach()
-    return Plan(*_planned(coefficients, name)) if torch.compiler.is_compiling() else _rounded(name, coefficients)
+    return _domain(coefficients, name) if torch.compiler.is_compiling() else _rounded(name, coefficients)
 
 
-def _rounded(name: str, coefficients: Tensor) -> Plan:
-    plan = _models[name](precise(coefficients))
-    domain, *others = (part.to(coefficients.dtype) for part in plan)
-    domain = torch.where(
-        domain.to(plan.domain.dtype) > plan.domain, torch.nextafter(domain, torch.zeros_like(domain)), domain
-    )
+def plan_of(name: str, coefficients: Tensor, domain: Tensor) -> Plan:
+    """The whole plan for coefficients `(*B, k)` and their domain, in their type."""
+    coefficients = coefficients.detach()
+    rest = _rest if torch.compiler.is_compiling() else _worked_out
+    return Plan(domain, *rest(coefficients, domain, name))
+
+
+def _rounded(name: str, coefficients: Tensor) -> Tensor:
+    exact = _models[name].domain(precise(coefficients))
+    domain = exact.to(coefficients.dtype)
+    domain = torch.where(domain.to(exact.dtype) > exact, torch.nextafter(domain, torch.zeros_like(domain)), domain)
     limits = torch.finfo(coefficients.dtype)
     overflows = coefficients.abs().amax(-1) > limits.max / 1e4
     underflows = domain < limits.tiny**0.25  # the squares of errors would be lost
-    return Plan(torch.where(overflows | underflows, 0, domain), *others)
+    return torch.where(overflows | underflows, 0, domain)
+
+
+def _worked_out(coefficients: Tensor, domain: Tensor, name: str) -> tuple[Tensor, ...]:
+    parts = _models[name].rest(precise(coefficients), precise(domain))
+    return tuple(part.to(coefficients.dtype) for part in parts)
+
+
+@torch.library.custom_op("diffproj::lens_domain", mutates_args=())
+def _domain(coefficients: Tensor, name: str) -> Tensor:
+    (domain,) = _remembered(f"{name} domain", lambda c: (_rounded(name, c),), coefficients)
+    return domain
 
 
 @torch.library.custom_op("diffproj::lens_plan", mutates_args=())
-def _planned(coefficients: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    plan = _remembered(name, coefficients) if coefficients.device.type == "cpu" else _rounded(name, coefficients)
-    domain, reach, noise, rho_max, ratio = (part.clone(memory_format=torch.contiguous_format) for part in plan)
-    return domain, reach, noise, rho_max, ratio
+def _rest(coefficients: Tensor, domain: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    reach, noise, rho_max, ratio = _remembered(
+        name, lambda c, reached: _worked_out(c, reached, name), coefficients, domain
+    )
+    return reach, noise, rho_max, ratio
 
 
-def _remembered(name: str, coefficients: Tensor) -> Plan:
-    """The plan, from memory if these coefficients were asked for lately. Not on accelerators, where looking waits."""
-    for index, (known, values, plan) in enumerate(_recent):
-        if known == name and values.dtype == coefficients.dtype and torch.equal(values, coefficients):
+def _remembered(name: str, function: Callable[..., tuple[Tensor, ...]], *arguments: Tensor) -> tuple[Tensor, ...]:
+    """Copies of the results, from memory if lately asked for. No memory on accelerators, where looking waits."""
+    if arguments[0].device.type != "cpu":
+        return tuple(part.contiguous() for part in function(*arguments))
+    for index, (known, values, _) in enumerate(_recent):
+        if known == name and all(
+            before.dtype == now.dtype and torch.equal(before, now)
+            for before, now in zip(values, arguments, strict=True)
+        ):
             _recent.insert(0, _recent.pop(index))
-            return plan
-    plan = _rounded(name, coefficients)
-    _recent.insert(0, (name, coefficients.clone(), plan))
-    del _recent[RECENT:]
-    return plan
+            break
+    else:
+        _recent.insert(0, (name, tuple(argument.clone() for argument in arguments), function(*arguments)))
+        del _recent[RECENT:]
+    return tuple(part.clone(memory_format=torch.contiguous_format) for part in _recent[0][2])
 
 
-@_planned.register_fake
-def _planned_shapes(coefficients: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # noqa: ARG001
+@_domain.register_fake
+def _domain_shape(coefficients: Tensor, name: str) -> Tensor:  # noqa: ARG001
+    return coefficients.new_empty(coefficients.shape[:-1])
+
+
+@_rest.register_fake
+def _rest_shapes(coefficients: Tensor, domain: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # noqa: ARG001
     batch = coefficients.shape[:-1]
-    sizes = [(), (), (), (3,), (NODES,)]
-    domain, reach, noise, rho_max, ratio = (coefficients.new_empty((*batch, *size)) for size in sizes)
-    return domain, reach, noise, rho_max, ratio
+    reach, noise, rho_max, ratio = (coefficients.new_empty((*batch, *size)) for size in ((), (), (3,), (NODES,)))
+    return reach, noise, rho_max, ratio
 
 
-@_planned.register_vmap
-def _planned_batched(
+@_domain.register_vmap
+def _domain_batched(
     _info: object, in_dims: tuple[int | None, None], coefficients: Tensor, name: str
-) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[int, int, int, int, int]]:
-    return _planned(coefficients.movedim(in_dims[0] or 0, 0), name), (0, 0, 0, 0, 0)
+) -> tuple[Tensor, int]:
+    return _domain(coefficients.movedim(in_dims[0] or 0, 0), name), 0
+
+
+@_rest.register_vmap
+def _rest_batched(
+    info: Any, in_dims: tuple[int | None, int | None, None], coefficients: Tensor, domain: Tensor, name: str
+) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], tuple[int, int, int, int]]:
+    coefficients, domain = with_batch_in_front(info, in_dims, coefficients, domain)
+    return _rest(coefficients, domain, name), (0, 0, 0, 0)

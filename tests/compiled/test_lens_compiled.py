@@ -55,6 +55,18 @@ def test_a_lens_as_an_argument() -> None:
             torch.testing.assert_close(compiled, eager, rtol=1e-13, atol=1e-13)
 
 
+def test_next_to_the_fold() -> None:
+    """A millionth of the radius in front of it fixed steps would not do: the compiled lens takes more, too."""
+    lens = BrownConrady(torch.tensor(CASES["brown5"][1], dtype=torch.float64))
+    angle = torch.linspace(0, 6.28, 50, dtype=torch.float64)
+    share = 1 - 10 ** torch.linspace(-6, -2, 50, dtype=torch.float64)
+    edge = (lens.domain * share).unsqueeze(-1) * torch.stack([angle.cos(), angle.sin()], dim=-1)
+    xy, _ = lens.distort(edge)
+    found, valid = torch.compile(lambda points: lens.undistort(points), fullgraph=True)(xy)
+    assert valid.all()
+    assert (lens.distort(found)[0] - xy).abs().max() < 1e-12
+
+
 def test_vmap_and_jvp_inside() -> None:
     many = torch.tensor(CASES["brown5"][1], dtype=torch.float64) * torch.tensor([[0.5], [1.0]], dtype=torch.float64)
     xy = points(20)
