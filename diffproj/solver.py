@@ -137,6 +137,7 @@ class Solution(NamedTuple):
     equations: Equations
 
 
+@np.errstate(all="ignore")  # infinite and undefined promises are looked at, not warned of
 def solve(
     problem: Problem,
     shared: Float[Tensor, "p s"],
@@ -217,8 +218,7 @@ class _Pace:
     def settle(self, prospect: np.ndarray, tolerance: float, negligible: float) -> np.ndarray:
         """Stop those that have nothing left to gain, which are returned, and those that are stuck."""
         # The step at hand is taken at the end: what counts is what the one after it would bring, as promises shrink.
-        with np.errstate(all="ignore"):
-            after = prospect * np.clip(prospect / self.before, FASTEST, 1)
+        after = prospect * np.clip(prospect / self.before, FASTEST, 1)
         self.before = np.where(self.active, prospect, self.before)
         small = (after <= tolerance * self.cost) & (prospect <= LAST_PROMISE * self.cost)
         # Where a promise is rounding of the cost, whether a trial is better is chance: a failure ends it.
@@ -238,8 +238,7 @@ class _Pace:
         """
         better = self.active & (cost <= self.cost) & np.isfinite(promise)  # false where the trial is NaN
         worse = self.failed = self.active & ~better
-        with np.errstate(all="ignore"):
-            model = 1 - (2 * (self.cost - cost) / promise - 1) ** 3
+        model = 1 - (2 * (self.cost - cost) / promise - 1) ** 3
         factor = np.where(better, np.maximum(np.minimum(model, 2), 1 / self.fall), np.where(worse, self.rise, 1))
         self.damping = np.maximum(self.damping * factor, SMALLEST_DAMPING)
         self.rise = np.where(better, FIRST_RISE, np.where(worse, 2 * self.rise, self.rise))
@@ -266,11 +265,11 @@ def damped_step(equations: Equations, damping: Float[Tensor, " p"]) -> tuple[Ten
     U, E, W, g, h, _ = equations
     D, D_local = (_positive(M.diagonal(dim1=-2, dim2=-1)) for M in (U, W))
     lam = damping.unsqueeze(-1)
-    L, local_failed = torch.linalg.cholesky_ex(W + torch.diag_embed(lam.unsqueeze(-1) * D_local))
+    L, local_failed = torch.linalg.cholesky_ex(_with_diagonal(W, lam.unsqueeze(-1) * D_local))
     Y = torch.linalg.solve_triangular(L, torch.cat([E.mT, h.unsqueeze(-1)], dim=-1), upper=False)
     Y, y = Y[..., :-1], Y[..., -1:]
     flat = Y.flatten(1, 2)
-    S = U + torch.diag_embed(lam * D) - flat.mT @ flat
+    S = torch.baddbmm(_with_diagonal(U, lam * D), flat.mT, flat, alpha=-1)
     reduced = g - _times(flat.mT, y.flatten(1))
     L_shared, failed = torch.linalg.cholesky_ex(S)
     dx = -torch.cholesky_solve(reduced.unsqueeze(-1), L_shared)
@@ -326,6 +325,12 @@ class _Terms:
             pull = _times(self.prior.precision, off)
             cost, U, g = cost + (off * pull).sum(-1) / 2, U + self.prior.precision, g + pull
         return cost, Equations(U, gram[..., :s, s:-1], gram[..., s:-1, s:-1], g, gram[..., s:-1, -1], c)
+
+
+def _with_diagonal(matrix: Tensor, addition: Tensor) -> Tensor:
+    sum_ = matrix.clone()
+    sum_.diagonal(dim1=-2, dim2=-1).add_(addition)
+    return sum_
 
 
 def _positive(diagonal: Tensor) -> Tensor:

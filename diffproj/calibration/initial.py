@@ -8,6 +8,7 @@ from torch import Tensor
 from diffproj.calibration import start
 from diffproj.calibration.board_error import assembled
 from diffproj.calibration.data import Data
+from diffproj.calibration.fit import ordinary
 from diffproj.calibration.reprojection import COEFFICIENTS, LensModel, lens_model
 from diffproj.camera import Camera
 
@@ -50,11 +51,14 @@ def from_nothing(
     data: Data, model: LensModel, size: tuple[int, int], tied: bool, bow: bool
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """Shared parameters and poses to start from, with nothing known but the size of the image."""
-    middle = data.pixels.new_tensor([(size[0] - 1) / 2, (size[1] - 1) / 2]).expand(len(data.pixels), 2)
-    rest = middle.new_zeros(len(middle), COEFFICIENTS[model] + 2 * bow)
-    if model == "fisheye":
-        return _fisheye(data, middle, rest, float(max(size)), bow)
-    return _perspective(data, middle, rest, size, tied, model != "none")
+    with torch.inference_mode():
+        middle = data.pixels.new_tensor([(size[0] - 1) / 2, (size[1] - 1) / 2]).expand(len(data.pixels), 2)
+        rest = middle.new_zeros(len(middle), COEFFICIENTS[model] + 2 * bow)
+        if model == "fisheye":
+            found = _fisheye(data, middle, rest, float(max(size)), bow)
+        else:
+            found = _perspective(data, middle, rest, size, tied, model != "none")
+    return ordinary(found)
 
 
 def _perspective(

@@ -76,19 +76,16 @@ def brown_conrady(coefficients: Tensor, X_cam: Tensor, by_coefficient: Tensor, b
             rows[:, :, row, 1 - component] = 0.0
     distorted = torch.addcmul(distorted, s_row, sideways)
 
-    # d(x', y') = factor dxy + xy (2 g' xy + (2 p2, 2 p1)) . dxy + steep xy . dxy
+    # d(x', y') = factor dxy + xy (2 g' xy + (2 p2, 2 p1)) . dxy + steep xy . dxy, as (P, V, by x and y, x' and y', N)
     toward = torch.addcmul(2 * torch.stack([p2, p1], dim=2), xy, 2 * slope.unsqueeze(2))
-    by_x = torch.addcmul(xy * toward[:, :, :1], steep, x.unsqueeze(2))
-    by_y = torch.addcmul(xy * toward[:, :, 1:], steep, y.unsqueeze(2))
-    by_x[:, :, 0] += factor
-    by_y[:, :, 1] += factor
+    by_xy = torch.addcmul(toward.unsqueeze(3) * xy.unsqueeze(2), xy.unsqueeze(3), steep.unsqueeze(2))
+    by_xy.diagonal(dim1=2, dim2=3).add_(factor.unsqueeze(-1))
     if count == 14:
-        distorted, by_x, by_y = _tilt(k[12], k[13], distorted, by_x, by_y, rows)
-    by_x *= inverse_depth.unsqueeze(2)
-    by_y *= inverse_depth.unsqueeze(2)
-    by_point[:, :, 0], by_point[:, :, 1] = by_x, by_y
-    torch.mul(by_x, x.unsqueeze(2), out=by_point[:, :, 2])
-    by_point[:, :, 2].addcmul_(by_y, y.unsqueeze(2)).neg_()
+        distorted, by_xy = _tilt(k[12], k[13], distorted, by_xy, rows)
+    by_xy *= inverse_depth[:, :, None, None]
+    by_point[:, :, :2] = by_xy
+    torch.sum(by_xy * xy.unsqueeze(3), dim=2, out=by_point[:, :, 2])
+    by_point[:, :, 2].neg_()
     return distorted
 
 
@@ -131,27 +128,24 @@ def _polynomial(s: Tensor, columns: list[Tensor]) -> Tensor:
     return value
 
 
-def _tilt(
-    tau_x: Tensor, tau_y: Tensor, xy: Tensor, by_x: Tensor, by_y: Tensor, rows: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _tilt(tau_x: Tensor, tau_y: Tensor, xy: Tensor, by_xy: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
     """The point on the tilted sensor, and derivatives taken on by the tilt's own Jacobian `(P, V, 2, 2, N)`."""
     x, y = xy.unbind(2)
     cos_x, sin_x, cos_y, sin_y = tau_x.cos(), tau_x.sin(), tau_y.cos(), tau_y.sin()
     inverse = (sin_y * x - cos_y * sin_x * y + cos_x * cos_y).reciprocal()
     X, Y = cos_x * x * inverse, (cos_y * y - sin_x * sin_y * x) * inverse
-    xx, xy_ = (cos_x - X * sin_y) * inverse, X * cos_y * sin_x * inverse
-    yx, yy = -(sin_x + Y) * sin_y * inverse, (1 + Y * sin_x) * cos_y * inverse
+    one = [((cos_x - X * sin_y) * inverse).unsqueeze(2), (X * cos_y * sin_x * inverse).unsqueeze(2)]
+    two = [(-(sin_x + Y) * sin_y * inverse).unsqueeze(2), ((1 + Y * sin_x) * cos_y * inverse).unsqueeze(2)]
 
     def onward(vectors: Tensor) -> Tensor:
         u, v = vectors.unbind(-2)
-        return torch.stack([xx * u + xy_ * v, yx * u + yy * v], dim=-2)
+        return torch.stack([one[0] * u + one[1] * v, two[0] * u + two[1] * v], dim=-2)
 
-    for row in range(12):
-        rows[:, :, row] = onward(rows[:, :, row])
+    rows[:, :, :12] = onward(rows[:, :, :12])
     fall = -cos_y * (cos_x * y + sin_x)  # dW / dtau_x
     rows[:, :, 12, 0] = (-sin_x * x - X * fall) * inverse
     rows[:, :, 12, 1] = (-cos_x * sin_y * x - Y * fall) * inverse
     fall = cos_y * x + sin_y * (sin_x * y - cos_x)  # dW / dtau_y
     rows[:, :, 13, 0] = -X * fall * inverse
     rows[:, :, 13, 1] = (-sin_y * y - sin_x * cos_y * x - Y * fall) * inverse
-    return torch.stack([X, Y], dim=2), onward(by_x), onward(by_y)
+    return torch.stack([X, Y], dim=2), onward(by_xy)

@@ -15,6 +15,7 @@ board's extent along x and y: the bows are what the board's centre stands off it
 """
 
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Literal
 
 import torch
@@ -85,16 +86,18 @@ def moved(local: LocalState, step: Tensor) -> LocalState:
     """
     R, t = local
     half = step[..., :3] / 2
-    V = (half @ _cross_generators(half)).unflatten(-1, (3, 3))
+    V = (half @ _cross_generators(half.dtype, half.device)).unflatten(-1, (3, 3))
     turn = (V + V @ V) * (2 / (1 + half.square().sum(-1)))[..., None, None]
     return R + turn @ R, t + step[..., 3:]
 
 
-def _cross_generators(like: Tensor) -> Tensor:
+@cache
+def _cross_generators(dtype: torch.dtype, device: torch.device) -> Tensor:
     """`(3, 9)`: takes a vector to the entries of its cross-product matrix."""
-    generators = like.new_zeros(3, 9)
-    generators[[0, 1, 2], [7, 2, 3]] = 1.0
-    generators[[0, 1, 2], [5, 6, 1]] = -1.0
+    with torch.inference_mode(False):  # what is kept must serve those who ask for derivatives, too
+        generators = torch.zeros(3, 9, dtype=dtype, device=device)
+        generators[[0, 1, 2], [7, 2, 3]] = 1.0
+        generators[[0, 1, 2], [5, 6, 1]] = -1.0
     return generators
 
 
@@ -146,7 +149,7 @@ class Reprojection:
             z = X_cam[:, :, 2]
             if self._unused is not None:
                 z.masked_fill_(self._unused, 1.0)
-            z.masked_fill_(z <= 0, torch.nan)  # behind the camera: no such cost
+            z.clamp_(min=0)  # behind the camera there is no cost: what follows is not finite
         elif self._unused is not None:
             X_cam[:, :, 2].masked_fill_(self._unused, 1.0)
         coefficients = shared[:, 4 : 4 + count]

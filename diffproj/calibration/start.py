@@ -19,6 +19,8 @@ FOCAL_SCALE = (0.4, 0.6, 0.8, 1.0, 1.3, 1.8, 2.5, 4.0)
 """Focal lengths to try, in units of the image's longer side."""
 FISHEYE_SCALE = (0.5, 0.65, 0.8, 1.0, 1.25, 1.6, 2.2)
 """Focal lengths to try for a fisheye, in units of the longer side over pi: 1 has half a turn across the image."""
+ENOUGH = 24
+"""Corners of a view that a homography is taken from at most, spread over those that were seen."""
 DIVISION_TRIES, DIVISION_RANGE = (-0.3, -0.15, 0.0), (-0.45, 0.15)
 """What the one number for a lens is looked for among, and its limits: -0.3 moves the image's corner by a third."""
 DIVISION_VIEWS = 4
@@ -33,9 +35,17 @@ def homographies(points: Tensor, xy: Tensor, used: Tensor) -> Tensor:
     Not finite, or of no use, where the used corners do not determine one.
     """
     P, V, N, _ = xy.shape
-    weights = None if bool(used.all()) else used.reshape(P * V, N).to(xy.dtype)
-    centred = (points[:, :2] - points[:, :2].mean(0)).expand(P * V, N, 2)
-    return find_homography_dlt(centred, xy.reshape(P * V, N, 2), weights, solver="lu").reshape(P, V, 3, 3)
+    board = (points[:, :2] - points[:, :2].mean(0)).expand(P, V, N, 2)
+    if N > ENOUGH:  # a start needs no more, however many there are
+        order = used.cumsum(-1) * ENOUGH // used.sum(-1, keepdim=True).clamp(min=ENOUGH)
+        spread = used & (order != torch.nn.functional.pad(order[..., :-1], (1, 0)))
+        chosen = spread.to(xy.dtype).topk(ENOUGH).indices
+        used = spread.gather(-1, chosen)
+        chosen = chosen.unsqueeze(-1).expand(-1, -1, -1, 2)
+        board, xy = board.gather(2, chosen), xy.gather(2, chosen)
+    board, xy = board.reshape(P * V, -1, 2), xy.reshape(P * V, -1, 2)
+    # Weights even where all are 1: what one view is computed by must not depend on another.
+    return find_homography_dlt(board, xy, used.flatten(0, 1).to(xy.dtype), solver="lu").reshape(P, V, 3, 3)
 
 
 def division(points: Tensor, pixels: Tensor, used: Tensor, middle: Tensor, radius: float) -> Tensor:

@@ -20,6 +20,12 @@ PARALLEL = math.radians(15)
 
 def verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor, tuple[str, ...]]:
     """The status `(P,)` of each camera, and for those that did not converge the cause; empty where there is none."""
+    with torch.inference_mode():
+        status, causes = _verdicts(found, names, board)
+    return status.clone(), causes
+
+
+def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor, tuple[str, ...]]:
     task, solution = found.task, found.solution
     used = task.used.any(-1)
     R, t = solution.local
