@@ -185,27 +185,29 @@ def _fit(
     options = {"max_iterations": max_iterations, "tolerance": tolerance}
     blocks = _blocks(task)
 
-    def attempt(task: Task, shared: Tensor, local: tuple[Tensor, ...]) -> Solution:
-        tell = progress or _tell_nobody
-        total = len(blocks) * max_iterations
+    tell = progress or _tell_nobody
+    rounds = 1 if reject is None else 1 + ROUNDS
+    total = rounds * len(blocks) * max_iterations
+
+    def attempt(task: Task, shared: Tensor, local: tuple[Tensor, ...], done: int) -> Solution:
         parts = []
         for number, where in enumerate(blocks):
-            report = partial(_report, tell, number * max_iterations, total)
+            report = partial(_report, tell, (done * len(blocks) + number) * max_iterations, total)
             parts.append(_solve(task.part(where), shared[where], tuple(z[where] for z in local), report, **options))
-        tell(total, total)
         return parts[0] if len(parts) == 1 else _joined(parts)
 
-    solution = attempt(task, shared, local)
+    solution = attempt(task, shared, local, 0)
     iterations = solution.iterations
     if reject is not None:
-        for _ in range(ROUNDS):
+        for done in range(1, rounds):
             # Views that fell below four corners keep the pose that they had.
             kept = _without_outliers(replace(task, used=given), solution, reject)
             if torch.equal(kept, task.used):
                 break
             task = replace(task, used=kept)
-            solution = attempt(task, solution.shared, solution.local)
+            solution = attempt(task, solution.shared, solution.local, done)
             iterations = iterations + solution.iterations
+    tell(total, total)
     return Fit(task, solution._replace(iterations=iterations), given & ~task.used)
 
 

@@ -119,7 +119,7 @@ class Calibration:
         causes = [cause or SENTENCES[code] for code, cause in zip(codes, self._causes(), strict=True)]
         beyond = (self.used.sum(-1) - self._residuals()[1]).sum(-1).flatten().tolist()
         causes = [
-            f"{cause}; {count} corners lie beyond the fold of the lens: fit one with fewer coefficients" * bool(count)
+            f"{cause}; {_counted(count)} beyond the fold of the lens: fit one with fewer coefficients" * bool(count)
             or cause
             for cause, count in zip(causes, beyond, strict=True)
         ]
@@ -178,6 +178,10 @@ class Calibration:
 
     def _causes(self) -> tuple[str, ...]:
         return self.causes or ("",) * max(1, self.status.numel())
+
+
+def _counted(corners: int) -> str:
+    return "1 corner lies" if corners == 1 else f"{corners} corners lie"
 
 
 def _spread(deviation: Tensor | None, form: str) -> str:

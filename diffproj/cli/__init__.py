@@ -1,0 +1,42 @@
+"""The `diffproj` command: joins calibration, experiment, figures and files.
+
+Exit codes: 0 done, 1 the work failed (one line says what and what to do), 2 the command was not understood, 130
+interrupted from the keyboard.
+"""
+
+import argparse
+import warnings
+from collections.abc import Sequence
+
+from diffproj.board import BoardNotFoundWarning
+from diffproj.calibration import CalibrationError
+from diffproj.cli import calibrate, experiment
+from diffproj.cli.terminal import failure, note
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", BoardNotFoundWarning)
+            warnings.showwarning = lambda message, *_: note(str(message))
+            return options.run(options)
+    except (ValueError, OSError, CalibrationError) as error:
+        note(failure(error))
+        return 1
+    except KeyboardInterrupt:
+        note("interrupted")
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="diffproj",
+        description="Pixels of one calibrated camera to world coordinates on known planes.",
+        epilog="'diffproj COMMAND --help' tells more about a command.",
+    )
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    calibrate.add_command(commands)
+    experiment.add_command(commands)
+    return parser

@@ -1,0 +1,64 @@
+"""Options and inputs that commands share: the board, photographs and the corners in them."""
+
+import argparse
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rich.progress import Progress
+
+from diffproj.board import Chessboard, Views, detect
+from diffproj.board.images import SUFFIXES, Source, listed
+
+Commands = Any  # argparse's own type for what add_subparsers returns is private
+SMALLEST_BOARD = 3
+"""Inner corners each way that the corner detector needs."""
+
+
+def board_size(text: str) -> tuple[int, int]:
+    """Read inner corners such as `9x6`."""
+    columns, separator, rows = text.lower().partition("x")
+    if not (separator and columns.isdecimal() and rows.isdecimal()):
+        raise argparse.ArgumentTypeError(f"want inner corners as COLUMNSxROWS, such as 9x6, got {text!r}")
+    if min(int(columns), int(rows)) < SMALLEST_BOARD:
+        raise argparse.ArgumentTypeError(
+            f"want at least {SMALLEST_BOARD}x{SMALLEST_BOARD} inner corners (one less than the squares), got {text!r}"
+        )
+    return int(columns), int(rows)
+
+
+def square_side(text: str) -> float:
+    """Read the side of a square."""
+    try:
+        side = float(text)
+    except ValueError:
+        side = math.nan
+    if not (math.isfinite(side) and side > 0):
+        raise argparse.ArgumentTypeError(f"want the side of a square as a positive number, such as 25, got {text!r}")
+    return side
+
+
+def photographs(paths: Iterable[Path]) -> list[Source]:
+    """Files as they are, and the photographs in folders, in natural order; each once, however often it is named.
+
+    Raises:
+        ValueError: a folder holds no photograph.
+        FileNotFoundError: there is no such file.
+    """
+    found: dict[Path, Source] = {}
+    for path in paths:
+        if path.is_dir() and not any(file.suffix.lower() in SUFFIXES for file in path.iterdir()):
+            raise ValueError(
+                f"{path}: want a folder with photographs ({', '.join(sorted(SUFFIXES))}), found none in it"
+            )
+        for photograph in listed(str(path)):
+            # The same corners twice would make the standard deviations look smaller than they are.
+            found.setdefault(Path(str(photograph.source)).resolve(), photograph.source)
+    return list(found.values())
+
+
+def find_corners(sources: list[Any], board: Chessboard, bars: Progress, title: str = "Finding corners") -> Views:
+    """The board's corners in photographs, under a progress bar."""
+    task = bars.add_task(title, total=None)
+    return detect(sources, board, lambda done, total: bars.update(task, completed=done, total=total))
