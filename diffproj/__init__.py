@@ -27,13 +27,17 @@ from diffproj.files import load_calibration, load_camera, save_camera
 from diffproj.learnable import LearnableCamera, image_residuals, plane_residuals
 from diffproj.lens import BrownConrady, KannalaBrandt, Lens
 from diffproj.losses import Cauchy, Huber, Loss, SoftL1
+from diffproj.maps import AccuracyMap, image_map, plane_map
+from diffproj.measurement import Measurement, Quantity, measure
 from diffproj.paper_route import paper_route
 from diffproj.plane import Plane
 from diffproj.rotation import euler_from_rotation, rotation_from_euler
+from diffproj.validation import CrossValidation, bootstrap, cross_validate
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "AccuracyMap",
     "BoardNotFoundError",
     "BoardNotFoundWarning",
     "BrownConrady",
@@ -43,29 +47,37 @@ __all__ = [
     "Cauchy",
     "Chessboard",
     "Covariance",
+    "CrossValidation",
     "Experiment",
     "Huber",
     "KannalaBrandt",
     "LearnableCamera",
     "Lens",
     "Loss",
+    "Measurement",
     "Plane",
     "PlaneMap",
+    "Quantity",
     "Reason",
     "SoftL1",
     "Status",
     "Views",
     "back_project",
+    "bootstrap",
     "calibrate",
+    "cross_validate",
     "detect",
     "euler_from_rotation",
     "example_views",
     "explain",
+    "image_map",
     "image_residuals",
     "load_calibration",
     "load_camera",
     "locate",
+    "measure",
     "paper_route",
+    "plane_map",
     "plane_residuals",
     "refine",
     "rotation_from_euler",

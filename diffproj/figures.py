@@ -1,12 +1,14 @@
-"""Pictures, drawn with matplotlib without a screen: the paper's Fig. 7."""
+"""Pictures, drawn with matplotlib without a screen: the paper's Fig. 7, and maps of accuracy over the image."""
 
 import io
 
 import torch
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from diffproj.experiment import Experiment
+from diffproj.maps import AccuracyMap
 
 EXACT, APPROXIMATED, ERROR = "#8a8f98", "#0b6bcb", "#d6336c"
 
@@ -54,6 +56,41 @@ def fig7(experiment: Experiment, magnification: float = 50.0) -> Figure:
     ]
     figure.suptitle("Corners of the test views on the board (world units)", fontsize=12)
     figure.legend(handles=marks, loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+def accuracy(found: AccuracyMap, unit: str = "world units") -> Figure:
+    """Ground resolution and predicted deviation over the image; the line surrounds what the calibration's corners did.
+
+    Args:
+        found: the map, from `image_map`.
+        unit: of the world, for the labels.
+    """
+    figure = Figure(figsize=(9.6, 3.9), layout="constrained")
+    u, v = (part.numpy() for part in found.pixels.cpu().unbind(-1))
+    panels = (
+        (found.resolution, f"ground resolution, {unit} a pixel"),
+        (found.deviation, f"standard deviation of a point, {unit}"),
+    )
+    for position, (values, title) in enumerate(panels):
+        axes = figure.add_subplot(1, 2, position + 1)
+        shown = values.cpu().numpy()
+        known = shown[(shown > 0) & (shown < float("inf"))]
+        scale = LogNorm(known.min(), known.max()) if known.size else None
+        axes.set_facecolor(EXACT)
+        image = axes.pcolormesh(u, v, shown, norm=scale, cmap="viridis", shading="gouraud")
+        covered = found.covered.cpu().double().numpy()
+        if 0 < float(covered.mean()) < 1:
+            axes.contour(u, v, covered, levels=[0.5], colors="white", linewidths=1.2)
+        axes.set_title(title, fontsize=10)
+        axes.set_aspect("equal")
+        axes.set_xlim(float(u.min()), float(u.max()))
+        axes.set_ylim(float(v.max()), float(v.min()))
+        axes.tick_params(labelsize=8)
+        bar = figure.colorbar(image, ax=axes, shrink=0.85)
+        bar.ax.yaxis.set_major_formatter("{x:g}")
+        bar.ax.yaxis.set_minor_formatter("{x:g}" if known.size and known.max() < 10 * known.min() else "")
+        bar.ax.tick_params(labelsize=8, which="both")
     return figure
 
 

@@ -126,6 +126,7 @@ def load_calibration(path: PathLike) -> Calibration:
             bow,
             found["objective"],
             tuple(found["causes"]),
+            None if found["pixel_sigma"] is None else _tensor(found["pixel_sigma"], torch.float64),
             None if covariance is None else lambda: covariance,
         )
     except (KeyError, TypeError, ValueError) as error:
@@ -181,6 +182,7 @@ def _json_document(item: Camera | Calibration) -> dict[str, Any]:
             "used": item.used.tolist(),
             "rejected": item.rejected.tolist(),
             "causes": item.causes,
+            "pixel_sigma": None if item.pixel_sigma is None else item.pixel_sigma.tolist(),
             "covariance": _covariance_fields(item),
         }
     return document
@@ -188,7 +190,7 @@ def _json_document(item: Camera | Calibration) -> dict[str, Any]:
 
 def _covariance_fields(item: Calibration) -> dict[str, Any] | None:
     """The blocks of the covariance; what is infinite is 0 here and known by the masks, for JSON has no infinity."""
-    if item._covariance is None:
+    if not item.has_covariance:
         return None
     known = item.covariance
     fields = {key: getattr(known, f"_{key}").tolist() for key in ("follow", "mixed", "alone")}

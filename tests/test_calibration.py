@@ -501,6 +501,53 @@ def test_one_tilted_view_with_a_fixed_principal_point() -> None:
     assert deviation < 10
 
 
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_deviations_are_opencvs(side: str) -> None:
+    views = in_float32(dp.example_views(side))
+    corners = [pixels.numpy().astype(np.float32) for pixels in views.pixels]
+    points = [BOARD.points.numpy().astype(np.float32)] * len(views)
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-16)
+    found = cv2.calibrateCameraExtended(points, corners, views.size, None, None, criteria=stop)
+    calibration = dp.calibrate(views, BOARD)
+    spread = torch.stack(list(calibration.covariance.deviations.values()))
+    np.testing.assert_allclose(spread.numpy(), found[5].ravel()[:9], rtol=1e-4)
+    # Of the poses the translations are comparable: OpenCV differentiates by the rotation vector.
+    translations = torch.stack([calibration.covariance.view(i).diagonal()[-3:].sqrt() for i in range(len(views))])
+    np.testing.assert_allclose(translations.numpy(), found[6].reshape(-1, 6)[:, 3:], rtol=1e-4)
+
+
+def test_the_full_covariance_is_the_dense_inverse() -> None:
+    _, views = simulate(5)
+    found = dp.calibrate(views, BOARD, "brown4", fixed=("p1",), tied_focal=True)
+    full = found.covariance.full()
+    assert full.shape == (8 + 30, 8 + 30)
+    torch.testing.assert_close(full, full.mT, rtol=1e-9, atol=1e-16)
+    scale = full.diagonal().clamp(min=1e-30).rsqrt()
+    assert torch.linalg.eigvalsh(full * scale * scale[:, None])[0] > -1e-9
+    from diffproj.calibration.reprojection import Reprojection
+
+    coefficients = found.camera.distortion.coefficients
+    K = found.camera.K
+    shared = torch.cat([K.diagonal()[:2], K[:2, 2], coefficients])[None]
+    panel = Reprojection(BOARD.points, views.pixels[None], views.visible[None], "brown4").linearise(
+        shared, (found.cameras.R[None], found.cameras.t[None])
+    )[0]
+    J = torch.zeros(5, 2, 54, 8 + 30, dtype=D)
+    for v in range(5):
+        J[v, ..., :8] = panel[v, :8].permute(1, 2, 0)
+        J[v, ..., 8 + 6 * v : 14 + 6 * v] = panel[v, 8:14].permute(1, 2, 0)
+    free = torch.eye(38, dtype=D)[:, [0, 2, 3, 4, 5, 7, *range(8, 38)]]
+    free[1, 0] = K[1, 1] / K[0, 0]
+    J = J.reshape(-1, 38) @ free
+    sigma2 = found.residuals.square().sum() / (J.shape[0] - J.shape[1])
+    want = free @ torch.linalg.inv(J.mT @ J) @ free.mT * sigma2
+    torch.testing.assert_close(full, want, rtol=1e-4, atol=1e-9 * float(want.abs().amax()))
+    joint = found.covariance.view(3)
+    index = [*range(8), *range(8 + 18, 8 + 24)]
+    torch.testing.assert_close(joint, want[index][:, index], rtol=1e-4, atol=1e-9 * float(want.abs().amax()))
+    assert float(found.pixel_sigma) == pytest.approx(float(sigma2) ** 0.5, rel=1e-9)
+
+
 # --------------------------------------------------------------------------------------------------------- the bow
 
 

@@ -177,7 +177,7 @@ def refine(
 def locate(
     views: Views,
     board: PlanarTarget,
-    camera: Camera | PinholeCamera,
+    camera: Camera | PinholeCamera | Calibration,
     *,
     weights: Tensor | None = None,
     loss: Loss | None = None,
@@ -192,7 +192,8 @@ def locate(
     Args:
         views: corners `(*B, V, N, 2)`.
         board: anything with `.points (N, 3)` on z = 0.
-        camera: batch shape broadcasting to `*B`; its own pose does not matter.
+        camera: batch shape broadcasting to `*B`; its own pose does not matter. A calibration brings its uncertainty
+            along.
         weights: as in `calibrate`.
         loss: as in `calibrate`.
         max_iterations: as in `calibrate`.
@@ -200,8 +201,8 @@ def locate(
         throw: as in `calibrate`.
 
     Returns:
-        A calibration with the given intrinsics and the poses found, in float64. Its covariance is that of the poses
-        under the noise of the corners, for intrinsics without error.
+        A calibration with the given intrinsics and the poses found, in float64. Its covariance holds the noise of the
+        corners; and, where a calibration with a covariance was given, that of the intrinsics, which the poses follow.
 
     Raises:
         TypeError: views are no `dp.Views`, or the camera has a lens of another library.
@@ -216,6 +217,10 @@ def locate(
         0.18
     """
     data = Data(views, board, weights)
+    known = None
+    if isinstance(camera, Calibration):
+        known = camera.covariance if camera.has_covariance else None
+        camera = camera.camera
     camera = as_camera(camera)
     if len(camera.batch_shape) > len(data.batch):
         raise ValueError(
@@ -270,7 +275,7 @@ def locate(
         ),
     )
     found = Fit(task, joined, torch.zeros_like(data.used))
-    return _result("locate", data, found, camera.size or views.size, throw)
+    return _result("locate", data, found, camera.size or views.size, throw, known)
 
 
 @dataclass(frozen=True)
@@ -323,7 +328,14 @@ def _fitted(
     return fit(task, shared, local, reject=options.reject, **steps), prior
 
 
-def _result(who: str, data: Data, found: Fit, size: tuple[int, int] | None, throw: bool) -> Calibration:
+def _result(
+    who: str,
+    data: Data,
+    found: Fit,
+    size: tuple[int, int] | None,
+    throw: bool,
+    known: Covariance | None = None,
+) -> Calibration:
     """The calibration with the batch shape of the views."""
     task, solution, batch = found.task, found.solution, data.batch
     cameras = assembled(task.lens, solution.shared, solution.local)  # type: ignore[arg-type]
@@ -346,7 +358,8 @@ def _result(who: str, data: Data, found: Fit, size: tuple[int, int] | None, thro
     )
 
     def covariance() -> Covariance:
-        return reshaped(found.covariance(), batch)
+        own = reshaped(found.covariance(), batch)
+        return own if known is None else own.following(known)
 
     calibration = Calibration(
         camera,
@@ -360,6 +373,7 @@ def _result(who: str, data: Data, found: Fit, size: tuple[int, int] | None, thro
         shaped(solution.shared[:, -2:]) if task.bow else None,
         task.objective,
         causes,
+        shaped(found.pixel_sigma()),
         covariance,
     )
     if throw and bool((status != Status.CONVERGED).any()):

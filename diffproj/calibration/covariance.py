@@ -20,7 +20,7 @@ A parameter that the corners do not determine has an infinite variance, and cova
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -64,14 +64,14 @@ class Covariance:
         """The covariance of two poses, or of one."""
         F, G = self._follow[..., view, :, :], self._follow[..., other, :, :]
         Q, P = self._mixed[..., view, :, :], self._mixed[..., other, :, :]
-        blocks = F @ _finite(self.shared) @ G.mT - Q @ G.mT - F @ P.mT
+        blocks = F @ finite(self.shared) @ G.mT - Q @ G.mT - F @ P.mT
         if view % self._alone.shape[-3] == other % self._alone.shape[-3]:
             blocks = blocks + self._alone[..., view, :, :]
         return blocks
 
     def cross(self, view: int) -> Float[Tensor, "*batch 6 s"]:
         """The covariance of a pose (rows) with the shared parameters (columns)."""
-        return self._mixed[..., view, :, :] - self._follow[..., view, :, :] @ _finite(self.shared)
+        return self._mixed[..., view, :, :] - self._follow[..., view, :, :] @ finite(self.shared)
 
     def view(self, view: int) -> Float[Tensor, "*batch sp sp"]:
         """The joint covariance of the shared parameters and the pose of one view, `(*B, s + 6, s + 6)`."""
@@ -81,6 +81,17 @@ class Covariance:
         pose, cross = torch.where(unknown, infinite, pose), torch.where(unknown, 0.0, cross)
         return torch.cat([torch.cat([self.shared, cross.mT], dim=-1), torch.cat([cross, pose], dim=-1)], dim=-2)
 
+    def following(self, known: "Covariance") -> "Covariance":
+        """The covariance of these poses and of shared parameters that another calibration, `known`, found.
+
+        The noise of both is independent; a bow of the other's board is left behind.
+        """
+        s = self.shared.shape[-1]
+        shared, undetermined = known.shared[..., :s, :s], known.undetermined[..., :s]
+        batch = self.shared.shape[:-2]
+        shared, undetermined = shared.expand(*batch, s, s), undetermined.expand(*batch, s)
+        return replace(self, shared=shared, undetermined=undetermined)
+
     def full(self) -> Float[Tensor, "*batch all all"]:
         """The whole covariance `(*B, s + 6 V, s + 6 V)`: shared parameters, then the poses in order.
 
@@ -89,17 +100,18 @@ class Covariance:
         V = self._alone.shape[-3]
         F, Q = self._follow.flatten(-3, -2), self._mixed.flatten(-3, -2)
         known = self.undetermined_views.repeat_interleave(6, dim=-1).logical_not().to(F.dtype)
-        poses = F @ _finite(self.shared) @ F.mT - Q @ F.mT - F @ Q.mT
+        poses = F @ finite(self.shared) @ F.mT - Q @ F.mT - F @ Q.mT
         poses = poses + torch.stack(
             [torch.nn.functional.pad(self._alone[..., v, :, :], (6 * v, 6 * (V - 1 - v))) for v in range(V)], dim=-3
         ).flatten(-3, -2)
-        cross = (Q - F @ _finite(self.shared)) * known.unsqueeze(-1)
+        cross = (Q - F @ finite(self.shared)) * known.unsqueeze(-1)
         poses = poses * known.unsqueeze(-1) * known.unsqueeze(-2)
         poses = poses + torch.diag_embed(torch.where(known > 0, 0.0, torch.inf))
         return torch.cat([torch.cat([self.shared, cross.mT], dim=-1), torch.cat([cross, poses], dim=-1)], dim=-2)
 
 
-def _finite(covariance: Tensor) -> Tensor:
+def finite(covariance: Tensor) -> Tensor:
+    """The same with 0 where it is infinite."""
     return torch.where(covariance.isinf(), 0.0, covariance)
 
 
@@ -156,9 +168,9 @@ def covariance(
     shared = inverse_S @ middle @ inverse_S
     follow = F.mT
     if basis is not None:
-        # In all coordinates the poses follow the free directions: any left inverse of the basis does.
-        left = torch.linalg.pinv(basis)
-        shared, mixed, follow = basis @ shared @ basis.mT, mixed @ basis.mT.unsqueeze(1), follow @ left.unsqueeze(1)
+        # How the poses follow all shared parameters, those held included, for whoever knows an error of theirs.
+        follow = inverse_W @ equations.E.mT
+        shared, mixed = basis @ shared @ basis.mT, mixed @ basis.mT.unsqueeze(1)
         unknown = (basis.abs() @ unknown.to(basis).unsqueeze(-1)).squeeze(-1) > 0
     shared = (shared + shared.mT) / 2
     shared = torch.where(unknown.unsqueeze(-1) | unknown.unsqueeze(-2), 0.0, shared)

@@ -100,6 +100,16 @@ class Fit:
         spare = self.degrees_of_freedom()
         return torch.where(spare > 0, 2 * cost / spare, torch.nan)
 
+    def pixel_sigma(self) -> Tensor:
+        """The noise of a corner's coordinate in pixels, as the residuals on the image tell it `(P,)`."""
+        task, solution = self.task, self.solution
+        image = replace(task, objective="image").problem.linearise(solution.shared, solution.local)[:, :, -1]
+        if task.loss is not None:
+            components = torch.where(task.used.unsqueeze(2), image.abs(), torch.nan)
+            return 1.4826 * components.flatten(1).nanmedian(-1).values
+        spare = self.degrees_of_freedom()
+        return torch.where(spare > 0, image.square().sum((1, 2, 3)) / spare, torch.nan).sqrt()
+
     def degrees_of_freedom(self) -> Tensor:
         """Residuals less parameters `(P,)`."""
         used = self.task.used
@@ -132,9 +142,8 @@ class Fit:
         flat = rows.flatten(-2)
         both = (weight * slope).unsqueeze(2)
         H = (flat * both.repeat(1, 1, 1, 2)) @ flat.mT + (score * (2 * weight * bend).unsqueeze(2)) @ score.mT
-        n = 2 * task.used.sum((-2, -1))
-        correction = (n / self.degrees_of_freedom().clamp(min=1))[:, None, None, None]
-        M = (score * both.square()) @ score.mT * correction
+        kept = self._kept_by_fitting(weight, slope, bend, squared)[:, None, None, None]
+        M = (score * both.square()) @ score.mT / kept
         s = len(task.names)
         U = H[..., :s, :s].sum(1)
         precision = None if task.prior is None else task.prior.precision
@@ -151,6 +160,30 @@ class Fit:
             precision=precision,
             scores=Scores(M[..., :s, :s], M[..., :s, s:], M[..., s:, s:]),
         )
+
+    def _kept_by_fitting(self, weight: Tensor, slope: Tensor, bend: Tensor, squared: Tensor) -> Tensor:
+        """The part of the scores' size that is left after fitting `(P,)`.
+
+        A fit takes `h psi(e) / mean A` off a residual of leverage h, with psi the score and A its derivative; to first
+        order in h, the number of parameters over that of residuals, what is left of `psi^2` on the average is
+
+            1 - h (2 mean(psi A psi) / (mean(psi^2) mean A) - mean(A^2) / (mean A)^2)
+
+        which is 1 - h for least squares, and more where outliers have a bounded score that no fit reduces.
+        """
+        used = self.task.used.to(squared)
+        n = used.sum((-2, -1))
+        h = 1 - self.degrees_of_freedom() / (2 * n)
+
+        def mean(values: Tensor) -> Tensor:
+            return (values * used).sum((-2, -1)) / n
+
+        psi = (weight * slope).square() * squared
+        A = weight * (slope + bend * squared)
+        A_squared = weight.square() * (slope.square() + 2 * slope * bend * squared + 2 * (bend * squared).square())
+        psi_A_psi = weight * (slope + 2 * bend * squared) * psi
+        taken = 2 * mean(psi_A_psi) / (mean(psi) * mean(A)) - mean(A_squared) / mean(A).square()
+        return (1 - h * taken).clamp(min=0.1)
 
 
 def fit(

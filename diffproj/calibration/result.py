@@ -60,6 +60,8 @@ class Calibration:
             fitted.
         objective: what was minimised.
         causes: for each camera that did not converge, the cause in words; `*B` flattened.
+        pixel_sigma: the standard deviation of a corner's coordinate in pixels, as the residuals tell it `(*B,)`: their
+            root mean square over the degrees of freedom; under a robust loss, 1.4826 times their median.
     """
 
     camera: Camera
@@ -73,6 +75,7 @@ class Calibration:
     bow: Float[Tensor, "*batch 2"] | None = None
     objective: Objective = "image"
     causes: tuple[str, ...] = ()
+    pixel_sigma: Float[Tensor, "*batch"] | None = None
     _covariance: Callable[[], Covariance] | None = None
 
     @property
@@ -127,6 +130,11 @@ class Calibration:
             return causes[0]
         failed = [f"camera {i}: {c}" for i, (s, c) in enumerate(zip(codes, causes, strict=True)) if s]
         return "; ".join([f"{len(codes) - len(failed)} of {len(codes)} cameras converged", *failed])
+
+    @property
+    def has_covariance(self) -> bool:
+        """Whether the covariance is known: not where the calibration came from a file without it."""
+        return self._covariance is not None
 
     @cached_property
     def covariance(self) -> Covariance:

@@ -1,0 +1,92 @@
+"""Maps of resolution and deviation over the image and over the plane."""
+
+import pytest
+import torch
+
+import diffproj as dp
+from diffproj import figures
+
+D = torch.float64
+BOARD = dp.Chessboard()
+
+
+@pytest.fixture(scope="module")
+def calibration() -> dp.Calibration:
+    return dp.calibrate(dp.example_views("left"), BOARD)
+
+
+def test_the_unseen_corner_is_tens_of_times_less_certain(calibration: dp.Calibration) -> None:
+    accuracy = dp.image_map(calibration, step=16)
+    H, W = accuracy.valid.shape
+    middle, corner = accuracy.deviation[H // 2, W // 2], accuracy.deviation[0, 0]
+    assert accuracy.valid.all()
+    assert accuracy.covered[H // 2, W // 2]
+    assert not accuracy.covered[0, 0]
+    assert corner > 20 * middle
+    # The resolution alone does not say so: it is geometry.
+    assert accuracy.resolution[0, 0] < 3 * accuracy.resolution[H // 2, W // 2]
+    inside = accuracy.deviation[accuracy.covered]
+    assert inside.median() < 0.2
+
+
+def test_the_grid_reaches_the_edges(calibration: dp.Calibration) -> None:
+    accuracy = dp.image_map(calibration, step=50)
+    assert accuracy.pixels[0, 0].tolist() == [0, 0]
+    assert accuracy.pixels[-1, -1].tolist() == [639, 479]
+    assert accuracy.pixels.shape == (11, 14, 2)
+
+
+def test_resolution_is_a_finite_difference(calibration: dp.Calibration) -> None:
+    accuracy = dp.image_map(calibration, step=100, view=3)
+    camera, plane = calibration.cameras[3], dp.Plane.z(0.0)
+    angle = torch.linspace(0, torch.pi, 181, dtype=D)
+    around = 1e-4 * torch.stack([angle.cos(), angle.sin()], dim=-1)
+    for i, j in ((0, 0), (2, 3), (4, 6)):
+        ahead, behind = (dp.back_project(accuracy.pixels[i, j] + s * around, camera, plane)[0] for s in (1, -1))
+        worst = (ahead - behind).norm(dim=-1).amax() / 2e-4
+        torch.testing.assert_close(accuracy.resolution[i, j], worst, rtol=1e-3, atol=0)
+
+
+def test_the_plane_is_the_image_seen_from_the_other_side(calibration: dp.Calibration) -> None:
+    table = dp.Plane([0.05, -0.1, 1.0], 3.0)
+    accuracy = dp.plane_map(calibration, (-50, -50, 250, 175), table, view="left03.jpg", shape=(5, 7))
+    assert accuracy.points.shape == (5, 7, 3)
+    assert accuracy.points[0, 0, :2].tolist() == pytest.approx([-50, -50])
+    assert accuracy.points[-1, -1, :2].tolist() == pytest.approx([250, 175])
+    off = (accuracy.points * torch.tensor([0.05, -0.1, 1.0], dtype=D)).sum(-1) - 3.0
+    assert off[accuracy.valid].abs().max() < 1e-9
+    view = calibration.views.names.index("left03.jpg")
+    measured = dp.measure(accuracy.pixels[2, 3][None], calibration, table, view=view)
+    worst = torch.linalg.eigvalsh(measured.covariance[0])[-1].sqrt()
+    torch.testing.assert_close(accuracy.deviation[2, 3], worst)
+
+
+def test_horizon_and_image_end_the_map(calibration: dp.Calibration) -> None:
+    upright = dp.Plane([0.0, 1.0, 0.02], 300.0)
+    accuracy = dp.image_map(calibration, upright, step=40)
+    assert accuracy.valid.any()
+    assert not accuracy.valid.all()
+    assert torch.equal(accuracy.deviation.isnan(), ~accuracy.valid)
+    far = dp.plane_map(calibration, (-5000, -5000, 5000, 5000), shape=(9, 9))
+    assert not far.valid[0, 0]
+    assert torch.equal(far.resolution.isnan(), ~far.valid)
+
+
+def test_picture(calibration: dp.Calibration) -> None:
+    image = figures.png(figures.accuracy(dp.image_map(calibration, step=32)))
+    assert image[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.mark.plain
+def test_bad_input_is_refused_by_name(calibration: dp.Calibration) -> None:
+    with pytest.raises(ValueError, match="step: want a positive distance"):
+        dp.image_map(calibration, step=0)
+    with pytest.raises(ValueError, match="extent: want"):
+        dp.plane_map(calibration, (0, 0, 0, 1))
+    with pytest.raises(ValueError, match="plane: want one that is a height"):
+        dp.plane_map(calibration, (0, 0, 1, 1), dp.Plane([1.0, 0, 0], 0.0))
+    both = dp.calibrate(dp.Views(torch.stack([calibration.views.pixels] * 2), size=(640, 480)), BOARD)
+    with pytest.raises(ValueError, match="calibration: want one camera of known size"):
+        dp.image_map(both)
+    with pytest.raises(ValueError, match="calibration: want one camera, got batch shape"):
+        dp.plane_map(both, (0, 0, 1, 1))

@@ -1,0 +1,248 @@
+"""Measured points and lengths with error bars: Jacobians, limits, and what is refused. Sampling is in `test_sampling`."""
+
+import pytest
+import torch
+
+import diffproj as dp
+from diffproj import synthetic
+
+D = torch.float64
+BOARD = dp.Chessboard()
+Z = dp.Plane.z(0.0)
+LENSES = {
+    "none": None,
+    "brown5": dp.BrownConrady(torch.tensor([-0.28, 0.07, 0.0013, 0.0001, 0.002], dtype=D)),
+    "brown14": dp.BrownConrady(
+        torch.tensor([-0.2, 0.03, 0.001, 0.0, 0.01, 0.02, -0.01, 0, 0.002, 0, 0.001, 0, 0.02, -0.03], dtype=D)
+    ),
+    "fisheye": dp.KannalaBrandt(torch.tensor([0.02, -0.01, 0.004, -0.001], dtype=D)),
+}
+
+
+@pytest.fixture(scope="module")
+def calibration() -> dp.Calibration:
+    return dp.calibrate(dp.example_views("left"), BOARD)
+
+
+def simulated(lens: str, views: int = 8) -> dp.Calibration:
+    K = torch.tensor([[533.0, 0, 342], [0, 534, 235], [0, 0, 1]], dtype=D)
+    truth = synthetic.random_cameras(dp.Camera(K, distortion=LENSES[lens], size=(640, 480)), BOARD, views)
+    seen = synthetic.corner_views(truth, BOARD)
+    return dp.refine(truth, seen, BOARD, throw=False)
+
+
+def redone(
+    calibration: dp.Calibration, view: int, step: torch.Tensor, pixels: torch.Tensor, plane: dp.Plane
+) -> torch.Tensor:
+    """The points with the camera's parameters and the view's pose moved by a step, by the public back-projection."""
+    from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
+    camera = calibration.cameras[view]
+    s = len(step) - 6
+    K = camera.K.clone()
+    K = K + torch.stack(
+        [
+            torch.stack([step[0], 0 * step[0], step[2]]),
+            torch.stack([0 * step[0], step[1], step[3]]),
+            torch.zeros(3, dtype=D),
+        ]
+    )
+    lens = camera.distortion
+    if lens is not None:
+        lens = type(lens)(lens.coefficients + step[4:s])  # type: ignore[attr-defined, call-arg]
+    R = axis_angle_to_rotation_matrix(step[None, s : s + 3])[0] @ camera.R
+    points, valid = dp.back_project(pixels, dp.Camera._unchecked(K, R, camera.t + step[s + 3 :], lens, None), plane)
+    assert valid.all()
+    return points
+
+
+@pytest.mark.parametrize("lens", list(LENSES))
+@pytest.mark.parametrize("slanted", [False, True])
+def test_jacobians_are_autograds(lens: str, slanted: bool) -> None:
+    found = simulated(lens)
+    plane = dp.Plane(torch.tensor([0.1, -0.2, 2.0], dtype=D), torch.tensor(7.0, dtype=D)) if slanted else Z
+    pixels = found.views.pixels[3, ::9] + 2.5
+    measured = dp.measure(pixels, found, plane, view=3, pixel_sigma=1.0, plane_covariance=torch.eye(4, dtype=D))
+    size = found.covariance.view(3).shape[-1]
+    by_theta = torch.func.jacfwd(lambda step: redone(found, 3, step, pixels, plane))(torch.zeros(size, dtype=D))
+    scale = by_theta.abs().amax((0, 1))
+    assert ((measured._common[..., :size] - by_theta).abs().amax((0, 1)) <= 1e-8 * scale).all()
+    by_pixel = torch.func.vmap(torch.func.jacfwd(lambda p: dp.back_project(p[None], found.cameras[3], plane)[0][0]))(
+        pixels
+    )
+    torch.testing.assert_close(measured._own, by_pixel, rtol=1e-8, atol=1e-10)
+
+    def by_coefficients(abcd: torch.Tensor) -> torch.Tensor:
+        return dp.back_project(pixels, found.cameras[3], dp.Plane(abcd[:3], abcd[3]))[0]
+
+    abcd = torch.cat([plane.to(D).normal, plane.to(D).offset[None]])
+    by_plane = torch.func.jacfwd(by_coefficients)(abcd)
+    torch.testing.assert_close(measured._common[..., size:], by_plane, rtol=1e-7, atol=1e-7)
+
+
+def test_joint_covariance_is_symmetric_and_positive(calibration: dp.Calibration) -> None:
+    measured = dp.measure(calibration.views.pixels[0], calibration, Z, pixel_sigma=0.2)
+    joint = measured.joint()
+    assert joint.shape == (162, 162)
+    torch.testing.assert_close(joint, joint.mT, rtol=1e-10, atol=1e-14)
+    assert torch.linalg.eigvalsh(joint)[0] > -1e-10 * joint.diagonal().amax()
+    blocks = torch.stack([joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(54)])
+    torch.testing.assert_close(blocks, measured.covariance, rtol=1e-12, atol=1e-15)
+    assert (measured.deviations[:, 2] < 1e-9).all()  # on the plane
+
+
+def test_quantities_carry_the_joint_covariance(calibration: dp.Calibration) -> None:
+    measured = dp.measure(calibration.views.pixels[0, [0, 8, 53, 45]], calibration, Z)
+    joint = measured.joint()
+
+    def want(function: object, which: list[int]) -> tuple[torch.Tensor, torch.Tensor]:
+        points = measured.points.clone().requires_grad_()
+        value = function(points[which])  # type: ignore[operator]
+        g = torch.autograd.grad(value, points)[0].flatten()
+        return value.detach(), (g @ joint @ g).sqrt()
+
+    def check(got: dp.Quantity, function: object, which: list[int], row: int = 0) -> None:
+        value, deviation = want(function, which)
+        torch.testing.assert_close(got.value[row], value, rtol=1e-10, atol=1e-12)
+        torch.testing.assert_close(got.deviation[row], deviation, rtol=1e-8, atol=1e-14)
+
+    check(measured.lengths(), lambda p: (p[1] - p[0]).norm(), [1, 2], row=1)
+    check(measured.lengths([[3, 1]]), lambda p: (p[1] - p[0]).norm(), [3, 1])
+    square = measured.area()
+    check(
+        square, lambda p: ((p[2] - p[0])[0] * (p[3] - p[1])[1] - (p[2] - p[0])[1] * (p[3] - p[1])[0]) / 2, [0, 1, 2, 3]
+    )
+    assert square.value[0] == pytest.approx(200 * 125, rel=2e-3)
+    right = measured.angles()
+    assert right.value.shape == (2,)
+    assert (right.value - torch.pi / 2).abs().max() < 0.01
+    check(
+        right,
+        lambda p: ((p[0] - p[1]) @ (p[2] - p[1]) / (p[0] - p[1]).norm() / (p[2] - p[1]).norm()).acos(),
+        [0, 1, 2],
+    )
+    low, high = measured.lengths().interval(0.6827)
+    torch.testing.assert_close((high - low) / 2, measured.lengths().deviation, rtol=1e-3, atol=0)
+
+
+def test_correlations_make_short_lengths_sure(calibration: dp.Calibration) -> None:
+    start = calibration.views.pixels[0, 20]
+    offsets = torch.tensor([0.0, 1e-3, 1e-2, 0.1, 1.0, 10.0], dtype=D)
+    pixels = start + torch.stack([offsets, 0 * offsets], dim=-1)
+    exact = dp.measure(pixels, calibration, Z, pixel_sigma=0.0)
+    lengths = exact.lengths([[0, i] for i in range(6)])
+    ratio = lengths.deviation[1:] / lengths.value[1:]
+    assert lengths.deviation[0] == 0
+    assert (lengths.deviation[1:] < 0.02 * lengths.value[1:]).all()
+    torch.testing.assert_close(ratio[0], ratio[1], rtol=0.01, atol=0)  # in proportion to the length
+    noisy = dp.measure(pixels, calibration, Z).lengths([[0, 1], [0, 5]])
+    assert noisy.significant.tolist() == [False, True]
+    assert "less than three deviations from 0" in dp.measure(pixels[:2], calibration, Z).summary()
+
+
+def test_a_view_by_number_or_name_and_a_camera_alone(calibration: dp.Calibration) -> None:
+    pixels = calibration.views.pixels[4, [0, 53]]
+    by_number = dp.measure(pixels, calibration, Z, view=4)
+    by_name = dp.measure(pixels, calibration, Z, view="left05.jpg")
+    assert torch.equal(by_number.joint(), by_name.joint())
+    alone = dp.measure(pixels, calibration.cameras[4], Z, pixel_sigma=float(calibration.pixel_sigma))
+    assert torch.equal(alone.points, by_number.points)
+    assert not alone.complete
+    assert (alone.deviations[:, :2] < by_number.deviations[:, :2]).all()
+    assert "noise of the pixels alone" in alone.summary()
+    assert "noise of the pixels alone" not in by_number.summary()
+
+
+def test_a_saved_calibration_measures_just_as_well(calibration: dp.Calibration, tmp_path) -> None:
+    dp.save_camera(tmp_path / "camera.json", calibration)
+    again = dp.load_calibration(tmp_path / "camera.json")
+    pixels = calibration.views.pixels[2, [0, 8, 53]]
+    first, second = (dp.measure(pixels, c, Z, view=2) for c in (calibration, again))
+    torch.testing.assert_close(second.joint(), first.joint(), rtol=1e-12, atol=1e-15)
+    assert second.complete
+
+
+def test_a_located_photograph_knows_the_intrinsics_uncertainty() -> None:
+    views = dp.example_views("left")
+    calibration = dp.calibrate(views[:8], BOARD)
+    known, held = dp.locate(views[8:], BOARD, calibration), dp.locate(views[8:], BOARD, calibration.camera)
+    assert torch.equal(known.cameras.t, held.cameras.t)
+    torch.testing.assert_close(known.covariance.shared, calibration.covariance.shared)
+    far = torch.tensor([[20.0, 20.0], [620.0, 460.0]], dtype=D)
+    sure, unsure = (dp.measure(far, c, Z, view=1, pixel_sigma=0.2).lengths().deviation for c in (held, known))
+    assert unsure > 1.1 * sure
+
+
+def test_points_that_are_not_there(calibration: dp.Calibration) -> None:
+    away = dp.Plane([0.0, 1.0, 0.05], -400.0)
+    pixels = torch.tensor([[320.0, 10.0], [320.0, 470.0], [1e6, 0.0], [torch.nan, 0.0]], dtype=D)
+    measured = dp.measure(pixels, calibration, away)
+    lengths = measured.lengths()
+    assert measured.points.isfinite().all()
+    assert measured.covariance.isfinite().all()
+    assert torch.equal(lengths.value.isnan(), ~(measured.valid[1:] & measured.valid[:-1]))
+    assert "not on the plane" in measured.summary()
+
+
+def test_what_is_not_determined_is_infinite() -> None:
+    K = torch.tensor([[533.0, 0, 319.5], [0, 534, 239.5], [0, 0, 1]], dtype=D)
+    centred = dp.Camera(K, size=(640, 480)).at(torch.eye(3, dtype=D), torch.tensor([[-100.0, -60, 500]], dtype=D))
+    views = synthetic.corner_views(centred, BOARD, noise_px=0.0)  # face on: focal length and distance are one
+    found = dp.calibrate(views, BOARD, "none", fixed=("principal_point",), tied_focal=True, throw=False)
+    if not found.covariance.undetermined.any():
+        pytest.skip("rounding determined it")
+    measured = dp.measure(views.pixels[0, [0, 5]], found, Z, pixel_sigma=0.1)
+    assert not measured.joint().isnan().any()
+
+
+def test_batched_and_differentiable() -> None:
+    K = torch.tensor([[533.0, 0, 342], [0, 534, 235], [0, 0, 1]], dtype=D)
+    camera = dp.Camera(K, distortion=LENSES["brown5"], size=(640, 480))
+    posed = synthetic.random_cameras(camera, BOARD, 16)
+    truth = camera.at(posed.R.reshape(2, 8, 3, 3), posed.t.reshape(2, 8, 3))
+    views = synthetic.corner_views(truth, BOARD)
+    both = dp.calibrate(views, BOARD)
+    measured = dp.measure(views.pixels[:, 1], both, Z, view=1)
+    assert measured.points.shape == (2, 54, 3)
+    assert measured.joint().shape == (2, 162, 162)
+    for i in range(2):
+        alone = dp.calibrate(dp.Views(views.pixels[i], size=views.size), BOARD)
+        single = dp.measure(views.pixels[i, 1], alone, Z, view=1)
+        torch.testing.assert_close(measured.lengths().deviation[i], single.lengths().deviation, rtol=1e-5, atol=0)
+
+    def deviation(pixels: torch.Tensor) -> torch.Tensor:
+        found = dp.measure(pixels, both, Z, view=1)
+        return found.lengths().deviation.sum() + found.points.sum()
+
+    assert torch.autograd.gradcheck(deviation, (views.pixels[:, 1, ::27].clone().requires_grad_(),), fast_mode=True)
+
+
+def test_held_out_boards_agree_with_their_error_bars() -> None:
+    """Distances between all corners of held-out views: errors over predicted deviations spread by about one."""
+    pairs = torch.combinations(torch.arange(54), 2)
+    for side in ("left", "right"):
+        views = dp.example_views(side)
+        calibration = dp.calibrate(views[:8], BOARD)
+        located = dp.locate(views[8:], BOARD, calibration)
+        points = BOARD.points
+        truth = (points[pairs[:, 0]] - points[pairs[:, 1]]).norm(dim=-1)
+        errors = []
+        for view in range(5):
+            lengths = dp.measure(located.views.pixels[view].to(D), located, Z, view=view).lengths(pairs)
+            errors.append((lengths.value - truth) / lengths.deviation)
+        assert 0.8 < torch.stack(errors).std() < 1.25
+
+
+@pytest.mark.plain
+def test_bad_input_is_refused_by_name(calibration: dp.Calibration) -> None:
+    pixels = calibration.views.pixels[0, :2]
+    with pytest.raises(ValueError, match="view: want one of left01.jpg, .* got 'left99.jpg'"):
+        dp.measure(pixels, calibration, Z, view="left99.jpg")
+    with pytest.raises(ValueError, match="view: want a number below 13, got 13"):
+        dp.measure(pixels, calibration, Z, view=13)
+    with pytest.raises(ValueError, match="pixel_sigma: want the noise of the pixels"):
+        dp.measure(pixels, calibration.cameras[0], Z)
+    with pytest.raises(ValueError, match="level: want a probability between 0 and 1"):
+        dp.measure(pixels, calibration, Z).lengths().interval(1.0)
+    with pytest.raises(ValueError, match="points: want at least 3, got 2"):
+        dp.measure(pixels, calibration, Z).angles()

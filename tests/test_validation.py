@@ -1,0 +1,72 @@
+"""Held-out errors and bootstrap deviations."""
+
+import pytest
+import torch
+
+import diffproj as dp
+from diffproj import synthetic
+
+D = torch.float64
+BOARD = dp.Chessboard()
+
+
+def test_folds_are_what_a_loop_gives() -> None:
+    views = dp.example_views("left")
+    outcome = dp.cross_validate(views, BOARD, folds=4)
+    assert outcome.fits.camera.batch_shape == (4,)
+    left_out = [i for i in range(13) if i % 4 == 1]
+    fitted = [i for i in range(13) if i % 4 != 1]
+    alone = dp.calibrate(views[fitted], BOARD)
+    torch.testing.assert_close(outcome.in_sample_px[1], alone.rms, rtol=1e-8, atol=0)
+    second = torch.arange(54) % 2 == 1
+    total, world, count = 0.0, 0.0, 0
+    for judges in (second, ~second):
+        located = dp.locate(views[left_out].hiding(judges), BOARD, alone.camera)
+        seen = views[left_out].pixels.to(D)[:, judges]
+        projected, _ = located.cameras.project(BOARD.points[judges])
+        landed, _ = dp.back_project(seen, located.cameras, dp.Plane.z(0.0))
+        total += float((projected - seen).square().sum())
+        world += float((landed - BOARD.points[judges]).square().sum())
+        count += seen.shape[0] * seen.shape[1]
+    assert float(outcome.held_out_px[1]) == pytest.approx((total / count) ** 0.5, rel=1e-7)
+    assert float(outcome.held_out_world[1]) == pytest.approx((world / count) ** 0.5, rel=1e-7)
+
+
+def test_held_out_errors_are_larger_and_in_their_place() -> None:
+    K = torch.tensor([[533.0, 0, 342], [0, 534, 235], [0, 0, 1]], dtype=D)
+    truth = synthetic.random_cameras(dp.Camera(K, size=(640, 480)), BOARD, 6)
+    views = synthetic.corner_views(truth, BOARD, noise_px=0.2)
+    outcome = dp.cross_validate(views, BOARD, "brown5", folds=3)
+    assert (outcome.held_out_px > outcome.in_sample_px).all()
+    assert (outcome.held_out_world > outcome.in_sample_world).all()
+    assert (outcome.held_out_px < 3 * 0.2 * 2**0.5).all()
+    lines = outcome.summary().splitlines()
+    assert len(lines) == 5
+    assert lines[-1].startswith("all")
+
+
+def test_bootstrap_agrees_with_the_covariance() -> None:
+    K = torch.tensor([[533.0, 0, 342], [0, 534, 235], [0, 0, 1]], dtype=D)
+    truth = synthetic.random_cameras(dp.Camera(K, size=(640, 480)), BOARD, 60)
+    views = synthetic.corner_views(truth, BOARD)
+    spread = dp.bootstrap(views, BOARD, "none", draws=100)
+    predicted = dp.calibrate(views, BOARD, "none").covariance.deviations
+    assert list(spread) == ["f_x", "f_y", "c_x", "c_y"]
+    for name, value in spread.items():  # 60 views and 100 draws know a deviation to 12 %
+        assert 0.6 < value / predicted[name] < 1.6
+
+
+@pytest.mark.plain
+def test_bad_input_is_refused_by_name() -> None:
+    views = dp.example_views("left")
+    batch = dp.Views(views.pixels[None], size=views.size)
+    with pytest.raises(ValueError, match="folds: want from 2 to the number of views, 13, got 14"):
+        dp.cross_validate(views, BOARD, folds=14)
+    with pytest.raises(ValueError, match="views: want those of one camera"):
+        dp.cross_validate(batch, BOARD)
+    with pytest.raises(ValueError, match="views: want those of one camera"):
+        dp.bootstrap(batch, BOARD)
+    with pytest.raises(ValueError, match="draws: want at least 2"):
+        dp.bootstrap(views, BOARD, draws=1)
+    with pytest.raises(ValueError, match="views: want draws that determine"):
+        dp.bootstrap(views[:1], BOARD, draws=4)
