@@ -60,8 +60,8 @@ class Quantity:
 
     @property
     def significant(self) -> Bool[Tensor, "*shape"]:
-        """Whether the value is at least three of its deviations from 0."""
-        return self.value.abs() >= SIGNIFICANT * self.deviation
+        """Whether the value is at least three of its deviations from 0; not where both are 0."""
+        return (self.value.abs() >= SIGNIFICANT * self.deviation) & (self.value != 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,8 @@ class Measurement:
     Attributes:
         points: `(*B, N, 3)` in world units.
         valid: `(*B, N)`, as `back_project` gives it.
-        complete: whether the calibration's uncertainty is in; if false, the pixels' noise alone.
+        complete: whether the uncertainty of the intrinsics is in; if not, that of the pixels alone, or of the pixels
+            and of a pose that was located with a bare camera.
     """
 
     points: Float[Tensor, "*batch n 3"]
@@ -148,7 +149,10 @@ class Measurement:
         return self.quantity(_angle, self._successive(3) if triples is None else triples)
 
     def area(self, corners: Sequence[int] | None = None) -> Quantity:
-        """The area of the polygon with these corners in order (all points if left out), in squared world units."""
+        """The area of the polygon with these corners in order (all points if left out), in squared world units.
+
+        Parts of an outline that crosses itself cancel.
+        """
         every = list(range(self.points.shape[-2])) if corners is None else list(corners)
         return self.quantity(_area, [every])
 
@@ -173,7 +177,8 @@ class Measurement:
                 note = "" if significant else "  less than three deviations from 0"
                 lines.append(f"{n} to {n + 1:<4} {length:10.3f} ± {deviation:.3f}{note}")
         if not self.complete:
-            lines.append("The deviations hold the noise of the pixels alone: the camera came without a covariance.")
+            known = "pixels and the pose" if self._sigma.shape[-1] else "pixels alone"
+            lines.append(f"The deviations hold the noise of the {known}: the camera came without a covariance.")
         return "\n".join(lines)
 
     def _successive(self, k: int) -> Tensor:
@@ -232,9 +237,13 @@ def measure(
             raise ValueError("pixel_sigma: want the noise of the pixels, for a camera alone does not know it")
     else:
         number = _number(calibration, view)
+        if not bool(calibration.used[..., number, :].any(-1).all()):
+            raise ValueError(f"view: want one whose pose is known, got {view!r}, of which no corner was used")
         camera = calibration.cameras[..., number]
         known = calibration.covariance.view(number) if calibration.has_covariance else None
         pixel_sigma = calibration.pixel_sigma if pixel_sigma is None else pixel_sigma
+        if pixel_sigma is None:
+            raise ValueError("pixel_sigma: want the noise of the pixels, for this calibration does not know it")
     camera = camera.to(torch.float64)
     plane = plane.to(torch.float64)
     points, valid = back_project(pixels, camera, plane)
@@ -257,7 +266,8 @@ def measure(
         sigma = sigma.unsqueeze(-1)
     common = torch.where(valid[..., None, None], torch.cat(blocks, dim=-1), 0.0)
     own = sigma.expand(*batch, points.shape[-2])[..., None, None] * D
-    return Measurement(points, valid, known is not None, common, _block_diagonal(covariances, batch), own)
+    complete = isinstance(calibration, Calibration) and known is not None and calibration.knows_intrinsics
+    return Measurement(points, valid, complete, common, _block_diagonal(covariances, batch), own)
 
 
 def _number(calibration: Calibration, view: int | str) -> int:

@@ -149,7 +149,7 @@ def solve(
     prior: Prior | None = None,
     basis: Float[Tensor, "p s q"] | None = None,
     max_iterations: int = 50,
-    tolerance: float = 1e-13,
+    tolerance: float = 1e-14,
     negligible: float = 0.0,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Solution:

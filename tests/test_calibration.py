@@ -1,5 +1,6 @@
 """`calibrate`, `refine` and `locate` against OpenCV's solvers, simulated truth and the bundled corners."""
 
+import os
 from collections.abc import Sequence
 
 import cv2
@@ -88,8 +89,10 @@ def assert_same_minimum(views: dp.Views, model: LensModel, atol_px: float = 1e-5
     views = in_float32(views)
     calibration = dp.calibrate(views, BOARD, model)
     rms, found_K, _ = by_opencv(views, model)
-    assert opencvs_rms(calibration, model == "fisheye") <= rms * (1 + 1e-9)
-    assert float(calibration.rms) == pytest.approx(opencvs_rms(calibration, model == "fisheye"), rel=1e-9)
+    ours = opencvs_rms(calibration, model == "fisheye")
+    assert ours <= rms * (1 + 1e-9)
+    if "beyond the fold" not in calibration.message:  # where OpenCV goes on counting
+        assert float(calibration.rms) == pytest.approx(ours, rel=1e-9)
     if atol_px < np.inf:
         np.testing.assert_allclose(calibration.camera.K.numpy(), found_K, rtol=0, atol=atol_px)
     return calibration
@@ -99,10 +102,9 @@ def assert_same_minimum(views: dp.Views, model: LensModel, atol_px: float = 1e-5
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-@pytest.mark.parametrize(("model", "atol_px"), [("none", 1e-5), ("brown4", 1e-5), ("brown5", 1e-5), ("brown8", np.inf)])
-def test_minimum_is_opencvs_on_bundled_corners(side: str, model: LensModel, atol_px: float) -> None:
-    # The bundled views hardly determine eight coefficients: the valley is flat to 1e-8, parameters differ along it.
-    calibration = assert_same_minimum(dp.example_views(side), model, atol_px)
+@pytest.mark.parametrize("model", ["none", "brown4", "brown5", "brown8"])
+def test_minimum_is_opencvs_on_bundled_corners(side: str, model: LensModel) -> None:
+    calibration = assert_same_minimum(dp.example_views(side), model)
     if model == "brown5":
         assert 0.15 < calibration.rms < {"left": 0.180, "right": 0.185}[side]
         assert calibration.camera.K[0, 0].item() == pytest.approx({"left": 532.8, "right": 537.2}[side], abs=1.5)
@@ -117,14 +119,37 @@ def test_minimum_is_opencvs_on_simulated_corners(model: LensModel, count: int) -
 
 def test_minimum_is_opencvs_for_eight_coefficients() -> None:
     _, views = simulate(100, TRUE_LENSES["brown8"])
-    assert_same_minimum(views, "brown8", atol_px=1e-3)  # OpenCV itself stops about so far from the bottom
+    assert_same_minimum(views, "brown8")
+    # 13 views hardly determine them: of several minima the one found is OpenCV's, or lower.
+    for seed in range(4):
+        _, views = simulate(13, TRUE_LENSES["brown8"], seed=seed)
+        assert_same_minimum(views, "brown8", atol_px=np.inf)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["brown4", "brown5", "fisheye"])
+@pytest.mark.parametrize("model", ["brown4", "brown5", "brown8", "fisheye"])
 def test_minimum_is_opencvs_for_a_thousand_views(model: LensModel) -> None:
     _, views = simulate(1000, TRUE_LENSES[model])
     assert_same_minimum(views, model)
+
+
+PHOTOS = os.environ.get("DIFFPROJ_PHOTOS")
+
+
+@pytest.mark.skipif(PHOTOS is None, reason="DIFFPROJ_PHOTOS names no folder with the photographs")
+@pytest.mark.parametrize(("side", "rms"), [("left", 0.1954), ("right", 0.2070)])
+def test_rms_of_corners_refined_in_windows_of_five(side: str, rms: float) -> None:
+    """The usual recipe for corners, and the RMS that OpenCV and mrcal reach with it."""
+    pixels = []
+    for number in [*range(1, 10), 11, 12, 13, 14]:
+        image = cv2.imread(f"{PHOTOS}/{side}{number:02d}.jpg", cv2.IMREAD_GRAYSCALE)
+        found, corners = cv2.findChessboardCorners(image, (9, 6))
+        assert found
+        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 0.001)
+        pixels.append(cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), stop).reshape(-1, 2))
+    views = dp.Views(np.stack(pixels).astype(np.float64), size=(640, 480))
+    # OpenCV starts counting at either end of the board: a half turn, which no calibration minds.
+    assert float(dp.calibrate(views, BOARD).rms) == pytest.approx(rms, abs=2e-4)
 
 
 @pytest.mark.parametrize("model", ["brown12", "brown14"])
@@ -481,7 +506,7 @@ def test_progress_is_told() -> None:
     told: list[tuple[int, int]] = []
     dp.calibrate(dp.example_views("left"), BOARD, progress=lambda done, total: told.append((done, total)))
     assert told[0][0] == 1
-    assert told[-1] == (100, 100)
+    assert told[-1] == (300, 300)
 
 
 def test_says_when_it_was_stopped_early() -> None:
@@ -765,6 +790,11 @@ def test_bad_input_is_refused_by_name() -> None:
         (ValueError, "camera: want a batch shape that broadcasts", lambda: dp.refine(truth[:3], views, board)),
         (ValueError, "camera: want no skew", lambda: dp.refine(skewed, views, board)),
         (TypeError, "camera: want a pinhole", lambda: dp.refine(dp.Camera(K, distortion=other()), views, board)),
+        (
+            ValueError,
+            r"camera: want the size of the photographs, \(640, 480\)",
+            lambda: dp.locate(views, board, dp.Camera(K, size=(320, 240))),
+        ),
         (TypeError, "camera: want dp.Camera", lambda: dp.refine("camera", batch, board)),
     ]
     for kind, message, call in cases:

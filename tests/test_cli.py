@@ -16,7 +16,7 @@ import pytest
 import diffproj as dp
 from diffproj import __main__, cli, synthetic
 from diffproj.cli import calibrate as calibrate_command
-from diffproj.cli.terminal import failure
+from diffproj.cli.terminal import failure, rounded
 
 PHOTOGRAPHS = Path(os.environ.get("DIFFPROJ_PHOTOS", "/usr/share/doc/opencv-doc/examples/data"))
 needs_photographs = pytest.mark.skipif(
@@ -369,10 +369,11 @@ def test_help_and_module(capsys: pytest.CaptureFixture[str], monkeypatch: pytest
         (-0.0000743, 0.000121, ("-0.00007", "0.00012")),
         (-16.54, 120.7, ("-17", "121")),
         (320.0, 0.0, ("320", "unknown")),
+        (-49457625.0, 5927151112.0, ("-4.95e+07", "5.9e+09")),
     ],
 )
 def test_values_are_shown_as_far_as_they_are_known(value: float, deviation: float, texts: tuple[str, str]) -> None:
-    assert calibrate_command._rounded(value, deviation) == texts
+    assert rounded(value, deviation) == texts
 
 
 def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -171,6 +171,8 @@ def test_a_located_photograph_knows_the_intrinsics_uncertainty() -> None:
     far = torch.tensor([[20.0, 20.0], [620.0, 460.0]], dtype=D)
     sure, unsure = (dp.measure(far, c, Z, view=1, pixel_sigma=0.2).lengths().deviation for c in (held, known))
     assert unsure > 1.1 * sure
+    assert "noise of the pixels and the pose" in dp.measure(far, held, Z, view=1).summary()
+    assert "noise" not in dp.measure(far, known, Z, view=1).summary()
 
 
 def test_points_that_are_not_there(calibration: dp.Calibration) -> None:
@@ -185,14 +187,28 @@ def test_points_that_are_not_there(calibration: dp.Calibration) -> None:
 
 
 def test_what_is_not_determined_is_infinite() -> None:
-    K = torch.tensor([[533.0, 0, 319.5], [0, 534, 239.5], [0, 0, 1]], dtype=D)
-    centred = dp.Camera(K, size=(640, 480)).at(torch.eye(3, dtype=D), torch.tensor([[-100.0, -60, 500]], dtype=D))
-    views = synthetic.corner_views(centred, BOARD, noise_px=0.0)  # face on: focal length and distance are one
-    found = dp.calibrate(views, BOARD, "none", fixed=("principal_point",), tied_focal=True, throw=False)
-    if not found.covariance.undetermined.any():
-        pytest.skip("rounding determined it")
-    measured = dp.measure(views.pixels[0, [0, 5]], found, Z, pixel_sigma=0.1)
-    assert not measured.joint().isnan().any()
+    K = torch.tensor([[533.0, 0, 320], [0, 534, 240], [0, 0, 1]], dtype=D)
+    angle = torch.tensor(0.5, dtype=D)
+    alike = dp.rotation_from_euler(angle, 0 * angle, 0 * angle).expand(3, 3, 3)
+    shifts = torch.tensor([[-100.0, -60, 500], [-80, -50, 600], [-90, -70, 450]], dtype=D)
+    views = synthetic.corner_views(dp.Camera(K, size=(640, 480)).at(alike, shifts), BOARD)
+    found = dp.calibrate(views, BOARD, "none", throw=False)
+    covariance = found.covariance
+    assert covariance.undetermined.any()
+    assert not covariance.undetermined.all()
+    assert covariance.deviations["f_x"].isinf()
+    assert "not determined" in found.summary()
+    full = covariance.full()
+    assert not full.isnan().any()
+    finite = torch.where(full.isinf(), 0.0, full)
+    scale = finite.diagonal().clamp(min=1e-30).rsqrt()
+    assert torch.linalg.eigvalsh(finite * scale * scale[:, None])[0] > -1e-6
+    measured = dp.measure(views.pixels[0, [0, 5]], found, Z)
+    joint = measured.joint()
+    assert not joint.isnan().any()
+    assert joint.diagonal().isinf()[[0, 1, 3, 4]].all()
+    assert measured.lengths().deviation.isinf().all()
+    assert "inf" in measured.summary()
 
 
 def test_batched_and_differentiable() -> None:
@@ -242,6 +258,9 @@ def test_bad_input_is_refused_by_name(calibration: dp.Calibration) -> None:
         dp.measure(pixels, calibration, Z, view=13)
     with pytest.raises(ValueError, match="pixel_sigma: want the noise of the pixels"):
         dp.measure(pixels, calibration.cameras[0], Z)
+    missing = dp.calibrate(dp.example_views("left").hiding(torch.arange(13)[:, None].expand(13, 54) == 6), BOARD)
+    with pytest.raises(ValueError, match="view: want one whose pose is known, got 6"):
+        dp.measure(pixels, missing, Z, view=6)
     with pytest.raises(ValueError, match="level: want a probability between 0 and 1"):
         dp.measure(pixels, calibration, Z).lengths().interval(1.0)
     with pytest.raises(ValueError, match="points: want at least 3, got 2"):

@@ -21,7 +21,7 @@ from diffproj.calibration.data import Data, PlanarTarget
 from diffproj.calibration.fit import Fit, Progress, Task, fit
 from diffproj.calibration.implicit import differentiated
 from diffproj.calibration.parameters import Priors, free_basis, make_prior
-from diffproj.calibration.reprojection import LensModel, shared_names
+from diffproj.calibration.reprojection import COEFFICIENTS, LensModel, shared_names
 from diffproj.calibration.result import Calibration, CalibrationError, Objective
 from diffproj.calibration.verdict import verdicts
 from diffproj.camera import Camera, as_camera
@@ -45,8 +45,8 @@ def calibrate(
     weights: Tensor | None = None,
     loss: Loss | None = None,
     reject_outliers: bool | float = False,
-    max_iterations: int = 100,
-    tolerance: float = 1e-13,
+    max_iterations: int = 300,
+    tolerance: float = 1e-14,
     progress: Progress | None = None,
     throw: bool = True,
 ) -> Calibration:
@@ -100,6 +100,12 @@ def calibrate(
     options = _Options(objective, bow, fixed, tied_focal, priors, loss, reject_outliers)
     shared, local = initial.from_nothing(data, distortion, views.size, tied_focal, bow)
     steps = {"max_iterations": max_iterations, "tolerance": tolerance, "progress": progress}
+    if COEFFICIENTS[distortion] > 5:
+        # The rational terms nearly cancel each other: from far off they lead into side valleys.
+        late = shared_names(distortion, bow=False)[9:]
+        early = replace(options, fixed=(*fixed, *late), objective="image", reject_outliers=False)
+        near, _ = _fitted(data, early, distortion, shared, local, **steps)
+        shared, local = near.solution.shared, near.solution.local
     found, _ = _fitted(data, options, distortion, shared, local, **steps)
     return _result("calibrate", data, found, views.size, throw)
 
@@ -117,8 +123,8 @@ def refine(
     weights: Tensor | None = None,
     loss: Loss | None = None,
     reject_outliers: bool | float = False,
-    max_iterations: int = 100,
-    tolerance: float = 1e-13,
+    max_iterations: int = 300,
+    tolerance: float = 1e-14,
     progress: Progress | None = None,
     throw: bool = True,
     differentiable: bool = False,
@@ -181,8 +187,8 @@ def locate(
     *,
     weights: Tensor | None = None,
     loss: Loss | None = None,
-    max_iterations: int = 100,
-    tolerance: float = 1e-13,
+    max_iterations: int = 300,
+    tolerance: float = 1e-14,
     throw: bool = True,
 ) -> Calibration:
     """Find the pose of each view with intrinsics and lens held, from at least 4 corners a view.
@@ -309,7 +315,7 @@ class _Options:
 
 
 def _fitted(
-    data: Data, options: _Options, model: LensModel, shared: Tensor, local: tuple[Tensor, Tensor], **steps: Any
+    data: Data, options: _Options, model: LensModel, shared: Tensor, local: tuple[Tensor, ...], **steps: Any
 ) -> tuple[Fit, Prior | None]:
     """Where the solver ends from that start, and the prior with its graph."""
     names = shared_names(model, options.bow)

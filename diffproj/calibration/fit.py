@@ -193,7 +193,7 @@ def fit(
     *,
     reject: float | None = None,
     max_iterations: int = 50,
-    tolerance: float = 1e-13,
+    tolerance: float = 1e-14,
     progress: Progress | None = None,
 ) -> Fit:
     """Minimise; with `reject`, leave out corners whose residual exceeds so many robust deviations, and repeat.

@@ -16,6 +16,10 @@ from diffproj.camera import Camera
 def from_camera(camera: Camera, data: Data, bow: bool) -> tuple[Tensor, tuple[Tensor, Tensor], LensModel]:
     """Shared parameters and poses to start from."""
     model = lens_model(camera.distortion)
+    if None not in (camera.size, data.views.size) and camera.size != data.views.size:
+        raise ValueError(
+            f"camera: want the size of the photographs, {data.views.size}, got {camera.size}; see resized()"
+        )
     camera = camera.detach().to(data.points.device, data.points.dtype)
     if bool((camera.K[..., 0, 1] != 0).any() or (camera.K[..., 1, 0] != 0).any()):
         raise ValueError("camera: want no skew, got K[..., 0, 1] or K[..., 1, 0] other than 0")

@@ -136,6 +136,11 @@ class Calibration:
         """Whether the covariance is known: not where the calibration came from a file without it."""
         return self._covariance is not None
 
+    @property
+    def knows_intrinsics(self) -> bool:
+        """Whether the covariance holds that of the intrinsics: not where a bare camera was only located."""
+        return self.has_covariance and bool((self.covariance.shared != 0).any())
+
     @cached_property
     def covariance(self) -> Covariance:
         """The joint covariance of intrinsics, lens, bow and every pose; computed at the first call.

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from diffproj.board import Chessboard
-from diffproj.calibration.fit import Fit
+from diffproj.calibration.fit import Fit, Task
+from diffproj.calibration.start import homographies
 from diffproj.solver import Status
 
 WORST_DEVIATION = 0.1
@@ -14,6 +15,8 @@ WORST_DEVIATION = 0.1
 said not to determine it."""
 WORST_FIT = 0.1
 """RMS residual of a view, relative to how far its corners spread, beyond which they are not the board's."""
+FACE_ON = 0.05
+"""A board whose image changes its scale by less than this part is as good as face on."""
 PARALLEL = math.radians(15)
 """Boards closer than this to parallel say little of the focal length, and are found tilted at random."""
 
@@ -66,7 +69,8 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
             )
         elif not bool(redundant[p]) or bool(unknown[p].any()):
             lacking = [name for name, lost in zip(task.names, unknown[p].tolist(), strict=True) if lost]
-            causes[p] = _undetermined(lacking, R[p, used[p]], t[p, used[p]], task.points)
+            seen = task.part(slice(p, p + 1))
+            causes[p] = _undetermined(lacking, R[p, used[p]], _foreshortening(seen)[0, used[p]])
     return status, tuple(causes)
 
 
@@ -92,18 +96,23 @@ def _mirrored(R: Tensor, t: Tensor, points: Tensor, used: Tensor, board: object)
     return used & (away != expected)
 
 
-def _undetermined(lacking: list[str], R: Tensor, t: Tensor, points: Tensor) -> str:
+def _undetermined(lacking: list[str], R: Tensor, foreshortening: Tensor) -> str:
     what = f"the views do not determine {', '.join(lacking)}" if lacking else "there are fewer corners than parameters"
     normals = R[..., 2]
     if len(normals) == 1:
-        sight = R[0] @ points.mean(0) + t[0]
-        cosine = (normals[0] * sight).sum().abs() / sight.norm()
-        why = "the only view is seen face on" if cosine > math.cos(PARALLEL) else "one view alone says too little"
+        why = "the only view is seen face on" if foreshortening[0] < FACE_ON else "one view alone says too little"
         return f"{what}: {why}; add views tilted by 20 to 50 degrees about both axes, or fix the principal point"
     across = torch.linalg.cross(normals, normals[:1].expand_as(normals)).norm(dim=-1)
     if bool((across < math.sin(PARALLEL)).all()):
         what += ": all views are parallel"
     return f"{what}; add photographs with the board tilted by 20 to 50 degrees about both axes"
+
+
+def _foreshortening(task: Task) -> Tensor:
+    """By what part the scale of the image changes over the board `(P, V)`, whatever the camera."""
+    H = homographies(task.points, task.pixels, task.used)
+    half = (task.points[:, :2] - task.points[:, :2].mean(0)).abs().amax(0)
+    return (H[..., 2, :2].abs() * half).sum(-1) / H[..., 2, 2].abs()
 
 
 def _listed(names: tuple[str, ...], chosen: Tensor) -> str:

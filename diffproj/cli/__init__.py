@@ -1,22 +1,24 @@
-"""The `diffproj` command: joins calibration, experiment, figures and files.
+"""The `diffproj` command: joins calibration, measurement, experiment, figures and files.
 
 Exit codes: 0 done, 1 the work failed (one line says what and what to do), 2 the command was not understood, 130
 interrupted from the keyboard.
 """
 
 import argparse
+import sys
 import warnings
 from collections.abc import Sequence
 
 from diffproj.board import BoardNotFoundWarning
 from diffproj.calibration import CalibrationError
-from diffproj.cli import calibrate, experiment
+from diffproj.cli import calibrate, experiment, measure
+from diffproj.cli.inputs import shielded
 from diffproj.cli.terminal import failure, note
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
-    options = _parser().parse_args(arguments)
+    options = _parser().parse_args(shielded(sys.argv[1:] if arguments is None else arguments))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", BoardNotFoundWarning)
@@ -38,5 +40,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     calibrate.add_command(commands)
+    measure.add_command(commands)
     experiment.add_command(commands)
     return parser

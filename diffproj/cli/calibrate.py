@@ -1,9 +1,7 @@
 """`diffproj calibrate`: from photographs of a chessboard to a camera file."""
 
 import argparse
-import math
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
@@ -12,12 +10,10 @@ from rich.table import Table
 
 from diffproj.board import Chessboard
 from diffproj.calibration import Calibration, LensModel, calibrate
-from diffproj.cli.inputs import Commands, board_size, find_corners, photographs, square_side
-from diffproj.cli.terminal import RESULTS, progress_bars, result
+from diffproj.cli.inputs import Commands, board_size, camera_file, find_corners, photographs, square_side
+from diffproj.cli.terminal import RESULTS, aligned, progress_bars, result, rounded
 from diffproj.files import save_camera
 from diffproj.lens import BrownConrady, KannalaBrandt
-
-SUFFIXES = (".json", ".yaml", ".yml", ".xml")
 
 DESCRIPTION = """\
 Finds a camera from photographs of a chessboard: focal lengths, principal point
@@ -95,19 +91,13 @@ def add_command(commands: Commands) -> None:
     file.add_argument(
         "-o",
         "--output",
-        type=_camera_file,
+        type=camera_file,
         default=Path("camera.json"),
         metavar="FILE",
         help="the camera file, replaced if there is one. Its ending says what it holds: .json the whole calibration; "
         ".yaml, .yml or .xml what OpenCV's calibration program writes (default: camera.json)",
     )
     command.set_defaults(run=run)
-
-
-def _camera_file(text: str) -> Path:
-    if Path(text).suffix.lower() not in SUFFIXES:
-        raise argparse.ArgumentTypeError(f"want a file ending in {', '.join(SUFFIXES)}, got {text!r}")
-    return Path(text)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -181,12 +171,12 @@ def _parameters_table(calibration: Calibration) -> Table:
         values += camera.distortion.coefficients.tolist()
     values += [] if bow is None else bow.tolist()
     known = calibration.covariance.deviations
-    pairs = [_rounded(value, float(deviation)) for value, deviation in zip(values, known.values(), strict=True)]
+    pairs = [rounded(value, float(deviation)) for value, deviation in zip(values, known.values(), strict=True)]
     table = Table(title="Camera", title_justify="left")
     table.add_column("parameter")
     table.add_column("value", no_wrap=True)
     table.add_column("standard deviation", no_wrap=True)
-    for name, *pair in zip(known, *(_aligned(column) for column in zip(*pairs, strict=True)), strict=True):
+    for name, *pair in zip(known, *(aligned(column) for column in zip(*pairs, strict=True)), strict=True):
         table.add_row(_title(name), *pair)
     return table
 
@@ -197,20 +187,6 @@ def _title(name: str) -> str:
         return f"board's bow along {name[-1]}, unit of --square"
     titles = {"f": "focal length {}, px", "c": "principal point {}, px"}
     return titles.get(name[0], "lens {}").format(name)
-
-
-def _rounded(value: float, deviation: float) -> tuple[str, str]:
-    """A value and its standard deviation, both to the deviation's second digit."""
-    if not (math.isfinite(deviation) and deviation > 0):
-        return f"{value:.6g}", "unknown"
-    decimals = max(0, 1 - math.floor(math.log10(deviation)))
-    return f"{value:.{decimals}f}", f"{deviation:.{decimals}f}"
-
-
-def _aligned(numbers: Sequence[str]) -> list[str]:
-    """Numbers with their decimal points below each other."""
-    width = max(len(number.partition(".")[0]) for number in numbers)
-    return [" " * (width - len(number.partition(".")[0])) + number for number in numbers]
 
 
 def _say_how_it_ended(calibration: Calibration, reject_outliers: bool) -> None:

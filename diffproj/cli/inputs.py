@@ -1,8 +1,9 @@
-"""Options and inputs that commands share: the board, photographs and the corners in them."""
+"""Options and inputs that commands share: the board, camera files, photographs and the corners in them."""
 
 import argparse
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,17 @@ from diffproj.board import Chessboard, Views, detect
 from diffproj.board.images import SUFFIXES, Source, listed
 
 Commands = Any  # argparse's own type for what add_subparsers returns is private
+CAMERA_SUFFIXES = (".json", ".yaml", ".yml", ".xml")
 SMALLEST_BOARD = 3
 """Inner corners each way that the corner detector needs."""
+
+
+def shielded(arguments: Sequence[str]) -> list[str]:
+    """Put a space before lists of numbers such as `-5,3`, so that argparse does not take them for options.
+
+    A single negative number needs no shield.
+    """
+    return [f" {text}" if re.match(r"-[.\d][^,]*,", text) else text for text in arguments]
 
 
 def board_size(text: str) -> tuple[int, int]:
@@ -37,6 +47,22 @@ def square_side(text: str) -> float:
     if not (math.isfinite(side) and side > 0):
         raise argparse.ArgumentTypeError(f"want the side of a square as a positive number, such as 25, got {text!r}")
     return side
+
+
+def camera_file(text: str) -> Path:
+    """Read the name of a camera file."""
+    if Path(text).suffix.lower() not in CAMERA_SUFFIXES:
+        raise argparse.ArgumentTypeError(f"want a file ending in {', '.join(CAMERA_SUFFIXES)}, got {text!r}")
+    return Path(text)
+
+
+def numbers(text: str, count: int) -> tuple[float, ...] | None:
+    """Read so many finite numbers with commas between them; `None` where it is something else."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return None
+    return values if len(values) == count and all(map(math.isfinite, values)) else None
 
 
 def photographs(paths: Iterable[Path]) -> list[Source]:

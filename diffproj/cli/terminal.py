@@ -1,5 +1,8 @@
 """What commands say and where: results on standard output, progress, warnings and failures on standard error."""
 
+import math
+from collections.abc import Sequence
+
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -7,6 +10,9 @@ from diffproj.calibration import CalibrationError, Status
 
 RESULTS = Console(highlight=False, emoji=False)
 NOTES = Console(stderr=True, highlight=False, emoji=False)
+
+HUGE = 1e5
+"""A deviation from which numbers are shown with a power of ten, such as those of points close to the horizon."""
 
 
 def note(text: str) -> None:
@@ -44,3 +50,19 @@ def progress_bars() -> Progress:
         transient=True,
         disable=not NOTES.is_terminal,
     )
+
+
+def rounded(value: float, deviation: float) -> tuple[str, str]:
+    """A value and its standard deviation, both to the deviation's second digit."""
+    if not (math.isfinite(deviation) and deviation > 0):
+        return f"{value:.6g}", "unknown"
+    if deviation >= HUGE:
+        return f"{value:.2e}", f"{deviation:.1e}"
+    decimals = max(0, 1 - math.floor(math.log10(deviation)))
+    return f"{value:.{decimals}f}", f"{deviation:.{decimals}f}"
+
+
+def aligned(numbers: Sequence[str]) -> list[str]:
+    """Numbers with their decimal points below each other."""
+    width = max(len(number.partition(".")[0]) for number in numbers)
+    return [" " * (width - len(number.partition(".")[0])) + number for number in numbers]
