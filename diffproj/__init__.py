@@ -29,6 +29,7 @@ from diffproj.lens import BrownConrady, KannalaBrandt, Lens
 from diffproj.losses import Cauchy, Huber, Loss, SoftL1
 from diffproj.maps import AccuracyMap, image_map, plane_map
 from diffproj.measurement import Measurement, Quantity, measure
+from diffproj.modules import CalibrationPrior, LearnablePlane, PlaneLoss, PlaneProjector, ground_resolution
 from diffproj.paper_route import paper_route
 from diffproj.plane import Plane
 from diffproj.rotation import euler_from_rotation, rotation_from_euler
@@ -43,6 +44,7 @@ __all__ = [
     "BrownConrady",
     "Calibration",
     "CalibrationError",
+    "CalibrationPrior",
     "Camera",
     "Cauchy",
     "Chessboard",
@@ -52,11 +54,14 @@ __all__ = [
     "Huber",
     "KannalaBrandt",
     "LearnableCamera",
+    "LearnablePlane",
     "Lens",
     "Loss",
     "Measurement",
     "Plane",
+    "PlaneLoss",
     "PlaneMap",
+    "PlaneProjector",
     "Quantity",
     "Reason",
     "SoftL1",
@@ -70,6 +75,7 @@ __all__ = [
     "euler_from_rotation",
     "example_views",
     "explain",
+    "ground_resolution",
     "image_map",
     "image_residuals",
     "load_calibration",

@@ -216,7 +216,7 @@ def in_blocks(
     """
     batch = max(1, points.shape[:-2].numel())
     length = max(1, BLOCK_POINTS // batch)
-    if points.shape[-2] <= length or wants_derivative(points, *parameters):
+    if wants_derivative(points, *parameters) or points.shape[-2] <= length:  # a graph is not to depend on the length
         return function(points)
     axis = points.ndim - 2
     results: list[Any] = []

@@ -15,7 +15,7 @@ LEVELS = (
     ("back_projection", "paper_route"),
     ("board",),
     ("calibration", "learnable", "synthetic"),
-    ("experiment", "files", "measurement", "validation"),
+    ("experiment", "files", "measurement", "modules", "validation"),
     ("maps",),
     ("figures",),
     ("cli",),

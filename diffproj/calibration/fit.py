@@ -95,15 +95,15 @@ class Fit:
         """`sum |e|^2 / (2 n - parameters)` of the least-squares problem, `(P,)`; NaN where nothing is left over."""
         cost = self.solution.cost
         if self.task.prior is not None:
-            off = self.solution.shared - self.task.prior.mean
+            off = self.solution.shared.detach() - self.task.prior.mean
             cost = cost - (off.unsqueeze(-2) @ self.task.prior.precision @ off.unsqueeze(-1)).flatten() / 2
         spare = self.degrees_of_freedom()
         return torch.where(spare > 0, 2 * cost / spare, torch.nan)
 
     def pixel_sigma(self) -> Tensor:
         """The noise of a corner's coordinate in pixels, as the residuals on the image tell it `(P,)`."""
-        task, solution = self.task, self.solution
-        image = replace(task, objective="image").problem.linearise(solution.shared, solution.local)[:, :, -1]
+        task, local = self.task, tuple(z.detach() for z in self.solution.local)
+        image = replace(task, objective="image").problem.linearise(self.solution.shared.detach(), local)[:, :, -1]
         if task.loss is not None:
             components = torch.where(task.used.unsqueeze(2), image.abs(), torch.nan)
             return 1.4826 * components.flatten(1).nanmedian(-1).values
@@ -132,7 +132,7 @@ class Fit:
         task = self.task
         if task.weights is None and task.loss is None and task.objective == "image":
             return self.plain_covariance()
-        shared, local = self.solution.shared, self.solution.local
+        shared, local = self.solution.shared.detach(), tuple(z.detach() for z in self.solution.local)
         panel = task.problem.linearise(shared, local)
         rows, residual = panel[:, :, :-1], panel[:, :, -1]
         score = (rows * residual.unsqueeze(2)).sum(3)  # (P, V, s + 6, N): of each corner, without its weight
