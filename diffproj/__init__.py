@@ -32,6 +32,7 @@ from diffproj.measurement import Measurement, Quantity, measure
 from diffproj.modules import CalibrationPrior, LearnablePlane, PlaneLoss, PlaneProjector, ground_resolution
 from diffproj.paper_route import paper_route
 from diffproj.plane import Plane
+from diffproj.rectification import plane_axes, rectify, render
 from diffproj.rotation import euler_from_rotation, rotation_from_euler
 from diffproj.validation import CrossValidation, bootstrap, cross_validate
 
@@ -83,9 +84,12 @@ __all__ = [
     "locate",
     "measure",
     "paper_route",
+    "plane_axes",
     "plane_map",
     "plane_residuals",
+    "rectify",
     "refine",
+    "render",
     "rotation_from_euler",
     "run_experiment",
     "save_camera",

@@ -13,7 +13,7 @@ LEVELS = (
     ("solver",),
     ("camera", "plane"),
     ("back_projection", "paper_route"),
-    ("board",),
+    ("board", "rectification"),
     ("calibration", "learnable", "synthetic"),
     ("experiment", "files", "measurement", "modules", "validation"),
     ("maps",),
