@@ -11,8 +11,10 @@ file is written whole or not at all.
 """
 
 import json
+import math
 import os
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,7 +66,7 @@ def save_camera(path: PathLike, camera: Camera | Calibration, format: Format | N
         raise TypeError(f"camera: want dp.Camera or dp.Calibration, got {type(camera).__name__}")
     path = Path(path)
     if _format(path, format) == "json":
-        content = _readable(json.dumps(_json_document(camera), indent=1))
+        content = _readable(json.dumps(_without_nan(_json_document(camera)), indent=1, allow_nan=False))
     else:
         content = _opencv_document(path, camera)
     write_whole(path, content)
@@ -126,8 +128,8 @@ def load_calibration(path: PathLike) -> Calibration:
             bow,
             found["objective"],
             tuple(found["causes"]),
-            None if found["pixel_sigma"] is None else _tensor(found["pixel_sigma"], torch.float64),
-            None if covariance is None else lambda: covariance,
+            None if found["pixel_sigma"] is None else _tensor(_with_nan(found["pixel_sigma"]), torch.float64),
+            None if covariance is None else partial(_same, covariance),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
@@ -188,6 +190,10 @@ def _json_document(item: Camera | Calibration) -> dict[str, Any]:
     return document
 
 
+def _same(covariance: Covariance) -> Covariance:
+    return covariance
+
+
 def _covariance_fields(item: Calibration) -> dict[str, Any] | None:
     """The blocks of the covariance; what is infinite is 0 here and known by the masks, for JSON has no infinity."""
     if not item.has_covariance:
@@ -208,6 +214,20 @@ def _covariance_from_fields(fields: dict[str, Any] | None) -> Covariance | None:
     shared, *blocks = (_tensor(fields[key], torch.float64) for key in ("shared", "follow", "mixed", "alone"))
     infinite = torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(shared))
     return Covariance(tuple(fields["names"]), shared + infinite, unknown, unknown_views, *blocks)
+
+
+def _without_nan(value: Any) -> Any:
+    """The same with `None` for what is no finite number, for JSON has only those."""
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _with_nan(value: Any) -> Any:
+    """The same with NaN for `None`."""
+    return [_with_nan(item) for item in value] if isinstance(value, list) else math.nan if value is None else value
 
 
 def _readable(text: str) -> str:

@@ -5,7 +5,7 @@ The parameters are chosen so that steps of one size mean much the same for each 
 * focal lengths through their logarithm, `f = f_0 exp(log_focal)`;
 * the principal point in units of the focal length, `c = c_0 + f_0 principal_point`;
 * the lens's coefficients as they are, `k = k_0 + distortion`;
-* poses on their manifold, `R = exp(rotation) R_0`, and `t = t_0 + |t_0| translation`.
+* poses on their manifold, `R = exp(rotation) R_0`, and `t = t_0 + |t_0| translation` (in world units where t_0 is 0).
 
 All are zero at first: the camera that the module was made from. What is not learned is a buffer, saved and moved along.
 """
@@ -42,17 +42,19 @@ class HasPoints(Protocol):
 class LearnableCamera(nn.Module):
     """A camera, or a batch of them, as a module: calling it gives a `Camera` that carries gradients.
 
-    Intrinsics and lens that are the same for a whole batch of poses, as those of `Calibration.cameras`, are one
-    parameter: axes over which the camera was only expanded stay so.
+    Intrinsics and lens of a batch of poses of one camera, as `Calibration.cameras` is, are one parameter.
 
     Args:
         camera: the start. Its tensors are copied; its dtype and device are the module's.
         learn: which parts are learned, of `"focal"`, `"principal_point"`, `"distortion"` and `"pose"`; all that the
             camera has if left out.
+        one_camera: whether the last batch axis counts poses of one camera, with one K and one lens. If left out, they
+            do where the camera was only expanded over them, which is how `camera.at(R, t)` and calibrations make it; a
+            change of dtype or picking by a list makes copies, and then it has to be said.
 
     Raises:
         TypeError: no camera, or one with a lens of another library.
-        ValueError: an unknown part, `"distortion"` of a pinhole, or a K with skew.
+        ValueError: an unknown part, `"distortion"` of a pinhole, a K with skew, or `one_camera` of different ones.
 
     Example:
         >>> import diffproj as dp
@@ -71,7 +73,9 @@ class LearnableCamera(nn.Module):
         torch.Size([13, 3, 3])
     """
 
-    def __init__(self, camera: Camera | PinholeCamera, learn: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, camera: Camera | PinholeCamera, learn: Sequence[str] | None = None, one_camera: bool | None = None
+    ) -> None:
         super().__init__()
         camera = as_camera(camera).detach()
         lens = camera.distortion
@@ -86,13 +90,17 @@ class LearnableCamera(nn.Module):
             raise ValueError(f"learn: want parts of {', '.join(available)}, got {unknown[0]!r}")
         self.learn, self.size, self.batch_shape = learn, camera.size, camera.batch_shape
         self._lens = None if lens is None else type(lens)
-        K = _unexpanded(camera.K, 2)
+        K = _once(camera.K, 2, one_camera)
         focal, center = K.diagonal(dim1=-2, dim2=-1)[..., :2], K[..., :2, 2]
         self.register_buffer("focal_0", focal.clone())
         self.register_buffer("principal_point_0", center.clone())
         self.register_buffer("R_0", camera.R.clone())
         self.register_buffer("t_0", camera.t.clone())
-        coefficients = focal[..., :0] if lens is None else _unexpanded(lens.expand(*self.batch_shape).coefficients, 1)
+        reach = camera.t.norm(dim=-1, keepdim=True)
+        self.register_buffer("reach", torch.where(reach > 0, reach, 1.0))
+        coefficients = (
+            focal[..., :0] if lens is None else _once(lens.expand(*self.batch_shape).coefficients, 1, one_camera)
+        )
         self.register_buffer("coefficients_0", coefficients.clone())
         self._own("log_focal", focal, "focal")
         self._own("principal_point", center, "principal_point")
@@ -104,6 +112,7 @@ class LearnableCamera(nn.Module):
     principal_point_0: Tensor
     R_0: Tensor
     t_0: Tensor
+    reach: Tensor
     coefficients_0: Tensor
     log_focal: Tensor
     principal_point: Tensor
@@ -132,7 +141,7 @@ class LearnableCamera(nn.Module):
         turn = axis_angle_to_rotation_matrix(self.rotation.reshape(-1, 3)).reshape(self.R_0.shape)
         # Elementwise, as everywhere: under autocast a matrix product would round the pose to 8 bits.
         R = (turn.unsqueeze(-1) * self.R_0.unsqueeze(-3)).sum(-2)
-        t = self.t_0 + self.t_0.norm(dim=-1, keepdim=True) * self.translation
+        t = self.t_0 + self.reach * self.translation
         lens = None
         if self._lens is not None:
             lens = self._lens(self.coefficients_0 + self.distortion).expand(*self.batch_shape)
@@ -200,9 +209,15 @@ def _points(board: HasPoints, camera: Camera) -> Tensor:
     return board.points.to(camera.K)
 
 
-def _unexpanded(tensor: Tensor, trailing: int) -> Tensor:
-    """The tensor with length 1 along the batch axes over which it was only expanded."""
-    for axis in range(tensor.ndim - trailing):
-        if tensor.shape[axis] > 1 and tensor.stride(axis) == 0:
-            tensor = tensor.narrow(axis, 0, 1)
+def _once(tensor: Tensor, trailing: int, one_camera: bool | None) -> Tensor:
+    """The tensor with length 1 along the batch axes over which it is the same camera."""
+    batch = tensor.ndim - trailing
+    for axis in range(batch):
+        last = axis == batch - 1
+        expanded = tensor.shape[axis] > 1 and tensor.stride(axis) == 0
+        first = tensor.narrow(axis, 0, 1)
+        if last and one_camera and not bool((tensor == first).all()):
+            raise ValueError("one_camera: want one K and one lens for all poses, got different ones")
+        if expanded if one_camera is None or not last else one_camera:
+            tensor = first
     return tensor

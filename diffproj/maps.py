@@ -18,7 +18,7 @@ from kornia.geometry.grid import create_meshgrid
 from torch import Tensor
 
 from diffproj.calibration import Calibration
-from diffproj.measurement import measure
+from diffproj.measurement import measure, view_number
 from diffproj.plane import Plane
 
 
@@ -112,6 +112,8 @@ def plane_map(
     """
     if calibration.views.batch_shape:
         raise ValueError(f"calibration: want one camera, got batch shape {tuple(calibration.views.batch_shape)}")
+    if len(extent) != 4:
+        raise ValueError(f"extent: want (x_min, y_min, x_max, y_max), got {tuple(extent)}")
     x_min, y_min, x_max, y_max = extent
     if not (x_max > x_min and y_max > y_min):
         raise ValueError(f"extent: want (x_min, y_min, x_max, y_max) with room between, got {tuple(extent)}")
@@ -123,7 +125,7 @@ def plane_map(
     xy = (low + unit * (high - low)).to(calibration.points.device)
     z = (plane.offset - (plane.normal[:2] * xy).sum(-1)) / plane.normal[2]
     points = torch.cat([xy, z.unsqueeze(-1)], dim=-1)
-    number = calibration.views.names.index(view) if isinstance(view, str) else view
+    number = view_number(calibration, view)
     camera = calibration.cameras[number]
     pixels, seen = camera.project(points.reshape(-1, 3))
     if camera.size is not None:

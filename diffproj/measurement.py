@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._numerics import check_tensor, precise
@@ -28,7 +29,7 @@ from diffproj.calibration import Calibration
 from diffproj.calibration.board_error import assembled
 from diffproj.calibration.covariance import finite
 from diffproj.calibration.reprojection import COEFFICIENTS, lens_model, moved
-from diffproj.camera import Camera
+from diffproj.camera import Camera, as_camera
 from diffproj.plane import Plane
 
 SIGNIFICANT = 3.0
@@ -121,7 +122,12 @@ class Measurement:
             >>> print(f"{middle.value[0]:.1f} mm")  # x of the centroid of three corners in a row
             25.0 mm
         """
-        index = torch.as_tensor(which, device=self.points.device)
+        index, N = torch.as_tensor(which, device=self.points.device), self.points.shape[-2]
+        if index.ndim != 2 or index.is_floating_point():
+            raise ValueError(f"which: want the numbers of k points for each of M quantities, got {tuple(index.shape)}")
+        if bool(((index < -N) | (index >= N)).any()):
+            raise IndexError(f"which: want numbers of the {N} points, got {index.flatten().tolist()}")
+        index = index % N
         k = index.shape[-1]
         chosen = self.points[..., index, :]  # (*B, M, k, 3)
         flat = chosen.reshape(-1, k, 3)
@@ -142,11 +148,11 @@ class Measurement:
 
     def lengths(self, pairs: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
         """Distances between points in world units: of successive points, or of `pairs (M, 2)`."""
-        return self.quantity(_length, self._successive(2) if pairs is None else pairs)
+        return self.quantity(_length, self._successive(2) if pairs is None else _sets("pairs", pairs, 2))
 
     def angles(self, triples: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
         """Angles at the second of three points in radians: of successive points, or of `triples (M, 3)`."""
-        return self.quantity(_angle, self._successive(3) if triples is None else triples)
+        return self.quantity(_angle, self._successive(3) if triples is None else _sets("triples", triples, 3))
 
     def area(self, corners: Sequence[int] | None = None) -> Quantity:
         """The area of the polygon with these corners in order (all points if left out), in squared world units.
@@ -197,7 +203,7 @@ class Measurement:
 
 def measure(
     pixels: Float[Tensor, "*#batch n 2"],
-    calibration: Calibration | Camera,
+    calibration: Calibration | Camera | PinholeCamera,
     plane: Plane,
     view: int | str = 0,
     pixel_sigma: float | Tensor | None = None,
@@ -231,17 +237,18 @@ def measure(
         199.9 ± 0.2 mm
     """
     pixels = precise(check_tensor("pixels", pixels, "N", 2))
-    if isinstance(calibration, Camera):
-        camera, known = calibration, None
+    if not isinstance(calibration, Calibration):
+        camera, known = as_camera(calibration), None
         if pixel_sigma is None:
             raise ValueError("pixel_sigma: want the noise of the pixels, for a camera alone does not know it")
     else:
-        number = _number(calibration, view)
+        number = view_number(calibration, view)
         if not bool(calibration.used[..., number, :].any(-1).all()):
             raise ValueError(f"view: want one whose pose is known, got {view!r}, of which no corner was used")
         camera = calibration.cameras[..., number]
         known = calibration.covariance.view(number) if calibration.has_covariance else None
-        pixel_sigma = calibration.pixel_sigma if pixel_sigma is None else pixel_sigma
+        if pixel_sigma is None and calibration.pixel_sigma is not None:
+            pixel_sigma = calibration.pixel_sigma.unsqueeze(-1)
         if pixel_sigma is None:
             raise ValueError("pixel_sigma: want the noise of the pixels, for this calibration does not know it")
     camera = camera.to(torch.float64)
@@ -255,6 +262,9 @@ def measure(
     D = torch.where(valid[..., None, None], T @ across, 0.0)
     blocks, covariances = [-D @ by_theta], [torch.zeros(*batch, 0, 0).to(D) if known is None else known]
     if plane_covariance is not None:
+        plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
+        if plane.is_per_point:
+            raise ValueError("plane_covariance: want one plane for all points, got one for each (Plane.per_point)")
         n = normal.expand_as(points)
         lift = n / n.square().sum(-1, keepdim=True)
         lift = lift - (D @ (by_point @ lift.unsqueeze(-1))).squeeze(-1)
@@ -262,15 +272,28 @@ def measure(
         blocks.append(lift.unsqueeze(-1) * with_offset.unsqueeze(-2))
         covariances.append(precise(plane_covariance))
     sigma = torch.as_tensor(pixel_sigma, dtype=torch.float64, device=points.device)
-    if sigma.ndim == len(batch) or sigma.ndim == 0:
-        sigma = sigma.unsqueeze(-1)
+    try:
+        sigma = sigma.expand(points.shape[:-1])
+    except RuntimeError:
+        want, got = tuple(points.shape[:-1]), tuple(sigma.shape)
+        raise ValueError(f"pixel_sigma: want a number or a shape that broadcasts to {want}, got {got}") from None
+    if bool((sigma.detach() < 0).any()):
+        raise ValueError("pixel_sigma: want standard deviations of at least 0, got negative ones")
     common = torch.where(valid[..., None, None], torch.cat(blocks, dim=-1), 0.0)
-    own = sigma.expand(*batch, points.shape[-2])[..., None, None] * D
+    own = sigma[..., None, None] * D
     complete = isinstance(calibration, Calibration) and known is not None and calibration.knows_intrinsics
     return Measurement(points, valid, complete, common, _block_diagonal(covariances, batch), own)
 
 
-def _number(calibration: Calibration, view: int | str) -> int:
+def _sets(name: str, which: Sequence[Sequence[int]] | Tensor, k: int) -> Tensor:
+    index = torch.as_tensor(which)
+    if index.ndim != 2 or index.shape[-1] != k:
+        raise ValueError(f"{name}: want point numbers of shape (M, {k}), got {tuple(index.shape)}")
+    return index
+
+
+def view_number(calibration: Calibration, view: int | str) -> int:
+    """The number of a view, from 0, by its number or its name."""
     names = calibration.views.names
     if isinstance(view, str):
         if view not in names:

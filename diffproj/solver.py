@@ -25,7 +25,8 @@ Computed per accepted point: the panel `[A_v B_v e_v]^T` and, by one batched pro
 E_v, W_v, g, h_v and the cost at once. Per trial: L_v, Y_v, S and a new panel. Nothing else.
 
 Each problem has its own lambda, acceptance and stopping, and no operation mixes problems: a hopeless neighbour changes
-no bit of a result. The cost never rises. How each ended is a `Status`, never an exception.
+no bit of a result. The cost never rises: a step is taken that was tried and found no worse, but for the last one, which
+promises less than a part in 10^8 and is not tried. How each ended is a `Status`, never an exception.
 """
 
 from collections.abc import Callable
@@ -123,10 +124,10 @@ class Solution(NamedTuple):
     Attributes:
         shared: x `(P, s)`.
         local: the local blocks.
-        cost: F `(P,)`.
+        cost: F `(P,)`, as it was before the last step, which was not tried.
         status: `Status` codes `(P,)`.
         iterations: steps tried `(P,)`.
-        equations: the normal equations there, with the last weights.
+        equations: the normal equations at the same place, with the last weights.
     """
 
     shared: Float[Tensor, "p s"]
@@ -149,7 +150,7 @@ def solve(
     prior: Prior | None = None,
     basis: Float[Tensor, "p s q"] | None = None,
     max_iterations: int = 50,
-    tolerance: float = 1e-14,
+    tolerance: float = 3e-14,
     negligible: float = 0.0,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Solution:
@@ -189,16 +190,17 @@ def solve(
         if done.any():
             # The last step promises hardly anything and brings the unknowns nearer still: it is not tried.
             last = done & (promised <= LAST_PROMISE * pace.cost)
-            shared, local = _chosen(last, trial, (shared, local))
+            shared, local = chosen(last, trial, (shared, local))
         if not pace.active.any():
             break
         trial_cost, trial_equations = terms.at(*trial)
         better = pace.learn(_array(trial_cost), promised)
         state, new = (shared, local, cost, equations), (*trial, trial_cost, trial_equations)
-        shared, local, cost, equations = _chosen(better, new, state)
+        shared, local, cost, equations = chosen(better, new, state)
         if progress is not None:
             progress(iteration, cost)
-    status, iterations = (torch.from_numpy(a).to(cost.device) for a in (pace.ended(), pace.iterations))
+    ends = pace.status.astype(np.int64), pace.iterations
+    status, iterations = (torch.from_numpy(end).to(cost.device) for end in ends)
     return Solution(shared, local, cost, status, iterations, equations)
 
 
@@ -245,10 +247,6 @@ class _Pace:
         self.fall = np.where(better, np.minimum(3 * self.fall, 1e6), np.where(worse, FIRST_FALL, self.fall))
         self.cost = np.where(better, cost, self.cost)
         return better
-
-    def ended(self) -> np.ndarray:
-        """How each ended, as codes."""
-        return self.status.astype(np.int64)
 
 
 def damped_step(equations: Equations, damping: Float[Tensor, " p"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -346,7 +344,7 @@ def _array(values: Tensor) -> np.ndarray:
     return values.detach().to("cpu", torch.float64).numpy().copy()
 
 
-def _chosen(mask: np.ndarray, new: Any, old: Any) -> Any:
+def chosen(mask: np.ndarray, new: Any, old: Any) -> Any:
     """Problem by problem, `new` where the mask is true; for a tensor or a tuple of such."""
     if mask.all():
         return new
@@ -355,5 +353,5 @@ def _chosen(mask: np.ndarray, new: Any, old: Any) -> Any:
     if isinstance(new, Tensor):
         where = torch.from_numpy(mask).to(new.device).reshape(-1, *(1,) * (new.ndim - 1))
         return torch.where(where, new, old)
-    parts = [_chosen(mask, a, b) for a, b in zip(new, old, strict=True)]
+    parts = [chosen(mask, a, b) for a, b in zip(new, old, strict=True)]
     return type(new)(*parts) if hasattr(new, "_fields") else tuple(parts)

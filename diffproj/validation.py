@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffproj.back_projection import back_project
 from diffproj.board import Views
-from diffproj.calibration import Calibration, LensModel, PlanarTarget, calibrate, locate
+from diffproj.calibration import Calibration, CalibrationError, LensModel, PlanarTarget, calibrate, locate
 from diffproj.plane import Plane
 
 
@@ -75,6 +75,8 @@ def cross_validate(
     """
     if views.batch_shape:
         raise ValueError(f"views: want those of one camera, got batch shape {tuple(views.batch_shape)}")
+    if options.get("bow"):
+        raise ValueError("bow: want False, for held-out views are located on a flat board")
     if not 2 <= folds <= len(views):
         raise ValueError(f"folds: want from 2 to the number of views, {len(views)}, got {folds}")
     out = torch.arange(len(views), device=views.device) % folds == torch.arange(folds, device=views.device).unsqueeze(
@@ -117,7 +119,7 @@ def bootstrap(
         The deviations by name, as `Covariance.deviations` names them. Draws that did not converge are left out.
 
     Raises:
-        ValueError: many cameras, fewer than 2 draws, or `weights` among the options.
+        ValueError: many cameras, fewer than 2 draws, or weights.
         CalibrationError: hardly any draw determines the camera.
 
     Example:
@@ -128,8 +130,10 @@ def bootstrap(
     """
     if views.batch_shape:
         raise ValueError(f"views: want those of one camera, got batch shape {tuple(views.batch_shape)}")
-    if draws < 2 or "weights" in options:
-        raise ValueError(f"draws: want at least 2 and no weights, got {draws} with options {sorted(options)}")
+    if draws < 2:
+        raise ValueError(f"draws: want at least 2, got {draws}")
+    if "weights" in options:
+        raise ValueError("weights: want none, for they say here how often a view was drawn")
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randint(len(views), (draws, len(views)), generator=generator).to(views.device)
     counts = torch.nn.functional.one_hot(drawn, len(views)).sum(1).to(torch.float64)
@@ -139,7 +143,7 @@ def bootstrap(
     found = calibrate(every.hiding(hidden), board, distortion, **options)
     kept = found.converged
     if int(kept.sum()) < max(2, draws // 2):
-        raise ValueError(f"views: want draws that determine the camera, got {int(kept.sum())} of {draws}; add views")
+        raise CalibrationError(f"bootstrap: {int(kept.sum())} of {draws} draws determine the camera; add views", found)
     K, lens = found.camera.K[kept], found.camera.distortion
     values = [K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]]
     values += [] if lens is None else list(lens.coefficients[kept].unbind(-1))  # type: ignore[attr-defined]

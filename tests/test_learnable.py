@@ -66,6 +66,7 @@ def test_lbfgs_reaches_the_solvers_minimum() -> None:
     assert (learnable().K[0] - best.camera.K).abs().max() < 0.01
 
 
+@pytest.mark.slow
 def test_adam_reaches_the_solvers_minimum() -> None:
     camera, views, board, best = pinhole()
     learnable = dp.LearnableCamera(_one_intrinsics(camera))
@@ -100,6 +101,23 @@ def test_the_plane_objective_by_lbfgs() -> None:
     total = by_lbfgs(learnable, lambda: dp.plane_residuals(learnable(), views, board)[0].square().sum(), 1500)
     error, _ = dp.plane_residuals(want.cameras, views, board)
     assert total == pytest.approx(error.square().sum().item(), rel=1e-6)
+
+
+def test_a_camera_at_the_origin_can_move(camera: dp.Camera) -> None:
+    learnable = dp.LearnableCamera(dp.Camera(camera.K))
+    learnable().t.sum().backward()
+    assert (learnable.translation.grad == 1).all()
+
+
+def test_one_camera_may_have_to_be_said(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
+    _, _, best = rough
+    copies = best.cameras.to(torch.float32)
+    assert dp.LearnableCamera(copies, one_camera=True).log_focal.shape == (1, 2)
+    assert dp.LearnableCamera(best.cameras, one_camera=False).log_focal.shape == (5, 2)
+    K = best.cameras.K.clone()
+    K[2, 0, 0] += 1
+    with pytest.raises(ValueError, match="one_camera: want one K and one lens"):
+        dp.LearnableCamera(dp.Camera(K, best.cameras.R, best.cameras.t), one_camera=True)
 
 
 def test_starts_as_the_camera_it_was_made_from(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:

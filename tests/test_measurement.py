@@ -140,6 +140,24 @@ def test_correlations_make_short_lengths_sure(calibration: dp.Calibration) -> No
     assert "less than three deviations from 0" in dp.measure(pixels[:2], calibration, Z).summary()
 
 
+def test_points_counted_from_the_end_are_the_same_points(calibration: dp.Calibration) -> None:
+    measured = dp.measure(calibration.views.pixels[0, :3], calibration, Z)
+
+    def total(points: torch.Tensor) -> torch.Tensor:
+        return (points[0] + points[1])[0]
+
+    same, ends = measured.quantity(total, [[2, 2]]), measured.quantity(total, [[2, -1]])
+    assert torch.equal(same.deviation, ends.deviation)
+    with pytest.raises(IndexError, match="which: want numbers of the 3 points"):
+        measured.lengths([[0, 3]])
+    with pytest.raises(ValueError, match="pairs: want point numbers"):
+        measured.lengths([[0, 1, 2]])
+    with pytest.raises(ValueError, match="pixel_sigma: want standard deviations"):
+        dp.measure(calibration.views.pixels[0, :3], calibration, Z, pixel_sigma=-1.0)
+    with pytest.raises(ValueError, match="pixel_sigma: want a number or a shape"):
+        dp.measure(calibration.views.pixels[0, :3], calibration, Z, pixel_sigma=torch.ones(2))
+
+
 def test_a_view_by_number_or_name_and_a_camera_alone(calibration: dp.Calibration) -> None:
     pixels = calibration.views.pixels[4, [0, 53]]
     by_number = dp.measure(pixels, calibration, Z, view=4)

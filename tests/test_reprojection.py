@@ -56,7 +56,10 @@ def residual(
     return (projected - pixels).mT
 
 
-@pytest.mark.parametrize("lens", list(COEFFICIENTS))
+LONG = [pytest.param(name, marks=pytest.mark.slow) if name in ("brown8", "brown12") else name for name in COEFFICIENTS]
+
+
+@pytest.mark.parametrize("lens", LONG)
 @pytest.mark.parametrize(("kind", "bow"), [(Reprojection, False), (Reprojection, True), (BoardError, False)])
 def test_jacobians_are_autograds(kind: type[Reprojection], lens: LensModel, bow: bool) -> None:
     board, shared, local = situation(lens, bow)

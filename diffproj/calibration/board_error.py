@@ -39,7 +39,8 @@ class BoardError(Reprojection):
         image = panel.clone()
         torch.div(b * v - d.unsqueeze(2) * u, determinant, out=image[:, :, :, 0])
         torch.div(c * u - a.unsqueeze(2) * v, determinant, out=image[:, :, :, 1])
-        image[:, :, -1] = (landed - self.points)[..., :2].mT
+        lost = (~valid & self.used).unsqueeze(-1)
+        image[:, :, -1] = torch.where(lost, torch.nan, landed - self.points)[..., :2].mT
         if self._unused is not None:
             image.masked_fill_(self._unused[:, :, None, None], 0.0)
         return image

@@ -7,8 +7,10 @@ holds a known camera and finds poses alone. All work for one camera, views `(V, 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, get_args
 
+import numpy as np
 import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
@@ -20,13 +22,13 @@ from diffproj.calibration.covariance import Covariance, reshaped
 from diffproj.calibration.data import Data, PlanarTarget
 from diffproj.calibration.fit import Fit, Progress, Task, fit
 from diffproj.calibration.implicit import differentiated
-from diffproj.calibration.parameters import Priors, free_basis, make_prior
+from diffproj.calibration.parameters import Priors, free_basis, held_at, make_prior
 from diffproj.calibration.reprojection import COEFFICIENTS, LensModel, shared_names
 from diffproj.calibration.result import Calibration, CalibrationError, Objective
 from diffproj.calibration.verdict import verdicts
 from diffproj.camera import Camera, as_camera
 from diffproj.losses import Loss
-from diffproj.solver import Prior, Solution, Status
+from diffproj.solver import Prior, Solution, Status, chosen
 
 REJECT = 5.0
 """Robust deviations beyond which a corner is an outlier: of Gaussian residuals, 4 in a million."""
@@ -46,7 +48,7 @@ def calibrate(
     loss: Loss | None = None,
     reject_outliers: bool | float = False,
     max_iterations: int = 300,
-    tolerance: float = 1e-14,
+    tolerance: float = 3e-14,
     progress: Progress | None = None,
     throw: bool = True,
 ) -> Calibration:
@@ -63,19 +65,20 @@ def calibrate(
             was no better in trials on real views. Take it where the loss that matters is in world units.
         bow: fit the board's bow too, a paraboloid of two parameters. Not with the plane objective, for a bowed board
             has no plane.
-        fixed: names of parameters or groups (`"focal"`, `"principal_point"`, `"distortion"`, `"k3"`, ...) that keep
-            their starting values: here the middle of the image and 0.
+        fixed: names of parameters or groups (`"principal_point"`, `"distortion"`, `"k3"`, ...) that keep their starting
+            values: here the middle of the image, and 0 for the lens. (A known focal length is for `refine`.)
         tied_focal: `f_x : f_y` keeps the start's ratio: here 1.
-        priors: what is known beforehand, by name or group: a standard deviation about the start, or
-            `(mean, deviation)`. It weighs against corners whose standard deviation is `1 / sqrt(weight)` px: give
-            weights along with it, such as `torch.tensor(25.0)` for 0.2 px.
-        weights: of the corners, broadcasting to `(*B, V, N)`: one over the variance of their coordinates.
+        priors: what is known beforehand, by name or group: a standard deviation about the values that `fixed` would
+            keep, or a tuple `(mean, deviation)`. It weighs against corners whose standard deviation is
+            `1 / sqrt(weight)` px: give weights along with it, such as `torch.tensor(25.0)` for 0.2 px.
+        weights: of the corners, broadcasting to `(*B, V, N)`: one over the variance of their coordinates, in px^-2 (for
+            the plane objective in world units). A corner of weight 0 takes no part.
         loss: a robust loss such as `dp.Huber(0.5)`, its scale in pixels (in world units for the plane objective).
         reject_outliers: leave out corners whose residual exceeds 5 (or so many) robust standard deviations, and
             repeat; `Calibration.rejected` and the summary name them.
         max_iterations: steps of the solver.
         tolerance: it stops when what is left to gain falls below this part of the cost.
-        progress: called as `progress(done, total)` after each step.
+        progress: called as `progress(done, total)` after each step; work in two stages starts again once.
         throw: raise where a camera did not converge; if false, look at `Calibration.status`.
 
     Returns:
@@ -100,13 +103,17 @@ def calibrate(
     options = _Options(objective, bow, fixed, tied_focal, priors, loss, reject_outliers)
     shared, local = initial.from_nothing(data, distortion, views.size, tied_focal, bow)
     steps = {"max_iterations": max_iterations, "tolerance": tolerance, "progress": progress}
+    # The start is a guess from the corners; what is held, or known, is not.
+    reference = shared.clone()
+    reference[:, :2], reference[:, 4:] = torch.nan, 0.0
     if COEFFICIENTS[distortion] > 5:
         # The rational terms nearly cancel each other: from far off they lead into side valleys.
         late = shared_names(distortion, bow=False)[9:]
         early = replace(options, fixed=(*fixed, *late), objective="image", reject_outliers=False)
-        near, _ = _fitted(data, early, distortion, shared, local, **steps)
+        early = replace(early, loss=None if objective == "plane" else loss)  # its scale is in world units
+        near, _ = _fitted(data, early, distortion, shared, local, reference, **steps)
         shared, local = near.solution.shared, near.solution.local
-    found, _ = _fitted(data, options, distortion, shared, local, **steps)
+    found, _ = _fitted(data, options, distortion, shared, local, reference, **steps)
     return _result("calibrate", data, found, views.size, throw)
 
 
@@ -124,7 +131,7 @@ def refine(
     loss: Loss | None = None,
     reject_outliers: bool | float = False,
     max_iterations: int = 300,
-    tolerance: float = 1e-14,
+    tolerance: float = 3e-14,
     progress: Progress | None = None,
     throw: bool = True,
     differentiable: bool = False,
@@ -174,7 +181,7 @@ def refine(
     options = _Options(objective, bow, fixed, tied_focal, priors, loss, reject_outliers)
     shared, local, model = initial.from_camera(camera, data, bow)
     steps = {"max_iterations": max_iterations, "tolerance": tolerance, "progress": progress}
-    found, prior = _fitted(data, options, model, shared, local, **steps)
+    found, prior = _fitted(data, options, model, shared, local, shared, **steps)
     if differentiable:
         found = differentiated(found, data, prior)
     return _result("refine", data, found, camera.size or views.size, throw)
@@ -188,12 +195,13 @@ def locate(
     weights: Tensor | None = None,
     loss: Loss | None = None,
     max_iterations: int = 300,
-    tolerance: float = 1e-14,
+    tolerance: float = 3e-14,
     throw: bool = True,
 ) -> Calibration:
     """Find the pose of each view with intrinsics and lens held, from at least 4 corners a view.
 
     A plane seen from afar has two poses that explain it almost equally well; both are refined and the better kept.
+    The board is taken to be flat, also where a calibration found a bow.
 
     Args:
         views: corners `(*B, V, N, 2)`.
@@ -222,6 +230,7 @@ def locate(
         >>> print(f"{dp.locate(views[8:], board, camera).rms:.2f}")
         0.18
     """
+    _check_loss(loss)
     data = Data(views, board, weights)
     known = None
     if isinstance(camera, Calibration):
@@ -260,7 +269,7 @@ def locate(
     better = torch.where(other.cost.isfinite(), other.cost, torch.inf) < torch.where(
         one.cost.isfinite(), one.cost, torch.inf
     )
-    best = _either(better, other, one)
+    best = chosen(better.numpy(force=True), other, one)
     task = data.task(model, loss=loss, basis=shared.new_zeros(*shared.shape, 0))
     seen = data.used.any(-1)
     status = torch.where(seen, best.status.reshape(seen.shape), Status.CONVERGED)
@@ -284,6 +293,11 @@ def locate(
     return _result("locate", data, found, camera.size or views.size, throw, known)
 
 
+def _check_loss(loss: object) -> None:
+    if loss is not None and not isinstance(loss, Loss):
+        raise TypeError(f"loss: want one such as dp.Huber(0.5), got {type(loss).__name__}")
+
+
 @dataclass(frozen=True)
 class _Options:
     """What is minimised, as the caller said it."""
@@ -301,25 +315,38 @@ class _Options:
             raise ValueError(f"objective: want one of {', '.join(get_args(Objective))}, got {self.objective!r}")
         if self.bow and self.objective == "plane":
             raise ValueError("bow: want False with objective='plane', for a bowed board has no plane")
+        if isinstance(self.fixed, str):
+            raise TypeError(f"fixed: want several names, as in fixed=({self.fixed!r},), got a string")
         if self.priors is not None and not isinstance(self.priors, Mapping):
             raise TypeError(f"priors: want a mapping from names, got {type(self.priors).__name__}")
-        if self.loss is not None and not isinstance(self.loss, Loss):
-            raise TypeError(f"loss: want one such as dp.Huber(0.5), got {type(self.loss).__name__}")
+        _check_loss(self.loss)
+        if not isinstance(self.reject_outliers, bool | np.bool_ | int | float) or not self.reject_outliers >= 0:
+            raise ValueError(f"reject_outliers: want True or a number above 0, got {self.reject_outliers!r}")
 
     @property
     def reject(self) -> float | None:
         """Robust deviations beyond which a corner is an outlier."""
-        if isinstance(self.reject_outliers, bool):
+        if isinstance(self.reject_outliers, bool | np.bool_):
             return REJECT if self.reject_outliers else None
-        return float(self.reject_outliers)
+        return float(self.reject_outliers) or None
 
 
 def _fitted(
-    data: Data, options: _Options, model: LensModel, shared: Tensor, local: tuple[Tensor, ...], **steps: Any
+    data: Data,
+    options: _Options,
+    model: LensModel,
+    shared: Tensor,
+    local: tuple[Tensor, ...],
+    reference: Tensor,
+    **steps: Any,
 ) -> tuple[Fit, Prior | None]:
-    """Where the solver ends from that start, and the prior with its graph."""
+    """Where the solver ends from that start, and the prior with its graph.
+
+    `reference (P, s)` is what fixed parameters keep and priors without a mean are about; NaN where nothing is known.
+    """
     names = shared_names(model, options.bow)
-    prior = make_prior(options.priors, shared, names, data.batch)
+    prior = make_prior(options.priors, reference, names, data.batch)
+    shared = held_at(reference, shared, names, options.fixed)
     task = data.task(
         model,
         bow=options.bow,
@@ -363,10 +390,6 @@ def _result(
         size,
     )
 
-    def covariance() -> Covariance:
-        own = reshaped(found.covariance(), batch)
-        return own if known is None else own.following(known)
-
     calibration = Calibration(
         camera,
         posed,
@@ -380,20 +403,13 @@ def _result(
         task.objective,
         causes,
         shaped(found.pixel_sigma()),
-        covariance,
+        partial(_covariance, found, tuple(batch), known),
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)
     return calibration
 
 
-def _either(mask: Tensor, one: Solution, other: Solution) -> Solution:
-    """Problem by problem, `one` where the mask is true."""
-
-    def pick(a: Any, b: Any) -> Any:
-        if isinstance(a, Tensor):
-            return torch.where(mask.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
-        parts = [pick(x, y) for x, y in zip(a, b, strict=True)]
-        return type(a)(*parts) if hasattr(a, "_fields") else tuple(parts)
-
-    return pick(one, other)
+def _covariance(found: Fit, batch: tuple[int, ...], known: Covariance | None) -> Covariance:
+    own = reshaped(found.covariance(), batch)
+    return own if known is None else own.following(known)

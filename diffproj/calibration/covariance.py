@@ -65,20 +65,21 @@ class Covariance:
         F, G = self._follow[..., view, :, :], self._follow[..., other, :, :]
         Q, P = self._mixed[..., view, :, :], self._mixed[..., other, :, :]
         blocks = F @ finite(self.shared) @ G.mT - Q @ G.mT - F @ P.mT
-        if view % self._alone.shape[-3] == other % self._alone.shape[-3]:
+        same = view % self._alone.shape[-3] == other % self._alone.shape[-3]
+        if same:
             blocks = blocks + self._alone[..., view, :, :]
-        return blocks
+        unknown = (self.undetermined_views[..., view] | self.undetermined_views[..., other])[..., None, None]
+        infinite = torch.diag_embed(torch.full_like(blocks[..., 0], torch.inf))
+        return torch.where(unknown, infinite if same else torch.zeros_like(blocks), blocks)
 
     def cross(self, view: int) -> Float[Tensor, "*batch 6 s"]:
         """The covariance of a pose (rows) with the shared parameters (columns)."""
-        return self._mixed[..., view, :, :] - self._follow[..., view, :, :] @ finite(self.shared)
+        cross = self._mixed[..., view, :, :] - self._follow[..., view, :, :] @ finite(self.shared)
+        return torch.where(self.undetermined_views[..., view, None, None], 0.0, cross)
 
     def view(self, view: int) -> Float[Tensor, "*batch sp sp"]:
         """The joint covariance of the shared parameters and the pose of one view, `(*B, s + 6, s + 6)`."""
         cross, pose = self.cross(view), self.between(view, view)
-        unknown = self.undetermined_views[..., view, None, None]
-        infinite = torch.diag_embed(torch.full_like(pose[..., 0], torch.inf))
-        pose, cross = torch.where(unknown, infinite, pose), torch.where(unknown, 0.0, cross)
         return torch.cat([torch.cat([self.shared, cross.mT], dim=-1), torch.cat([cross, pose], dim=-1)], dim=-2)
 
     def following(self, known: "Covariance") -> "Covariance":

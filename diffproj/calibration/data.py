@@ -44,6 +44,8 @@ class Data:
             raise TypeError(f"views: want dp.Views, got {type(views).__name__}; dp.Views(pixels, size=...) makes them")
         if len(views) == 0:
             raise ValueError("views: want at least one, got none")
+        if not isinstance(board, PlanarTarget):
+            raise TypeError(f"board: want dp.Chessboard or anything with .points (N, 3), got {type(board).__name__}")
         self.views, self.board, self.batch = views, board, views.batch_shape
         self.given_points = precise(board.points.to(views.device))
         self.given_pixels = precise(views.pixels)
@@ -57,18 +59,23 @@ class Data:
         _check_points(points)
         self.points = points
         self.pixels = self.given_pixels.detach().reshape(-1, *views.pixels.shape[-3:])
-        visible = views.visible.reshape(self.pixels.shape[:-1])
-        self.used = visible & (visible.sum(-1, keepdim=True) >= 4)
+        visible = views.visible
         self.given_weights, self.weights = None, None
         if weights is not None:
+            given = torch.as_tensor(weights).to(views.device)
             try:
-                self.given_weights = precise(torch.as_tensor(weights).to(views.device)).expand(views.visible.shape)
+                given = precise(given).expand(visible.shape)
             except RuntimeError:
-                want, got = tuple(views.visible.shape), tuple(weights.shape)
+                want, got = tuple(visible.shape), tuple(given.shape)
                 raise ValueError(f"weights: want a shape that broadcasts to {want}, got {got}") from None
-            if not bool((self.given_weights.detach()[views.visible] >= 0).all()):
-                raise ValueError("weights: want numbers of at least 0, got negative ones or NaN")
-            self.weights = self.given_weights.detach().reshape(visible.shape)
+            counted = given.detach()[visible]
+            if not bool(((counted >= 0) & counted.isfinite()).all()):
+                raise ValueError("weights: want finite numbers of at least 0, got others at corners that were seen")
+            self.given_weights = torch.where(visible, given, 0.0)
+            self.weights = self.given_weights.detach().reshape(self.pixels.shape[:-1])
+            visible = visible & (self.given_weights.detach() > 0)
+        visible = visible.reshape(self.pixels.shape[:-1])
+        self.used = visible & (visible.sum(-1, keepdim=True) >= 4)
 
     def task(self, model: LensModel, **options: Any) -> Task:
         """What is to be minimised on these corners."""

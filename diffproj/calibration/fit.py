@@ -18,7 +18,7 @@ from diffproj.calibration.covariance import Covariance, Scores
 from diffproj.calibration.reprojection import POSE, LensModel, Reprojection, shared_names
 from diffproj.calibration.result import Objective
 from diffproj.losses import Loss
-from diffproj.solver import Equations, Prior, Solution, Status, solve
+from diffproj.solver import Equations, Prior, Solution, chosen, solve
 
 BLOCK_CORNERS = 24_000
 """Corners solved at once on a CPU, those of some thirty cameras of 13 views: enough to hide the cost of calls."""
@@ -102,11 +102,12 @@ class Fit:
 
     def pixel_sigma(self) -> Tensor:
         """The noise of a corner's coordinate in pixels, as the residuals on the image tell it `(P,)`."""
+        if self.task.objective == "image" and self.task.loss is None and self.task.weights is None:
+            return self.residual_variance().detach().sqrt()
         task, local = self.task, tuple(z.detach() for z in self.solution.local)
         image = replace(task, objective="image").problem.linearise(self.solution.shared.detach(), local)[:, :, -1]
         if task.loss is not None:
-            components = torch.where(task.used.unsqueeze(2), image.abs(), torch.nan)
-            return 1.4826 * components.flatten(1).nanmedian(-1).values
+            return _robust_sigma(image, task.used)
         spare = self.degrees_of_freedom()
         return torch.where(spare > 0, image.square().sum((1, 2, 3)) / spare, torch.nan).sqrt()
 
@@ -192,8 +193,8 @@ def fit(
     local: tuple[Tensor, ...],
     *,
     reject: float | None = None,
-    max_iterations: int = 50,
-    tolerance: float = 1e-14,
+    max_iterations: int = 300,
+    tolerance: float = 3e-14,
     progress: Progress | None = None,
 ) -> Fit:
     """Minimise; with `reject`, leave out corners whose residual exceeds so many robust deviations, and repeat.
@@ -214,7 +215,7 @@ def _fit(
     tolerance: float,
     progress: Progress | None,
 ) -> Fit:
-    given = task.used
+    given = inliers = task.used
     options = {"max_iterations": max_iterations, "tolerance": tolerance}
     blocks = _blocks(task)
 
@@ -234,14 +235,18 @@ def _fit(
     if reject is not None:
         for done in range(1, rounds):
             # Views that fell below four corners keep the pose that they had.
-            kept = _without_outliers(replace(task, used=given), solution, reject)
-            if torch.equal(kept, task.used):
+            inliers = _inliers(replace(task, used=given), solution, reject)
+            kept = inliers & (inliers.sum(-1, keepdim=True) >= 4)
+            changed = (kept != task.used).any(-1).any(-1)
+            if not bool(changed.any()):
                 break
             task = replace(task, used=kept)
-            solution = attempt(task, solution.shared, solution.local, done)
-            iterations = iterations + solution.iterations
+            again = attempt(task, solution.shared, solution.local, done)
+            # Who has settled stays as it is, to the bit.
+            solution = chosen(changed.numpy(force=True), again, solution)
+            iterations = iterations + torch.where(changed, again.iterations, 0)
     tell(total, total)
-    return Fit(task, solution._replace(iterations=iterations), given & ~task.used)
+    return Fit(task, solution._replace(iterations=iterations), given & ~inliers)
 
 
 def ordinary(value: Any) -> Any:
@@ -297,13 +302,20 @@ def _joined(parts: list[Solution]) -> Solution:
     )
 
 
-def _without_outliers(task: Task, solution: Solution, limit: float) -> Tensor:
-    """Which of the given corners are no outliers, at least four in a view or none `(P, V, N)`."""
+def _inliers(task: Task, solution: Solution, limit: float) -> Tensor:
+    """Which of the given corners are no outliers `(P, V, N)`, each measured by its own weight."""
     residual = task.problem.linearise(solution.shared, solution.local)[:, :, -1]
-    components = torch.where(task.used.unsqueeze(2), residual.abs(), torch.nan)
-    sigma = 1.4826 * components.flatten(1).nanmedian(-1).values
-    kept = task.used & (residual.square().sum(2) <= (limit * sigma[:, None, None]).square())
-    return kept & (kept.sum(-1, keepdim=True) >= 4)
+    if task.weights is not None:
+        residual = residual * task.weights.sqrt().unsqueeze(2)
+    # Of exact corners the residuals are rounding, which has outliers of its own.
+    least = 1e-6 if task.objective == "image" else 1e-9 * float(task.points.abs().amax())
+    sigma = _robust_sigma(residual, task.used).clamp(min=least)
+    return task.used & (residual.square().sum(2) <= (limit * sigma[:, None, None]).square())
+
+
+def _robust_sigma(residual: Tensor, used: Tensor) -> Tensor:
+    """1.4826 times the median of the components of residuals `(P, V, 2, N)`, `(P,)`."""
+    return 1.4826 * torch.where(used.unsqueeze(2), residual.abs(), torch.nan).flatten(1).nanmedian(-1).values
 
 
 def _derivatives(loss: Loss | None, squared: Tensor) -> tuple[Tensor, Tensor]:
@@ -315,6 +327,3 @@ def _derivatives(loss: Loss | None, squared: Tensor) -> tuple[Tensor, Tensor]:
         slope = loss.weight(e2)
         bend = torch.autograd.grad(slope.sum(), e2, allow_unused=True)[0] if slope.requires_grad else None
     return slope.detach(), torch.zeros_like(squared) if bend is None else bend
-
-
-__all__ = ["Fit", "Progress", "Status", "Task", "fit"]

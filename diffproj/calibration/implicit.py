@@ -22,6 +22,9 @@ from diffproj.solver import Prior
 
 def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
     """The same fit with shared parameters and poses that carry gradients to pixels, points, weights and prior."""
+    sources = [data.given_pixels, data.given_points, data.given_weights, *(prior or ())]
+    if not any(source is not None and source.requires_grad for source in sources):
+        return found
     task, solution = found.task, found.solution
     P, V = task.pixels.shape[:2]
     s = len(task.names)

@@ -13,7 +13,7 @@ from torch import Tensor
 from diffproj.solver import Prior
 
 Priors = Mapping[str, Any]
-"""By name or group: a standard deviation about the starting value, or a pair `(mean, standard deviation)`; numbers or
+"""By name or group: a standard deviation about the starting value, or a tuple `(mean, standard deviation)`; numbers or
 tensors that broadcast to `(*B, size of the group)`."""
 
 
@@ -46,11 +46,8 @@ def free_basis(shared: Tensor, names: Sequence[str], fixed: Sequence[str], tied_
         tied_focal: `f_x : f_y` keeps the start's ratio.
 
     Raises:
-        TypeError: `fixed` is a single string.
         ValueError: an unknown name, or one focal length fixed while they are tied.
     """
-    if isinstance(fixed, str):
-        raise TypeError(f"fixed: want several names, as in fixed=({fixed!r},), got a string")
     held = {position for name in fixed for position in positions("fixed", name, names)}
     if tied_focal and len(held & {0, 1}) == 1:
         raise ValueError("fixed: want both focal lengths or none while tied_focal=True, got one of them")
@@ -65,6 +62,20 @@ def free_basis(shared: Tensor, names: Sequence[str], fixed: Sequence[str], tied_
     return basis
 
 
+def held_at(reference: Tensor, shared: Tensor, names: Sequence[str], fixed: Sequence[str]) -> Tensor:
+    """The start `(P, s)` with fixed parameters at the values that they keep.
+
+    Raises:
+        ValueError: nothing is known of what is to be fixed.
+    """
+    held = sorted({position for name in fixed for position in positions("fixed", name, names)})
+    if not held:
+        return shared
+    if bool(reference[:, held].isnan().any()):
+        raise ValueError("fixed: want what is known beforehand; a focal length is for refine, whose camera has one")
+    return shared.index_copy(1, torch.tensor(held, device=shared.device), reference[:, held])
+
+
 def make_prior(priors: Priors | None, shared: Tensor, names: Sequence[str], batch: Sequence[int]) -> Prior | None:
     """The prior on the shared parameters; gradients flow to tensors among its values.
 
@@ -77,7 +88,7 @@ def make_prior(priors: Priors | None, shared: Tensor, names: Sequence[str], batc
     precision = torch.zeros_like(mean)
     for name, value in priors.items():
         where = positions("priors", name, names)
-        pair = value if isinstance(value, tuple | list) else (None, value)
+        pair = value if isinstance(value, tuple) else (None, value)
         if len(pair) != 2:
             raise ValueError(f"priors: want a deviation or (mean, deviation) for {name!r}, got {value!r}")
         if pair[0] is not None:
@@ -85,10 +96,12 @@ def make_prior(priors: Priors | None, shared: Tensor, names: Sequence[str], batc
         deviation = _written(torch.ones_like(mean), where, pair[1], name, batch)
         if not bool((deviation > 0).all()):
             raise ValueError(f"priors: want a positive standard deviation for {name!r}, got {pair[1]}")
+        if not bool(mean.detach()[:, where].isfinite().all()):
+            raise ValueError(f"priors: want (mean, deviation) with a finite mean for {name!r}, got {value!r}")
         chosen = torch.zeros_like(mean)
         chosen[:, where] = 1.0
         precision = precision * (1 - chosen) + chosen / deviation.square()
-    return Prior(mean, torch.diag_embed(precision))
+    return Prior(torch.where(precision > 0, mean, 0.0), torch.diag_embed(precision))
 
 
 def _written(into: Tensor, where: list[int], value: Any, name: str, batch: Sequence[int]) -> Tensor:

@@ -138,8 +138,11 @@ class Calibration:
 
     @property
     def knows_intrinsics(self) -> bool:
-        """Whether the covariance holds that of the intrinsics: not where a bare camera was only located."""
-        return self.has_covariance and bool((self.covariance.shared != 0).any())
+        """Whether the covariance holds that of the intrinsics: not where they were all held, as `locate` holds them."""
+        if not self.has_covariance:
+            return False
+        count = sum(not name.startswith("bow") for name in self.covariance.names)
+        return bool((self.covariance.shared[..., :count, :count] != 0).any())
 
     @cached_property
     def covariance(self) -> Covariance:
@@ -179,7 +182,7 @@ class Calibration:
                 lines.append(line(f"lens {name}", (name,), [value], "10.5f", ""))
         if self.bow is not None:
             lines.append(line("bow along x, y", ("bow_x", "bow_y"), self.bow.tolist(), "10.4f", " world units"))
-        lines.append(f"{'RMS':<16}{float(self.rms):10.4f} px over {int(self.used.sum())} corners")
+        lines.append(f"{'RMS':<16}{self.rms.item():10.4f} px over {int(self.used.sum())} corners")
         width = max(map(len, self.views.names), default=0)
         seen, used = self.views.visible.sum(-1).tolist(), self.used.sum(-1).tolist()
         for view, (name, rms) in enumerate(zip(self.views.names, self.view_rms.tolist(), strict=True)):

@@ -54,7 +54,14 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
         if bool(none[p]):
             causes[p] = "no view shows at least 4 corners"
         elif not bool(finite[p]):
-            causes[p] = "the corners are not finite, or the start puts the board behind the camera"
+            causes[p] = (
+                "some corners have no place on the board, beyond the lens's fold or the horizon: fit a lens with fewer "
+                "coefficients, or take objective='image'"
+                if task.objective == "plane" and bool(task.pixels[p][task.used[p]].isfinite().all())
+                else "the corners are not finite, or the start puts the board behind the camera"
+            )
+        elif status[p] == Status.DIVERGED:
+            continue
         elif bool(unpoised[p].any()):
             causes[p] = f"the corners of {_listed(names, unpoised[p])} do not determine a pose: do they lie on a line?"
         elif bool(misfits[p].any()):
