@@ -818,7 +818,7 @@ def test_bad_input_is_refused_by_name() -> None:
         (
             ValueError,
             "fixed: want both focal lengths or none",
-            lambda: dp.calibrate(views, board, fixed=("f_x",), tied_focal=True),
+            lambda: dp.refine(truth[0], views, board, fixed=("f_x",), tied_focal=True),
         ),
         (TypeError, "priors: want a mapping", lambda: dp.calibrate(views, board, priors=[1])),
         (
