@@ -173,7 +173,7 @@ def image_residuals(
         >>> torch.equal(error, calibration.residuals)
         True
     """
-    camera = as_camera(camera)
+    camera = _posed(camera, views)
     projected, valid = camera.project(_points(board, camera))
     valid = valid & views.visible
     return torch.where(valid.unsqueeze(-1), projected - views.pixels.to(projected), 0.0), valid
@@ -199,10 +199,20 @@ def plane_residuals(
         >>> bool(valid.all()), bool(error.norm(dim=-1).mean() < 0.2)  # millimetres
         (True, True)
     """
-    camera = as_camera(camera)
+    camera = _posed(camera, views)
     points, valid = back_project(views.pixels.to(camera.K), camera, Plane.z(0.0))
     valid = valid & views.visible
     return torch.where(valid.unsqueeze(-1), points - _points(board, camera), 0.0), valid
+
+
+def _posed(camera: Camera | PinholeCamera, views: Views) -> Camera:
+    camera = as_camera(camera)
+    if camera.batch_shape[-1:] != (len(views),):
+        raise ValueError(
+            f"camera: want a pose for each of the {len(views)} views, batch shape (*B, {len(views)}), "
+            f"got {tuple(camera.batch_shape)}"
+        )
+    return camera
 
 
 def _points(board: HasPoints, camera: Camera) -> Tensor:

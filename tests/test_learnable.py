@@ -207,6 +207,10 @@ def test_bad_input_is_refused_by_name(camera: dp.Camera) -> None:
         dp.LearnableCamera(camera, ("distortion",))
     with pytest.raises(TypeError, match="camera: want dp.Camera"):
         dp.LearnableCamera("camera")
+    views = dp.example_views("left")
+    for residuals in (dp.image_residuals, dp.plane_residuals):
+        with pytest.raises(ValueError, match="camera: want a pose for each of the 13 views"):
+            residuals(camera, views, BOARD)
     skewed = dp.Camera(camera.K + torch.tensor([[0.0, 1, 0], [0, 0, 0], [0, 0, 0]], dtype=D))
     with pytest.raises(ValueError, match="camera: want no skew"):
         dp.LearnableCamera(skewed)

@@ -77,7 +77,8 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
         elif not bool(redundant[p]) or bool(unknown[p].any()):
             lacking = [name for name, lost in zip(task.names, unknown[p].tolist(), strict=True) if lost]
             seen = task.part(slice(p, p + 1))
-            causes[p] = _undetermined(lacking, R[p, used[p]], _foreshortening(seen)[0, used[p]])
+            free = task.basis is None or bool(task.basis[p, 2:4].any())
+            causes[p] = _undetermined(lacking, R[p, used[p]], _foreshortening(seen)[0, used[p]], free)
     return status, tuple(causes)
 
 
@@ -103,12 +104,13 @@ def _mirrored(R: Tensor, t: Tensor, points: Tensor, used: Tensor, board: object)
     return used & (away != expected)
 
 
-def _undetermined(lacking: list[str], R: Tensor, foreshortening: Tensor) -> str:
+def _undetermined(lacking: list[str], R: Tensor, foreshortening: Tensor, free_principal_point: bool) -> str:
     what = f"the views do not determine {', '.join(lacking)}" if lacking else "there are fewer corners than parameters"
     normals = R[..., 2]
     if len(normals) == 1:
         why = "the only view is seen face on" if foreshortening[0] < FACE_ON else "one view alone says too little"
-        return f"{what}: {why}; add views tilted by 20 to 50 degrees about both axes, or fix the principal point"
+        remedy = "add views tilted by 20 to 50 degrees about both axes"
+        return f"{what}: {why}; {remedy}{', or fix the principal point' * free_principal_point}"
     across = torch.linalg.cross(normals, normals[:1].expand_as(normals)).norm(dim=-1)
     if bool((across < math.sin(PARALLEL)).all()):
         what += ": all views are parallel"
