@@ -31,6 +31,7 @@ def test_one_graph_serves_every_batch_size(projector: dp.PlaneProjector, pixels:
     assert len(graphs) <= 2  # the first size, and then any
 
 
+@pytest.mark.slow
 def test_a_compiled_step_has_the_same_gradients(projector: dp.PlaneProjector, pixels: torch.Tensor) -> None:
     target = torch.zeros(len(pixels), 3, dtype=D)
 
@@ -46,6 +47,7 @@ def test_a_compiled_step_has_the_same_gradients(projector: dp.PlaneProjector, pi
         torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learn", [(), EVERY])
 def test_exports(camera: dp.Camera, pixels: torch.Tensor, learn: tuple[str, ...]) -> None:
     projector = dp.PlaneProjector(camera, dp.Plane.z(0.0), learn)
