@@ -70,11 +70,12 @@ def _perspective(
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """Straighten the image with a lens of one number, then Zhang's equations."""
     radius = 0.5 * math.hypot(*size)
-    lam = (
-        start.division(data.points, data.pixels, data.used, middle, radius) if bent else torch.zeros_like(middle[:, 0])
-    )
-    pixels = start.without_division(data.pixels, middle, lam, radius) if bent else data.pixels
-    H = start.homographies(data.points, pixels, data.used)
+    lam, H = torch.zeros_like(middle[:, 0]), None
+    if bent:
+        lam, H = start.division(data.points, data.pixels, data.used, middle, radius)
+    if H is None:
+        straight = start.without_division(data.pixels, middle, lam, radius) if bent else data.pixels
+        H = start.homographies(data.points, straight, data.used)
     f = start.focal_lengths(H, middle, float(max(size)), data.used.any(-1), tied)
     upper = (H[..., :2, :] - middle[:, None, :, None] * H[..., 2:, :]) / f[:, None, :, None]
     pose = start.poses(torch.cat([upper, H[..., 2:, :]], dim=-2), data.points)

@@ -23,6 +23,8 @@ ENOUGH = 24
 """Corners of a view that a homography is taken from at most, spread over those that were seen."""
 DIVISION_TRIES, DIVISION_RANGE = (-0.3, -0.15, 0.0), (-0.45, 0.15)
 """What the one number for a lens is looked for among, and its limits: -0.3 moves the image's corner by a third."""
+FEW_VIEWS = 64
+"""Views in all up to which the cost is that of calls, not of views."""
 DIVISION_VIEWS = 4
 """Views of a camera that the lens is looked for in."""
 WIDEST = math.radians(75)
@@ -48,19 +50,26 @@ def homographies(points: Tensor, xy: Tensor, used: Tensor) -> Tensor:
     return find_homography_dlt(board, xy, used.flatten(0, 1).to(xy.dtype), solver="lu").reshape(P, V, 3, 3)
 
 
-def division(points: Tensor, pixels: Tensor, used: Tensor, middle: Tensor, radius: float) -> Tensor:
+def division(
+    points: Tensor, pixels: Tensor, used: Tensor, middle: Tensor, radius: float
+) -> tuple[Tensor, Tensor | None]:
     """The lens as one number `(P,)`: `lambda` of `centred = distorted / (1 + lambda (|distorted| / radius)^2)`.
 
     Straight lines of the board are straight on the image only without the lens: the number is where the homographies
     of a few views that reach far out fit best, on the parabola through three tries (Fitzgibbon 2001 has the model).
+    Where there are few views in all, all are tried, and their homographies without the lens `(P, V, 3, 3)`, which are
+    interpolated between the tries, come along: one call is dearer than a few more views.
     """
     P, V = used.shape[:2]
     offset = torch.where(used.unsqueeze(-1), pixels - middle[:, None, None], 0.0)
     reach = offset.square().sum(-1).amax(-1)
-    far = reach.topk(min(V, DIVISION_VIEWS), dim=1).indices
-    chosen = torch.arange(P, device=far.device).unsqueeze(1), far
+    every = P * V <= FEW_VIEWS
+    if not every:
+        far = reach.topk(min(V, DIVISION_VIEWS), dim=1).indices
+        chosen = torch.arange(P, device=far.device).unsqueeze(1), far
+        pixels, used = pixels[chosen], used[chosen]
     tries = len(DIVISION_TRIES)
-    seen, kept = pixels[chosen].repeat(tries, 1, 1, 1), used[chosen].repeat(tries, 1, 1)
+    seen, kept = pixels.repeat(tries, 1, 1, 1), used.repeat(tries, 1, 1)
     lam = seen.new_tensor(DIVISION_TRIES).repeat_interleave(P)
     xy = without_division(seen, middle.repeat(tries, 1), lam, radius)
     H = homographies(points, xy, kept)
@@ -74,7 +83,16 @@ def division(points: Tensor, pixels: Tensor, used: Tensor, middle: Tensor, radiu
     slope_1, slope_2 = (error[1] - error[0]) / (b - a), (error[2] - error[1]) / (c - b)
     bend = (slope_2 - slope_1) / (c - a)
     lowest = (a + b) / 2 - slope_1 / (2 * bend)
-    return torch.where((bend > 0) & lowest.isfinite(), lowest, 0.0).clamp(*DIVISION_RANGE)
+    found = torch.where((bend > 0) & lowest.isfinite(), lowest, 0.0).clamp(*DIVISION_RANGE)
+    if not every:
+        return found, None
+    scaled = (H / H[..., 2:, 2:]).reshape(tries, P, V, 3, 3)
+    shares = [  # Lagrange's
+        (found - b) * (found - c) / ((a - b) * (a - c)),
+        (found - a) * (found - c) / ((b - a) * (b - c)),
+        (found - a) * (found - b) / ((c - a) * (c - b)),
+    ]
+    return found, (scaled * torch.stack(shares)[:, :, None, None, None]).sum(0)
 
 
 def without_division(pixels: Tensor, middle: Tensor, lam: Tensor, radius: float) -> Tensor:
