@@ -303,14 +303,11 @@ class _Terms:
         robust = None
         if self.weights is not None or self.loss is not None:
             squared = panel[..., -1, :, :].square().sum(-2)
-            weights, value = self.weights, squared
+            weights = torch.ones_like(squared) if self.weights is None else self.weights
             if self.loss is not None:
-                value, slope = self.loss.value(squared), self.loss.weight(squared)
-                weights = slope if weights is None else weights * slope
-            if self.loss is not None:
-                robust = (value if self.weights is None else value * self.weights).sum((-2, -1)) / 2
-            if weights is not None:
-                panel = panel * weights.sqrt()[:, :, None, None]
+                robust = (weights * self.loss.value(squared)).sum((-2, -1)) / 2
+                weights = weights * self.loss.weight(squared)
+            panel = panel * weights.sqrt()[:, :, None, None]
         rows = panel.flatten(-2)
         gram = rows @ rows.mT
         s = rows.shape[-2] - self.local_size - 1

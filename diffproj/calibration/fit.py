@@ -1,7 +1,7 @@
 """From a start to a calibration: solve, reject outliers, solve again, and say how it ended.
 
 Everything here works on P cameras side by side, batch axes flattened. `Task` holds what is to be minimised; `fit` runs
-the solver over it in blocks of cameras that stay in the processor's cache.
+the solver over it in blocks of cameras.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,8 @@ from diffproj.losses import Loss
 from diffproj.solver import Equations, Prior, Solution, chosen, solve
 
 BLOCK_CORNERS = 24_000
-"""Corners solved at once on a CPU, those of some thirty cameras of 13 views: enough to hide the cost of calls."""
+"""Corners solved at once on a CPU, those of some thirty cameras of 13 views: enough to hide the cost of calls, and few
+enough that a camera that takes long holds up few others."""
 ROUNDS = 10
 """Of rejecting outliers, at most."""
 NEGLIGIBLE_PX = 1e-11
