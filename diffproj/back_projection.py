@@ -37,7 +37,8 @@ from diffproj._numerics import (
     precise,
     rounding,
 )
-from diffproj.camera import Camera, as_camera, pixel_to_normalized
+from diffproj.camera import Camera, as_camera
+from diffproj.intrinsics import pixel_to_normalized
 from diffproj.plane import Plane
 
 

@@ -33,6 +33,7 @@ from diffproj._numerics import (
     transform,
 )
 from diffproj.interop import ArrayLike
+from diffproj.intrinsics import check_intrinsics, check_warp, pixel_to_normalized, warped
 from diffproj.lens import BrownConrady, KannalaBrandt, Lens
 
 ROTATION_TOLERANCE = 1e-5
@@ -98,7 +99,7 @@ class Camera:
                 f"distortion: want a lens such as dp.BrownConrady(coefficients), got {type(distortion).__name__}"
             )
         if readable(K, R, t):
-            _check_intrinsics(K)
+            check_intrinsics(K)
             _check_pose(R, t)
         self._assign(K, R, t, distortion, _checked_size(size))
 
@@ -215,6 +216,40 @@ class Camera:
         """The camera of the crop whose first pixel was pixel `(left, top)`: the principal point moves along."""
         shift = self.K.new_tensor([[0, 0, left], [0, 0, top], [0, 0, 0]])
         return self._with(K=self.K - shift, size=_checked_size((width, height)))
+
+    def warped(self, matrix: Float[Tensor, "*#batch 3 3"], size: tuple[int, int] | None = None) -> "Camera":
+        """The camera of the same image warped, as a geometric augmentation does: pixels `p` go to `matrix p`.
+
+        An affine matrix changes K alone: turned, mirrored, sheared, scaled and shifted images stay exact, behind a lens
+        too. A projective one also turns a pinhole; see `intrinsics.warped`. Gradients flow to the matrix.
+
+        Args:
+            matrix: `(*B, 3, 3)`, from pixels `(u, v, 1)` of this image to those of the warped one, up to a factor;
+                what Kornia's augmentations keep as `transform_matrix`.
+            size: `(width, height)` of the warped image; that of this one if left out.
+
+        Raises:
+            TypeError: no floating-point tensor, or another dtype than the camera's.
+            ValueError: wrong shape or device, no inverse, or a projective matrix for a camera with a lens.
+
+        Example:
+            >>> from kornia.augmentation import RandomHorizontalFlip
+            >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+            >>> camera = Camera(K, t=torch.tensor([0.0, 0, 1000]), size=(640, 480))
+            >>> flip = RandomHorizontalFlip(p=1.0)
+            >>> image = flip(torch.rand(1, 3, 480, 640))
+            >>> pixels, _ = camera.warped(flip.transform_matrix).project(torch.tensor([[100.0, 0, 0]]))
+            >>> pixels.tolist()  # 639 - 370
+            [[[269.0, 240.0]]]
+        """
+        matrix = check_tensor("matrix", matrix, 3, 3)
+        check_same_kind(camera=self.K, matrix=matrix)
+        broadcast_batches(camera=self.batch_shape, matrix=matrix.shape[:-2])
+        if readable(matrix):
+            check_warp(matrix, behind_lens=self.distortion is not None)
+        K, turn = warped(self.K, matrix)
+        R, t = (turn.unsqueeze(-1) * self.R.unsqueeze(-3)).sum(-2), dot(turn, self.t.unsqueeze(-2))
+        return self._with(K=K, R=R, t=t, size=_checked_size(size) or self.size)
 
     # ------------------------------------------------------------------------------------------- points and pixels
 
@@ -382,14 +417,6 @@ class Camera:
         return interop.pinhole_from_tensors(self.K, self.R, self.t, self.size)
 
 
-def pixel_to_normalized(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 2 2"]:
-    """The inverse of `F`: takes a pixel's offset from the principal point to the normalised plane."""
-    (a, b), (c, d) = K[..., 0, :2].unbind(-1), K[..., 1, :2].unbind(-1)
-    determinant = a * d - b * c
-    adjugate = torch.stack([torch.stack([d, -b], dim=-1), torch.stack([-c, a], dim=-1)], dim=-2)
-    return adjugate / determinant[..., None, None]
-
-
 def as_camera(camera: Camera | PinholeCamera) -> Camera:
     """A `Camera` as it is, Kornia's `PinholeCamera` converted.
 
@@ -418,18 +445,6 @@ def _checked_size(size: Any) -> tuple[int, int] | None:
     if len(size) != 2 or any(int(side) != side or side < 1 for side in size):
         raise ValueError(f"size: want (width, height) in whole pixels, got {size}")
     return int(size[0]), int(size[1])
-
-
-def _check_intrinsics(K: Tensor) -> None:
-    last_row = K.new_tensor([0.0, 0.0, 1.0])
-    if not bool(K.isfinite().all()):
-        raise ValueError("K: want finite values, got NaN or infinity")
-    if bool(((K[..., 2, :] - last_row).abs() > 1e-5).any()):
-        raise ValueError("K: want the last row (0, 0, 1), got another; divide by K[..., 2, 2]")
-    F = K[..., :2, :2]
-    determinant = F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0]
-    if bool((determinant.abs() <= 8 * torch.finfo(K.dtype).eps * F.square().sum(dim=(-2, -1))).any()):
-        raise ValueError("K: want an invertible matrix, got a singular one; are both focal lengths set?")
 
 
 def _check_pose(R: Tensor, t: Tensor) -> None:

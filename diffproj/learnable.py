@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from diffproj.back_projection import back_project
 from diffproj.board import Views
 from diffproj.camera import Camera, as_camera
+from diffproj.intrinsics import check_no_skew, focal_and_center, intrinsic_matrix
 from diffproj.lens import BrownConrady, KannalaBrandt
 from diffproj.plane import Plane
 
@@ -81,8 +82,7 @@ class LearnableCamera(nn.Module):
         lens = camera.distortion
         if lens is not None and not isinstance(lens, BrownConrady | KannalaBrandt):
             raise TypeError(f"camera: want a lens of diffproj, got {type(lens).__name__}")
-        if bool((camera.K[..., 0, 1] != 0).any() or (camera.K[..., 1, 0] != 0).any()):
-            raise ValueError("camera: want no skew, got K[..., 0, 1] or K[..., 1, 0] other than 0")
+        check_no_skew(camera.K)
         available = [part for part in PARTS if lens is not None or part != "distortion"]
         learn = tuple(available if learn is None else [learn] if isinstance(learn, str) else learn)
         unknown = [part for part in learn if part not in available]
@@ -91,7 +91,7 @@ class LearnableCamera(nn.Module):
         self.learn, self.size, self.batch_shape = learn, camera.size, camera.batch_shape
         self._lens = None if lens is None else type(lens)
         K = _once(camera.K, 2, one_camera)
-        focal, center = K.diagonal(dim1=-2, dim2=-1)[..., :2], K[..., :2, 2]
+        focal, center = focal_and_center(K).split(2, dim=-1)
         self.register_buffer("focal_0", focal.clone())
         self.register_buffer("principal_point_0", center.clone())
         self.register_buffer("R_0", camera.R.clone())
@@ -131,13 +131,7 @@ class LearnableCamera(nn.Module):
         """The camera as it is now, with the batch shape of the one it was made from."""
         focal = self.focal_0 * self.log_focal.exp()
         center = self.principal_point_0 + self.focal_0 * self.principal_point
-        bottom = torch.zeros_like(focal[..., :1])
-        rows = [
-            torch.cat([focal[..., :1], bottom, center[..., :1]], dim=-1),
-            torch.cat([bottom, focal[..., 1:], center[..., 1:]], dim=-1),
-            torch.cat([bottom, bottom, torch.ones_like(bottom)], dim=-1),
-        ]
-        K = torch.stack(rows, dim=-2).expand(*self.batch_shape, 3, 3)
+        K = intrinsic_matrix(focal, center).expand(*self.batch_shape, 3, 3)
         turn = axis_angle_to_rotation_matrix(self.rotation.reshape(-1, 3)).reshape(self.R_0.shape)
         # Elementwise, as everywhere: under autocast a matrix product would round the pose to 8 bits.
         R = (turn.unsqueeze(-1) * self.R_0.unsqueeze(-3)).sum(-2)

@@ -30,6 +30,7 @@ from diffproj.calibration.board_error import assembled
 from diffproj.calibration.covariance import finite
 from diffproj.calibration.reprojection import COEFFICIENTS, lens_model, moved
 from diffproj.camera import Camera, as_camera
+from diffproj.intrinsics import focal_and_center
 from diffproj.plane import Plane
 
 SIGNIFICANT = 3.0
@@ -309,7 +310,7 @@ def _projection_derivatives(points: Tensor, camera: Camera, known: Tensor | None
     batch = points.shape[:-2]
     model = lens_model(camera.distortion)
     K = camera.K.expand(*batch, 3, 3).reshape(-1, 3, 3)
-    parts = [K.diagonal(dim1=-2, dim2=-1)[:, :2], K[:, :2, 2]]
+    parts = [focal_and_center(K)]
     if camera.distortion is not None:
         coefficients: Tensor = camera.distortion.coefficients  # type: ignore[attr-defined]
         parts.append(coefficients.expand(*batch, coefficients.shape[-1]).reshape(len(K), -1))

@@ -18,6 +18,7 @@ from diffproj._numerics import check_tensor, precise
 from diffproj.back_projection import PlaneMap
 from diffproj.calibration import Calibration
 from diffproj.camera import Camera, as_camera
+from diffproj.intrinsics import focal_and_center
 from diffproj.learnable import PARTS, LearnableCamera
 from diffproj.losses import Loss
 from diffproj.plane import Plane
@@ -286,8 +287,7 @@ class CalibrationPrior(nn.Module):
         return (off * (self.precision * off.unsqueeze(-2)).sum(-1)).sum(-1) / 2
 
     def _vector(self, camera: Camera) -> Tensor:
-        K = precise(camera.K)
-        parts = [K.diagonal(dim1=-2, dim2=-1)[..., :2], K[..., :2, 2]]
+        parts = [focal_and_center(precise(camera.K))]
         if camera.distortion is not None:
             parts.append(precise(camera.distortion.coefficients))  # type: ignore[attr-defined]
         if self.posed:

@@ -9,7 +9,7 @@ PACKAGE = Path(diffproj.__file__).parent
 
 LEVELS = (
     ("_numerics", "_pytree", "_atomic"),
-    ("losses", "rotation", "interop", "lens"),
+    ("losses", "rotation", "interop", "intrinsics", "lens"),
     ("solver",),
     ("camera", "plane"),
     ("back_projection", "paper_route"),

@@ -15,6 +15,7 @@ from torch import Tensor
 from diffproj.back_projection import back_project
 from diffproj.calibration.reprojection import COEFFICIENTS, Reprojection, make_lens
 from diffproj.camera import Camera
+from diffproj.intrinsics import intrinsic_matrix
 from diffproj.plane import Plane
 from diffproj.solver import LocalState
 
@@ -50,15 +51,6 @@ def assembled(lens: str, shared: Tensor, local: LocalState) -> Camera:
     """Cameras `(P, V)` of shared parameters `(P, s)` and poses, without a look at the values."""
     R, t = local
     batch = R.shape[:-2]
-    f, c = shared[:, None, :2], shared[:, None, 2:4]
-    last = torch.zeros_like(c[..., :1])
-    K = torch.stack(
-        [
-            torch.cat([f[..., :1], last, c[..., :1]], dim=-1),
-            torch.cat([last, f[..., 1:], c[..., 1:]], dim=-1),
-            torch.cat([last, last, torch.ones_like(last)], dim=-1),
-        ],
-        dim=-2,
-    )
+    K = intrinsic_matrix(shared[:, None, :2], shared[:, None, 2:4])
     model = make_lens(lens, shared[:, None, 4 : 4 + COEFFICIENTS[lens]])  # type: ignore[arg-type, index]
     return Camera._unchecked(K.expand(*batch, 3, 3), R, t, None if model is None else model.expand(*batch), None)

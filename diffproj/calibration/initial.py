@@ -11,6 +11,7 @@ from diffproj.calibration.data import Data
 from diffproj.calibration.fit import ordinary
 from diffproj.calibration.reprojection import COEFFICIENTS, LensModel, lens_model
 from diffproj.camera import Camera
+from diffproj.intrinsics import check_no_skew, focal_and_center
 
 
 def from_camera(camera: Camera, data: Data, bow: bool) -> tuple[Tensor, tuple[Tensor, Tensor], LensModel]:
@@ -21,15 +22,14 @@ def from_camera(camera: Camera, data: Data, bow: bool) -> tuple[Tensor, tuple[Te
             f"camera: want the size of the photographs, {data.views.size}, got {camera.size}; see resized()"
         )
     camera = camera.detach().to(data.points.device, data.points.dtype)
-    if bool((camera.K[..., 0, 1] != 0).any() or (camera.K[..., 1, 0] != 0).any()):
-        raise ValueError("camera: want no skew, got K[..., 0, 1] or K[..., 1, 0] other than 0")
+    check_no_skew(camera.K)
     posed = len(camera.batch_shape) == len(data.batch) + 1
     intrinsics = camera[..., 0] if posed else camera
     try:
         if posed:
             camera = camera.at(camera.R.expand(*data.batch, len(data.views), 3, 3), camera.t)
         K = intrinsics.K.expand(*data.batch, 3, 3).reshape(-1, 3, 3)
-        parts = [K.diagonal(dim1=-2, dim2=-1)[:, :2], K[:, :2, 2]]
+        parts = [focal_and_center(K)]
         if intrinsics.distortion is not None:
             coefficients: Tensor = intrinsics.distortion.coefficients  # type: ignore[attr-defined]
             parts.append(coefficients.expand(*data.batch, -1).reshape(len(K), -1))
