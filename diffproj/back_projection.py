@@ -238,24 +238,21 @@ def _denominator(b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[T
 
 def _plane_matrix(camera: Camera, plane: Plane) -> Tensor:
     """`M (*B, 4, 3)` in float64, scaled to `max |M| = 1`; zero where the camera's centre lies in the plane."""
-    to_world = precise(camera.R).mT
-    if camera.distortion is None:
-        turned = (to_world[..., :2].unsqueeze(-1) * pixel_to_normalized(precise(camera.K)).unsqueeze(-3)).sum(dim=-2)
-        G = torch.cat([turned, to_world[..., 2:]], dim=-1)
-    else:
-        G = to_world
+    R, t = precise(camera.R), precise(camera.t)
     normal, offset = precise(plane.normal), precise(plane.offset)
-    center = -dot(to_world, precise(camera.t).unsqueeze(-2))
-    along = dot(normal, center)
-    height = offset - along
-    resting = rounding(camera.dtype) * (offset.abs() + (normal * center).abs().sum(dim=-1))
-    usable = height.abs() > resting
-    b = dot(G.mT, normal.unsqueeze(-2))
-    A = center.unsqueeze(-1) * b.unsqueeze(-2) + height[..., None, None] * G
+    b = dot(R, normal.unsqueeze(-2))  # the normal in the camera frame: n . C = -b . t
+    center = -dot(R.mT, t.unsqueeze(-2))
+    terms = b * t
+    height = offset + terms.sum(dim=-1)
+    resting = rounding(camera.dtype) * (offset.abs() + terms.abs().sum(dim=-1))
+    A = center.unsqueeze(-1) * b.unsqueeze(-2) + height[..., None, None] * R.mT
     M = torch.cat([A, b.unsqueeze(-2)], dim=-2)
+    if camera.distortion is None:
+        F_inverse = pixel_to_normalized(precise(camera.K))
+        M = torch.cat([(M[..., :2].unsqueeze(-1) * F_inverse.unsqueeze(-3)).sum(dim=-2), M[..., 2:]], dim=-1)
     # The factor changes no point, so no derivative has to pass through it.
-    factor = (torch.where(height < 0, -1.0, 1.0) / M.abs().amax(dim=(-2, -1))).detach()
-    return M * torch.where(usable, factor, 0.0)[..., None, None]
+    factor = M.detach().abs().amax(dim=(-2, -1)).reciprocal().copysign(height.detach())
+    return M * torch.where(height.detach().abs() > resting.detach(), factor, 0.0)[..., None, None]
 
 
 _pytree.register(PlaneMap, children=("matrix", "camera"), static=("is_per_point",))

@@ -15,13 +15,9 @@ def intrinsic_matrix(
     focal: Float[Tensor, "*batch 2"], center: Float[Tensor, "*batch 2"]
 ) -> Float[Tensor, "*batch 3 3"]:
     """K of focal lengths and principal point, in px."""
-    none = torch.zeros_like(focal[..., :1])
-    rows = [
-        torch.cat([focal[..., :1], none, center[..., :1]], dim=-1),
-        torch.cat([none, focal[..., 1:], center[..., 1:]], dim=-1),
-        torch.cat([none, none, torch.ones_like(none)], dim=-1),
-    ]
-    return torch.stack(rows, dim=-2)
+    (f_x, f_y), (c_x, c_y) = focal.unbind(-1), center.unbind(-1)
+    zero, one = torch.zeros_like(f_x), torch.ones_like(f_x)
+    return torch.stack([f_x, zero, c_x, zero, f_y, c_y, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
 
 
 def focal_and_center(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
@@ -31,10 +27,9 @@ def focal_and_center(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"
 
 def pixel_to_normalized(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 2 2"]:
     """The inverse of `F`: takes a pixel's offset from the principal point to the normalised plane."""
-    (a, b), (c, d) = K[..., 0, :2].unbind(-1), K[..., 1, :2].unbind(-1)
-    determinant = a * d - b * c
-    adjugate = torch.stack([torch.stack([d, -b], dim=-1), torch.stack([-c, a], dim=-1)], dim=-2)
-    return adjugate / determinant[..., None, None]
+    a, b, c, d = K[..., :2, :2].flatten(-2).unbind(-1)
+    determinant = torch.addcmul(a * d, b, c, value=-1)
+    return (torch.stack([d, -b, -c, a], dim=-1) / determinant.unsqueeze(-1)).unflatten(-1, (2, 2))
 
 
 def warped(

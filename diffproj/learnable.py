@@ -5,18 +5,20 @@ The parameters are chosen so that steps of one size mean much the same for each 
 * focal lengths through their logarithm, `f = f_0 exp(log_focal)`;
 * the principal point in units of the focal length, `c = c_0 + f_0 principal_point`;
 * the lens's coefficients as they are, `k = k_0 + distortion`;
-* poses on their manifold, `R = exp(rotation) R_0`, and `t = t_0 + |t_0| translation` (in world units where t_0 is 0).
+* poses on their manifold, `R = Q(rotation) R_0`, and `t = t_0 + |t_0| translation` (in world units where t_0 is 0).
+
+`Q(w)` turns about the axis w by `2 atan(|w| / 2)`: Cayley's map, which agrees with the rotation vector to second order
+and is rational, so that it costs little and all its derivatives are exact at 0.
 
 All are zero at first: the camera that the module was made from. What is not learned is a buffer, saved and moved along.
 """
 
-from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor, nn
 
 from diffproj.back_projection import back_project
@@ -28,6 +30,14 @@ from diffproj.plane import Plane
 
 PARTS = ("focal", "principal_point", "distortion", "pose")
 """What may be learned."""
+_PARAMETERS = {
+    "focal": ("log_focal",),
+    "principal_point": ("principal_point",),
+    "distortion": ("distortion",),
+    "pose": ("rotation", "translation"),
+}
+Learn = Sequence[str] | Mapping[str, Any]
+"""Parts to learn, or for each part the cameras whose it is, as booleans that broadcast to the batch shape."""
 
 
 @runtime_checkable
@@ -48,14 +58,16 @@ class LearnableCamera(nn.Module):
     Args:
         camera: the start. Its tensors are copied; its dtype and device are the module's.
         learn: which parts are learned, of `"focal"`, `"principal_point"`, `"distortion"` and `"pose"`; all that the
-            camera has if left out.
+            camera has if left out. A mapping says it for each camera of a batch: from a part to booleans that
+            broadcast to the batch shape.
         one_camera: whether the last batch axis counts poses of one camera, with one K and one lens. If left out, they
             do where the camera was only expanded over them, which is how `camera.at(R, t)` and calibrations make it; a
             change of dtype or picking by a list makes copies, and then it has to be said.
 
     Raises:
         TypeError: no camera, or one with a lens of another library.
-        ValueError: an unknown part, `"distortion"` of a pinhole, a K with skew, or `one_camera` of different ones.
+        ValueError: an unknown part, `"distortion"` of a pinhole, booleans that do not fit or that part what is one
+            parameter, a K with skew, or `one_camera` of different ones.
 
     Example:
         >>> import diffproj as dp
@@ -75,7 +87,7 @@ class LearnableCamera(nn.Module):
     """
 
     def __init__(
-        self, camera: Camera | PinholeCamera, learn: Sequence[str] | None = None, one_camera: bool | None = None
+        self, camera: Camera | PinholeCamera, learn: Learn | None = None, one_camera: bool | None = None
     ) -> None:
         super().__init__()
         camera = as_camera(camera).detach()
@@ -84,11 +96,8 @@ class LearnableCamera(nn.Module):
             raise TypeError(f"camera: want a lens of diffproj, got {type(lens).__name__}")
         check_no_skew(camera.K)
         available = [part for part in PARTS if lens is not None or part != "distortion"]
-        learn = tuple(available if learn is None else [learn] if isinstance(learn, str) else learn)
-        unknown = [part for part in learn if part not in available]
-        if unknown:
-            raise ValueError(f"learn: want parts of {', '.join(available)}, got {unknown[0]!r}")
-        self.learn, self.size, self.batch_shape = learn, camera.size, camera.batch_shape
+        chosen = learned_parts(available if learn is None else learn, available)
+        self.learn, self.size, self.batch_shape = tuple(chosen), camera.size, camera.batch_shape
         self._lens = None if lens is None else type(lens)
         K = _once(camera.K, 2, one_camera)
         focal, center = focal_and_center(K).split(2, dim=-1)
@@ -102,11 +111,10 @@ class LearnableCamera(nn.Module):
             focal[..., :0] if lens is None else _once(lens.expand(*self.batch_shape).coefficients, 1, one_camera)
         )
         self.register_buffer("coefficients_0", coefficients.clone())
-        self._own("log_focal", focal, "focal")
-        self._own("principal_point", center, "principal_point")
-        self._own("distortion", coefficients, "distortion")
-        self._own("rotation", camera.t, "pose")
-        self._own("translation", camera.t, "pose")
+        likes = {"focal": focal, "principal_point": center, "distortion": coefficients, "pose": camera.t}
+        for part, names in _PARAMETERS.items():
+            for name in names:
+                own(self, name, likes[part], chosen.get(part, False), self.batch_shape)
 
     focal_0: Tensor
     principal_point_0: Tensor
@@ -120,31 +128,83 @@ class LearnableCamera(nn.Module):
     rotation: Tensor
     translation: Tensor
 
-    def _own(self, name: str, like: Tensor, part: str) -> None:
-        zero = torch.zeros_like(like, memory_format=torch.contiguous_format)
-        if part in self.learn:
-            self.register_parameter(name, nn.Parameter(zero))
-        else:
-            self.register_buffer(name, zero)
-
     def forward(self) -> Camera:
         """The camera as it is now, with the batch shape of the one it was made from."""
-        focal = self.focal_0 * self.log_focal.exp()
-        center = self.principal_point_0 + self.focal_0 * self.principal_point
+        focal = self.focal_0 * learned(self, "log_focal").exp()
+        center = self.principal_point_0 + self.focal_0 * learned(self, "principal_point")
         K = intrinsic_matrix(focal, center).expand(*self.batch_shape, 3, 3)
-        turn = axis_angle_to_rotation_matrix(self.rotation.reshape(-1, 3)).reshape(self.R_0.shape)
-        # Elementwise, as everywhere: under autocast a matrix product would round the pose to 8 bits.
-        R = (turn.unsqueeze(-1) * self.R_0.unsqueeze(-3)).sum(-2)
-        t = self.t_0 + self.reach * self.translation
+        # Crosswise and elementwise: under autocast a matrix product would round the pose to 8 bits.
+        half = learned(self, "rotation").unsqueeze(-1) / 2
+        across = torch.linalg.cross(half, self.R_0, dim=-2)
+        across = across + torch.linalg.cross(half, across, dim=-2)
+        R = self.R_0 + across * (2 / (1 + half.square().sum(-2, keepdim=True)))
+        t = self.t_0 + self.reach * learned(self, "translation")
         lens = None
         if self._lens is not None:
-            lens = self._lens(self.coefficients_0 + self.distortion).expand(*self.batch_shape)
+            lens = self._lens(self.coefficients_0 + learned(self, "distortion")).expand(*self.batch_shape)
         return Camera._unchecked(K, R, t, lens, self.size)
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""
         lens = "pinhole" if self._lens is None else self._lens.__name__
         return f"batch_shape={tuple(self.batch_shape)}, {lens}, learn={self.learn}"
+
+
+def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
+    """From part to whether, or for which cameras, it is learned; parts that are learned nowhere are left out.
+
+    Raises:
+        ValueError: a part that is not available.
+    """
+    names = (learn,) if isinstance(learn, str) else tuple(learn)
+    unknown = [part for part in names if part not in available]
+    if unknown:
+        raise ValueError(f"learn: want parts of {', '.join(available)}, got {unknown[0]!r}")
+    wanted = {part: learn[part] for part in names} if isinstance(learn, Mapping) else dict.fromkeys(names, True)
+    return {part: where for part, where in wanted.items() if bool(torch.as_tensor(where).any())}
+
+
+def own(module: nn.Module, name: str, like: Tensor, where: Any, batch: torch.Size) -> None:
+    """Give a module zeros `(*B, k)` of a name: a parameter if it is learned, with a mask if not everywhere.
+
+    Args:
+        module: whose they are.
+        name: of the parameter or buffer; that of the mask is `NAME_learned`.
+        like: of the shape, dtype and device that it has; an axis of the batch along which it is one has length 1.
+        where: whether it is learned, or for which of the batch.
+        batch: the batch shape.
+
+    Raises:
+        ValueError: `where` does not broadcast to the batch, or differs along an axis along which this is one.
+    """
+    zero = torch.zeros_like(like, memory_format=torch.contiguous_format)
+    mask = torch.as_tensor(where, device=like.device)
+    if not bool(mask.any()):
+        module.register_buffer(name, zero)
+        return
+    module.register_parameter(name, nn.Parameter(zero))
+    if bool(mask.all()):
+        return
+    try:
+        mask = mask.bool().expand(batch)
+    except RuntimeError:
+        raise ValueError(
+            f"learn: want booleans that broadcast to the batch shape {tuple(batch)}, got shape {tuple(mask.shape)}"
+        ) from None
+    for axis, length in enumerate(like.shape[:-1]):
+        if length < mask.shape[axis]:
+            first = mask.narrow(axis, 0, 1)
+            if not bool((mask == first).all()):
+                raise ValueError(f"learn: want the same for all poses of one camera, got {mask.tolist()} for {name}")
+            mask = first
+    module.register_buffer(f"{name}_learned", mask.unsqueeze(-1).to(like.dtype))
+
+
+def learned(module: nn.Module, name: str) -> Tensor:
+    """What `own` made, zero where it is not learned."""
+    value: Tensor = getattr(module, name)
+    mask: Tensor | None = getattr(module, f"{name}_learned", None)
+    return value if mask is None else value * mask
 
 
 def image_residuals(

@@ -6,7 +6,7 @@ The projector's camera and plane may be learned along, whole or in parts; `Calib
 calibration says they are, as firmly as it knows. Geometry runs in the camera's own precision, under autocast too.
 """
 
-from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,7 +19,7 @@ from diffproj.back_projection import PlaneMap
 from diffproj.calibration import Calibration
 from diffproj.camera import Camera, as_camera
 from diffproj.intrinsics import focal_and_center
-from diffproj.learnable import PARTS, LearnableCamera
+from diffproj.learnable import PARTS, Learn, LearnableCamera, learned, learned_parts, own
 from diffproj.losses import Loss
 from diffproj.plane import Plane
 
@@ -34,6 +34,10 @@ class LearnablePlane(nn.Module):
         plane: the start.
         scale: the distance in world units by which a shift of 1 moves the plane; as far as it is from the camera makes
             steps of tilt and shift alike.
+        learn: whether it is learned, or which planes of the batch are: booleans that broadcast to its shape.
+
+    Raises:
+        ValueError: a plane for each point, or booleans that do not fit.
 
     Example:
         >>> learnable = LearnablePlane(Plane(torch.tensor([0.0, 0.0, 2.0]), torch.tensor(8.0)))
@@ -41,33 +45,37 @@ class LearnablePlane(nn.Module):
         (tensor(8., grad_fn=<MulBackward0>), ['tilt', 'shift'])
     """
 
-    normal_0: Tensor
-    offset_0: Tensor
+    unit_0: Tensor
+    distance_0: Tensor
+    length_0: Tensor
     tangents: Tensor
     scale: Tensor
+    tilt: Tensor
+    shift: Tensor
 
-    def __init__(self, plane: Plane, scale: float = 1.0) -> None:
+    def __init__(self, plane: Plane, scale: float = 1.0, learn: Any = True) -> None:
         super().__init__()
         if plane.is_per_point:
             raise ValueError("plane: want one plane for all points, got one for each (Plane.per_point)")
         normal, offset = plane.normal.detach(), plane.offset.detach()
+        length = normal.norm(dim=-1)
         self.register_buffer("scale", torch.as_tensor(scale).to(normal))
-        self.register_buffer("normal_0", normal.clone())
-        self.register_buffer("offset_0", offset.clone())
+        self.register_buffer("length_0", length)
+        self.register_buffer("unit_0", normal / length.unsqueeze(-1))
+        self.register_buffer("distance_0", offset / length)
         smallest = nn.functional.one_hot(normal.abs().argmin(-1), 3).to(normal)
         first = nn.functional.normalize(torch.linalg.cross(normal, smallest), dim=-1)
         second = nn.functional.normalize(torch.linalg.cross(normal, first), dim=-1)
         self.register_buffer("tangents", torch.stack([first, second], dim=-1))
-        self.tilt = nn.Parameter(torch.zeros_like(self.tangents[..., 0, :]))
-        self.shift = nn.Parameter(torch.zeros_like(offset))
+        own(self, "tilt", self.tangents[..., 0, :], learn, plane.batch_shape)
+        own(self, "shift", offset.unsqueeze(-1), learn, plane.batch_shape)
 
     def forward(self) -> Plane:
         """The plane as it is now."""
-        length = self.normal_0.norm(dim=-1, keepdim=True)
-        turned = self.normal_0 / length + (self.tangents * self.tilt.unsqueeze(-2)).sum(-1)
-        normal = turned * (length / turned.norm(dim=-1, keepdim=True))
-        length = length.squeeze(-1)
-        return Plane._unchecked(normal, length * (self.offset_0 / length + self.scale * self.shift))
+        turned = self.unit_0 + (self.tangents * learned(self, "tilt").unsqueeze(-2)).sum(-1)
+        normal = turned * (self.length_0 / turned.norm(dim=-1)).unsqueeze(-1)
+        distance = self.distance_0 + self.scale * learned(self, "shift").squeeze(-1)
+        return Plane._unchecked(normal, self.length_0 * distance)
 
 
 class PlaneProjector(nn.Module):
@@ -77,7 +85,8 @@ class PlaneProjector(nn.Module):
         camera: at its pose, of batch shape `*B`, or Kornia's `PinholeCamera`.
         plane: the plane, of batch shape `*B`.
         learn: what is learned along: any of `"focal"`, `"principal_point"`, `"distortion"`, `"pose"` and `"plane"`;
-            nothing if left out, and then the map is built once.
+            nothing if left out, and then the map is built once. A mapping says it for each camera of a batch, as for
+            `LearnableCamera`: `{"focal": True, "pose": torch.tensor([True, False])}`.
 
     Raises:
         TypeError: no camera or no plane, or different dtypes.
@@ -91,28 +100,20 @@ class PlaneProjector(nn.Module):
         ([[100.0, 0.0, 0.0]], ['_camera.log_focal', '_camera.rotation', '_camera.translation'])
     """
 
-    _matrix: Tensor
-
-    def __init__(self, camera: Camera | PinholeCamera, plane: Plane, learn: Sequence[str] = ()) -> None:
+    def __init__(self, camera: Camera | PinholeCamera, plane: Plane, learn: Learn = ()) -> None:
         super().__init__()
         camera = as_camera(camera).detach()
-        learn = (learn,) if isinstance(learn, str) else tuple(learn)
-        unknown = [part for part in learn if part not in (*PARTS, "plane")]
-        if unknown:
-            raise ValueError(f"learn: want parts of {', '.join((*PARTS, 'plane'))}, got {unknown[0]!r}")
-        matrix = PlaneMap(camera, plane).matrix  # checks that they fit together
+        PlaneMap(camera, plane)  # checks that they fit together
         plane = plane.like(camera.K)
-        self.learn = learn
-        self._camera = LearnableCamera(camera, [part for part in learn if part != "plane"])
+        chosen = learned_parts(learn, (*PARTS, "plane"))
+        self.learn = tuple(chosen)
+        whole = chosen.pop("plane", False)
+        self._camera = LearnableCamera(camera, chosen)
         away = ((plane.normal * camera.center).sum(-1) - plane.offset).abs() / plane.normal.norm(dim=-1)
-        self._plane = LearnablePlane(plane, scale=float(away.mean()))
-        if "plane" not in learn:
-            self._plane.requires_grad_(False)
-            for name in ("tilt", "shift"):
-                value = getattr(self._plane, name).detach()
-                delattr(self._plane, name)
-                self._plane.register_buffer(name, value)
-        self.register_buffer("_matrix", matrix if not learn else matrix[..., :0], persistent=False)
+        self._plane = LearnablePlane(plane, float(away.mean()), whole)
+        self._built: PlaneMap | None = None
+        self._rebuild()
+        self.register_load_state_dict_post_hook(_rebuild)
 
     @property
     def camera(self) -> Camera:
@@ -125,22 +126,30 @@ class PlaneProjector(nn.Module):
         return self._plane()
 
     def map(self) -> PlaneMap:
-        """The map as it is now; for a frozen projector it costs nothing to get."""
-        camera = self._camera()
-        return PlaneMap(camera, self._plane()) if self.learn else PlaneMap._unchecked(self._matrix, camera, False)
+        """The map as it is now; a frozen projector has it ready."""
+        return PlaneMap(self._camera(), self._plane()) if self._built is None else self._built
 
     def forward(
-        self, pixels: Float[Tensor, "*#batch n 2"]
+        self, pixels: Float[Tensor, "*#batch n 2"], warp: Float[Tensor, "*#batch 3 3"] | None = None
     ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
-        """Points `(*B, N, 3)` and `valid (*B, N)` of pixels `(*B, N, 2)`; see `back_project`."""
-        with torch.autocast(self._matrix.device.type, enabled=False):
-            return self.map()(pixels)
+        """Points on the plane.
 
-    def load_state_dict(self, state_dict: dict, strict: bool = True, assign: bool = False):  # type: ignore[override]
-        """As every module; a frozen map is built anew."""
-        result = super().load_state_dict(state_dict, strict, assign)
-        self._rebuild()
-        return result
+        Args:
+            pixels: `(*B, N, 2)`.
+            warp: how the image that they belong to was warped, from the camera's own pixels: `(*B, 3, 3)`, what
+                Kornia's augmentations keep as `transform_matrix`; see `Camera.warped`.
+
+        Returns:
+            Points `(*B, N, 3)` and `valid (*B, N)`; see `back_project`.
+
+        Raises:
+            TypeError: no floating-point tensors, or others than the camera's dtype.
+            ValueError: shapes or devices that do not fit, or a warp that `Camera.warped` refuses.
+        """
+        with torch.autocast(self._camera.t_0.device.type, enabled=False):
+            if warp is None:
+                return self.map()(pixels)
+            return PlaneMap(self.camera.warped(warp), self.plane)(pixels)
 
     def _apply(self, fn, recurse: bool = True):  # type: ignore[override]
         super()._apply(fn, recurse)
@@ -150,11 +159,16 @@ class PlaneProjector(nn.Module):
     def _rebuild(self) -> None:
         if not self.learn:
             with torch.no_grad():
-                self._matrix = PlaneMap(self._camera(), self._plane()).matrix
+                self._built = PlaneMap(self._camera(), self._plane())
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""
         return f"learn={self.learn}"
+
+
+def _rebuild(projector: PlaneProjector, _: Any) -> None:
+    """Called behind `load_state_dict`, of the projector itself or of a network that it is part of."""
+    projector._rebuild()
 
 
 class PlaneLoss(nn.Module):

@@ -86,6 +86,27 @@ def test_saved_moved_and_copied(
     assert torch.equal(torch.load(stream, weights_only=False)(pixels)[0], want)
 
 
+def test_a_network_loads_its_frozen_projector(lens_camera: dp.Camera, pixels: torch.Tensor, plane: dp.Plane) -> None:
+    network, other = (
+        torch.nn.ModuleDict({"to_plane": dp.PlaneProjector(camera, plane)})
+        for camera in (lens_camera, lens_camera.at(lens_camera.R, lens_camera.t + 50))
+    )
+    other.load_state_dict(network.state_dict())
+    assert torch.equal(other["to_plane"](pixels)[0], network["to_plane"](pixels)[0])
+
+
+def test_planes_of_a_batch_learn_one_by_one(camera: dp.Camera, pixels: torch.Tensor) -> None:
+    planes = dp.Plane.z(torch.tensor([0.0, 30, 60], dtype=D))
+    projector = dp.PlaneProjector(camera, planes, {"plane": torch.tensor([False, True, False])})
+    points, _ = projector(pixels)
+    points.square().sum().backward()
+    with torch.no_grad():
+        for parameter in projector.parameters():
+            parameter -= 1e-9 * parameter.grad
+    moved = (projector(pixels)[0] != points).flatten(1).any(-1)
+    assert moved.tolist() == [False, True, False]
+
+
 def test_geometry_keeps_its_precision_under_autocast(lens_camera: dp.Camera, pixels: torch.Tensor) -> None:
     camera = lens_camera.to(torch.float32)
     for learn in ((), EVERY):

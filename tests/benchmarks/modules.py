@@ -60,20 +60,17 @@ def main() -> None:
         pixels = torch.rand(10**5, 2) * torch.tensor([640.0, 480])
         bare = dp.PlaneMap(camera(lens), board)
         took = compared({"bare": lambda: bare(pixels), "frozen": lambda: frozen(pixels)})  # noqa: B023
-        print(f"{name}, 10^5 points: frozen projector {took['frozen'] / took['bare']:.2f} x the bare map", end=", ")
         rebuilt = compared({"map": learned.map})["map"]
-        print(f"a learnable one rebuilds its map in {1e3 * rebuilt:.2f} ms", end=", ")
 
         def step() -> None:
             inputs = pixels.requires_grad_()  # noqa: B023
-            points, valid = learned(inputs)  # noqa: B023
+            points, _ = learned(inputs)  # noqa: B023
             points.backward(torch.ones_like(points))
 
-        step()
-        output = 12 * len(pixels)
-        for p in (pixels, *learned.parameters()):
-            p.grad = None
-        print(f"forward and backward peak at {peak_bytes(step) / output:.1f} x the output")
+        peak = peak_bytes(step) / (12 * len(pixels))
+        print(f"{name}, 10^5 points: frozen projector {took['frozen'] / took['bare']:.2f} x the bare map")
+        print(f"{name}: a learnable projector rebuilds its map in {1e3 * rebuilt:.2f} ms")
+        print(f"{name}, 10^5 points: forward and backward peak at {peak:.1f} x the output")
 
 
 if __name__ == "__main__":
