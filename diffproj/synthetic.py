@@ -1,12 +1,12 @@
 """Board photographs and corner sets with known truth: the paper's set-up, rendered through the package's own kernel.
 
-A photograph is rendered by asking the question that back-projection answers: each sample of the pixel grid goes to the
-board's plane, where the chessboard says whether it is black or white. Averaging samples gives anti-aliased edges; a
-Gaussian blur stands for the optics and Gaussian noise for the sensor.
+A photograph is the board's print, `board_texture`, seen by `diffproj.render`: each pixel asks the question that
+back-projection answers. Vignetting and a Gaussian blur stand for the optics, Gaussian noise for the sensor.
 """
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, UInt8
@@ -14,11 +14,13 @@ from kornia.filters import gaussian_blur2d
 from kornia.geometry.grid import create_meshgrid
 from torch import Tensor
 
-from diffproj.back_projection import PlaneMap
+from diffproj._numerics import transform
 from diffproj.board import Chessboard, Views
 from diffproj.camera import Camera
+from diffproj.intrinsics import pixel_to_normalized
 from diffproj.lens import Lens
 from diffproj.plane import Plane
+from diffproj.rectification import render
 from diffproj.rotation import rotation_from_euler
 
 TEST_VIEWS = ("a", "b", "c", "d", "e")
@@ -90,13 +92,57 @@ def paper_setup(distortion: Lens | None = None) -> PaperSetup:
     return PaperSetup(board, _at_poses(camera, board, _FIT_POSES), _at_poses(camera, board, _TEST_POSES))
 
 
+class Texture(NamedTuple):
+    """What is printed on a plane, as `diffproj.render` takes it.
+
+    Attributes:
+        image: grey values `(1, rows, columns)` in 0..1.
+        extent: `(s_min, t_min, s_max, t_max)` in world units.
+        axes: `(origin, axis_s, axis_t)`, each `(3,)`.
+    """
+
+    image: Float[Tensor, "1 rows columns"]
+    extent: tuple[float, float, float, float]
+    axes: tuple[Tensor, Tensor, Tensor]
+
+
+def board_texture(board: Chessboard, texels: int = 32) -> Texture:
+    """The board as it is printed on z = 0, s to the right along its rows and t down along its columns.
+
+    One square of white paper surrounds the printed squares, and one square of table the paper.
+
+    Args:
+        board: in either frame.
+        texels: along the side of a square; edges fall between them.
+
+    Example:
+        >>> import diffproj as dp
+        >>> texture = board_texture(dp.Chessboard(columns=4, rows=3, square=10.0), texels=2)
+        >>> texture.image.shape, texture.extent
+        (torch.Size([1, 16, 18]), (-30.0, -30.0, 60.0, 50.0))
+    """
+    if texels < 1:
+        raise ValueError(f"texels: want at least 1 along a square, got {texels}")
+    # Squares by number: 0 lies behind the first inner corner.
+    row, column = (torch.arange(-3, count + 2) for count in (board.rows, board.columns))
+    row = row.unsqueeze(-1)
+    printed = (row >= -1) & (row < board.rows) & (column >= -1) & (column < board.columns)
+    paper = (row >= -2) & (row <= board.rows) & (column >= -2) & (column <= board.columns)
+    grey = torch.where(paper, torch.where(printed & ((row + column) % 2 == 0), BLACK, WHITE), TABLE)
+    low, side = -3 * board.square, board.square
+    extent = (low, low, (board.columns + 2) * side, (board.rows + 2) * side)
+    x, y = torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0])
+    axes = (torch.zeros(3), y, x) if board.axes == "paper" else (torch.zeros(3), x, y)
+    return Texture(grey.repeat_interleave(texels, 0).repeat_interleave(texels, 1)[None], extent, axes)
+
+
 def photograph(
     camera: Camera,
     board: Chessboard,
     *,
     blur_px: float = 0.7,
     noise: float = 4 / 255,
-    samples: int = 12,
+    vignetting: float = 0.3,
     seed: int = 0,
 ) -> UInt8[Tensor, "*batch h w"]:
     """Render grey photographs of a board that lies on z = 0.
@@ -106,7 +152,8 @@ def photograph(
         board: the board; one square of white paper surrounds the printed squares.
         blur_px: standard deviation of the optics' Gaussian blur in pixels; 0 for none.
         noise: standard deviation of the sensor's noise, in units of the full range.
-        samples: samples a pixel, whose mean it is.
+        vignetting: how much of the law of natural vignetting the image shows: 1 for light that falls off with the
+            fourth power of the cosine of the angle from the axis, 0 for an even image.
         seed: of the noise.
 
     Returns:
@@ -122,15 +169,18 @@ def photograph(
     """
     if camera.size is None:
         raise ValueError("camera: want a size, got None; give Camera(..., size=(width, height))")
-    if blur_px < 0 or noise < 0 or samples < 1:
-        raise ValueError(
-            f"photograph: want blur_px >= 0, noise >= 0 and samples >= 1, got {blur_px}, {noise} and {samples}"
-        )
+    if blur_px < 0 or noise < 0 or not 0 <= vignetting <= 1:
+        given = f"{blur_px}, {noise} and {vignetting}"
+        raise ValueError(f"photograph: want blur_px >= 0, noise >= 0 and vignetting from 0 to 1, got {given}")
     generator = torch.Generator().manual_seed(seed)
     cameras = [camera] if not camera.batch_shape else [camera[i] for i in _indices(camera.batch_shape)]
     images = []
     for single in cameras:
-        image = _render(single.detach().to("cpu"), board, samples)
+        # In float32, right to 1e-6 of the scene: a thousandth of a pixel.
+        single = single.detach().to("cpu", torch.float32)
+        texture = board_texture(board, _texels(single, board))
+        shown, seen = render(texture.image, single, Plane.z(0.0), texture.extent, axes=texture.axes)
+        image = torch.where(seen, shown[0], TABLE) * (1 - vignetting * (1 - _falloff(single)))
         if blur_px > 0:
             kernel = 2 * round(4 * blur_px) + 1
             image = gaussian_blur2d(image[None, None], (kernel, kernel), (blur_px, blur_px))[0, 0]
@@ -246,29 +296,21 @@ def _at_poses(camera: Camera, board: Chessboard, poses: tuple[tuple[float, ...],
     return camera.at(R, table[:, 3:] - R @ center)
 
 
-def _render(camera: Camera, board: Chessboard, samples: int) -> Float[Tensor, "h w"]:
-    """The noiseless image of one camera: each pixel the mean of samples spread over its square."""
+def _texels(camera: Camera, board: Chessboard) -> int:
+    """Texels along a square, about two for each pixel where the board is nearest."""
+    pixels, valid = camera.project(board.points.to(camera.dtype))
+    pixels = torch.where(valid.unsqueeze(-1), pixels, torch.nan).reshape(board.rows, board.columns, 2)
+    sides = torch.cat([pixels.diff(dim=axis).norm(dim=-1).flatten() for axis in (0, 1)])
+    longest = sides[sides.isfinite()]
+    return min(256, max(8, math.ceil(2 * float(longest.amax())))) if len(longest) else 8
+
+
+def _falloff(camera: Camera) -> Float[Tensor, "h w"]:
+    """The fourth power of the cosine of the angle under which light meets the sensor, `1 / (1 + r^2)^2`."""
     width, height = camera.size or (0, 0)
-    grid = create_meshgrid(height, width, normalized_coordinates=False).reshape(-1, 2)
-    to_board = PlaneMap(camera.to(torch.float32), Plane.z(0.0))  # right to 1e-6 of the scene: a thousandth of a pixel
-    # Samples lie on a lattice where no two share a row or column: a grid of 5 x 5 would place an upright edge no better
-    # than to a fifth of a pixel.
-    lattice = torch.arange(samples, dtype=torch.float64).unsqueeze(-1) * torch.tensor([0.754877666, 0.569840291]) % 1
-    image = torch.zeros(height * width)
-    for offset in (lattice - lattice.mean(dim=0)).to(grid):
-        points, valid = to_board(grid + offset)
-        image += torch.where(valid, _grey(points, board), TABLE)
-    return (image / samples).reshape(height, width)
-
-
-def _grey(points: Float[Tensor, "n 3"], board: Chessboard) -> Float[Tensor, " n"]:
-    """What the board shows at points of its plane; the square beyond the first inner corner is black."""
-    along = points[..., :2] / board.square
-    row, column = along.unbind(-1) if board.axes == "paper" else along.flip(-1).unbind(-1)
-    black = (row.floor() + column.floor()) % 2 == 0
-    printed = (row > -1) & (row < board.rows) & (column > -1) & (column < board.columns)
-    paper = (row > -2) & (row < board.rows + 1) & (column > -2) & (column < board.columns + 1)
-    return torch.where(paper, torch.where(printed & black, BLACK, WHITE), TABLE)
+    pixels = create_meshgrid(height, width, normalized_coordinates=False, dtype=camera.dtype).reshape(-1, 2)
+    xy = transform(pixel_to_normalized(camera.K), pixels - camera.K[:2, 2])
+    return (1 + xy.square().sum(-1)).reshape(height, width) ** -2
 
 
 def _indices(shape: torch.Size) -> list[tuple[int, ...]]:

@@ -1,8 +1,8 @@
 """Warped images: `Camera.warped` and `PlaneProjector(pixels, warp)` with the matrices of Kornia's augmentations."""
 
-from kornia import augmentation
 import pytest
 import torch
+from kornia import augmentation
 from kornia.geometry.transform import get_perspective_transform
 
 import diffproj as dp

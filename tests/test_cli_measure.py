@@ -26,7 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tilted photograph of an 8 x 5 board, one without a board, and the camera in each kind of file."""
     folder = tmp_path_factory.mktemp("measure")
     setup, board = synthetic.paper_setup(), dp.Chessboard(8, 5, 25.0, axes="paper")
-    photograph = synthetic.photograph(setup.test[3], board, samples=3).numpy()
+    photograph = synthetic.photograph(setup.test[3], board).numpy()
     cv2.imwrite(str(folder / "photo.png"), photograph)
     cv2.imwrite(str(folder / "small.png"), photograph[:, :600])
     cv2.imwrite(str(folder / "empty.png"), np.full((480, 640), 90, np.uint8))

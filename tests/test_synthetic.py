@@ -39,7 +39,7 @@ def test_detected_corners_are_where_they_were_rendered(distortion: tuple[float, 
 def test_brightness_and_noise() -> None:
     setup = synthetic.paper_setup()
     camera = setup.test[0]
-    clean = synthetic.photograph(camera, setup.board, noise=0.0, blur_px=0.0)
+    clean = synthetic.photograph(camera, setup.board, noise=0.0, blur_px=0.0, vignetting=0.0)
     assert clean.dtype == torch.uint8
     assert clean.shape == (480, 640)
     assert clean[0, 0].item() == round(synthetic.TABLE * 255)
@@ -48,12 +48,37 @@ def test_brightness_and_noise() -> None:
     )  # square (0, 0), the next, margin
     u, v = camera.project(inside)[0].round().long().unbind(-1)
     assert clean[v, u].tolist() == [round(g * 255) for g in (synthetic.BLACK, synthetic.WHITE, synthetic.WHITE)]
-    noisy = synthetic.photograph(camera, setup.board, noise=0.02, blur_px=0.0, seed=1)
-    assert torch.equal(noisy, synthetic.photograph(camera, setup.board, noise=0.02, blur_px=0.0, seed=1))
+    noisy = synthetic.photograph(camera, setup.board, noise=0.02, blur_px=0.0, vignetting=0.0, seed=1)
+    assert torch.equal(
+        noisy, synthetic.photograph(camera, setup.board, noise=0.02, blur_px=0.0, vignetting=0.0, seed=1)
+    )
     table = noisy[:10].double() / 255
     assert table.std().item() == pytest.approx(0.02, rel=0.05)
-    blurred = synthetic.photograph(camera, setup.board, noise=0.0)
+    blurred = synthetic.photograph(camera, setup.board, noise=0.0, vignetting=0.0)
     assert blurred.int().diff().abs().max() < 0.7 * clean.int().diff().abs().max()
+
+
+def test_the_corners_of_the_image_are_darker() -> None:
+    setup = synthetic.paper_setup()
+    even, shaded = (synthetic.photograph(setup.test[0], setup.board, noise=0.0, vignetting=v) for v in (0.0, 1.0))
+    offset = torch.tensor([[0.0, 0]], dtype=D) - setup.test.K[0, :2, 2]
+    angle = (offset / 701).norm().atan()
+    assert shaded[0, 0] / 255 == pytest.approx(synthetic.TABLE * float(angle.cos() ** 4), abs=0.004)
+    assert shaded[238, 322] == even[238, 322]
+
+
+@pytest.mark.parametrize("axes", ["opencv", "paper"])
+def test_a_texture_shows_the_board_in_its_frame(axes: str) -> None:
+    board = dp.Chessboard(columns=4, rows=3, square=10.0, axes=axes)
+    image, extent, (origin, s, t) = synthetic.board_texture(board, texels=4)
+    assert (origin == 0).all()
+    texel = (extent[2] - extent[0]) / image.shape[2]
+    assert texel == (extent[3] - extent[1]) / image.shape[1] == 2.5
+    for k, corner in enumerate(board.points.to(s)):  # four squares meet there, two of them black
+        column, row = (round(float(corner @ axis) / texel + 12) for axis in (s, t))
+        around = image[0, row - 1 : row + 1, column - 1 : column + 1]
+        even, odd = (synthetic.BLACK, synthetic.WHITE)[:: 1 if (k // 4 + k % 4) % 2 == 0 else -1]
+        torch.testing.assert_close(around, torch.tensor([[even, odd], [odd, even]]))
 
 
 def test_batches_of_photographs() -> None:
@@ -80,7 +105,9 @@ def test_errors() -> None:
     camera = dp.Camera(setup.fit.K[0])
     with pytest.raises(ValueError, match="camera: want a size"):
         synthetic.photograph(camera, setup.board)
-    with pytest.raises(ValueError, match="samples >= 1"):
-        synthetic.photograph(setup.fit[0], setup.board, samples=0)
+    with pytest.raises(ValueError, match="vignetting from 0 to 1"):
+        synthetic.photograph(setup.fit[0], setup.board, vignetting=2.0)
+    with pytest.raises(ValueError, match="texels: want at least 1"):
+        synthetic.board_texture(setup.board, 0)
     with pytest.raises(ValueError, match="batch of views"):
         synthetic.corner_views(camera, setup.board)
