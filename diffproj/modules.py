@@ -130,7 +130,10 @@ class PlaneProjector(nn.Module):
         return PlaneMap(self._camera(), self._plane()) if self._built is None else self._built
 
     def forward(
-        self, pixels: Float[Tensor, "*#batch n 2"], warp: Float[Tensor, "*#batch 3 3"] | None = None
+        self,
+        pixels: Float[Tensor, "*#batch n 2"],
+        warp: Float[Tensor, "*#batch 3 3"] | None = None,
+        plane: Plane | None = None,
     ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
         """Points on the plane.
 
@@ -138,6 +141,7 @@ class PlaneProjector(nn.Module):
             pixels: `(*B, N, 2)`.
             warp: how the image that they belong to was warped, from the camera's own pixels: `(*B, 3, 3)`, what
                 Kornia's augmentations keep as `transform_matrix`; see `Camera.warped`.
+            plane: of these samples, in place of the projector's own.
 
         Returns:
             Points `(*B, N, 3)` and `valid (*B, N)`; see `back_project`.
@@ -147,9 +151,10 @@ class PlaneProjector(nn.Module):
             ValueError: shapes or devices that do not fit, or a warp that `Camera.warped` refuses.
         """
         with torch.autocast(self._camera.t_0.device.type, enabled=False):
-            if warp is None:
+            if warp is None and plane is None:
                 return self.map()(pixels)
-            return PlaneMap(self.camera.warped(warp), self.plane)(pixels)
+            camera = self.camera if warp is None else self.camera.warped(warp)
+            return PlaneMap(camera, self.plane if plane is None else plane)(pixels)
 
     def _apply(self, fn, recurse: bool = True):  # type: ignore[override]
         super()._apply(fn, recurse)

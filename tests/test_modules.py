@@ -86,6 +86,15 @@ def test_saved_moved_and_copied(
     assert torch.equal(torch.load(stream, weights_only=False)(pixels)[0], want)
 
 
+@pytest.mark.parametrize("learn", [(), ("pose",)])
+def test_samples_bring_planes_of_their_own(learn: tuple[str, ...], camera: dp.Camera, pixels: torch.Tensor) -> None:
+    planes = dp.Plane.z(torch.tensor([0.0, 30, 60], dtype=D))
+    points, valid = dp.PlaneProjector(camera, dp.Plane.z(0.0), learn)(pixels, plane=planes)
+    want, seen = dp.back_project(pixels, camera, planes)
+    torch.testing.assert_close(points, want)
+    assert torch.equal(valid, seen)
+
+
 def test_a_network_loads_its_frozen_projector(lens_camera: dp.Camera, pixels: torch.Tensor, plane: dp.Plane) -> None:
     network, other = (
         torch.nn.ModuleDict({"to_plane": dp.PlaneProjector(camera, plane)})
