@@ -83,13 +83,18 @@ def accuracy(found: AccuracyMap, unit: str = "world units") -> Figure:
         if 0 < float(covered.mean()) < 1:
             axes.contour(u, v, covered, levels=[0.5], colors="white", linewidths=1.2)
         axes.set_title(title, fontsize=10)
+        axes.set_xlabel("u, px", labelpad=1, fontsize=9)
+        axes.set_ylabel("v, px", labelpad=1, fontsize=9)
         axes.set_aspect("equal")
         axes.set_xlim(float(u.min()), float(u.max()))
         axes.set_ylim(float(v.max()), float(v.min()))
         axes.tick_params(labelsize=8)
         bar = figure.colorbar(image, ax=axes, shrink=0.85)
         bar.ax.yaxis.set_major_formatter("{x:g}")
-        bar.ax.yaxis.set_minor_formatter("{x:g}" if known.size and known.max() < 10 * known.min() else "")
+        bar.ax.yaxis.set_minor_formatter("")
+        if known.size and known.max() < 10 * known.min():  # hardly any power of ten lies in there
+            marks = (m * 10.0**e for e in range(-9, 9) for m in (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9))
+            bar.set_ticks([mark for mark in marks if known.min() <= mark <= known.max()], minor=False)
         bar.ax.tick_params(labelsize=8, which="both")
     return figure
 

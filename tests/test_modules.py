@@ -157,12 +157,17 @@ def test_loss_counts_what_is_valid() -> None:
     assert (gradient[~valid] == 0).all()
 
 
-def test_invalid_pixels_change_no_gradient_of_the_others(lens_camera: dp.Camera, pixels: torch.Tensor) -> None:
-    projector = dp.PlaneProjector(lens_camera, dp.Plane.z(0.0), EVERY)
-    target = torch.zeros(len(pixels), 3, dtype=D)
+@pytest.mark.parametrize("dtype", [torch.float32, D])
+@pytest.mark.parametrize("behind_lens", [False, True])
+def test_invalid_pixels_change_no_gradient_of_the_others(
+    behind_lens: bool, dtype: torch.dtype, camera: dp.Camera, lens_camera: dp.Camera, pixels: torch.Tensor
+) -> None:
+    projector = dp.PlaneProjector((lens_camera if behind_lens else camera).to(dtype), dp.Plane.z(0.0), "pose")
+    pixels = pixels.to(dtype)
+    target = torch.zeros(len(pixels), 3, dtype=dtype)
     broken = torch.rand(len(pixels)) < 0.3
     wrong = pixels.clone()
-    wrong[broken] = torch.tensor([torch.inf, 1e9], dtype=D)
+    wrong[broken] = torch.tensor([torch.inf, 1e9], dtype=dtype)
 
     def gradient(pixels: torch.Tensor) -> torch.Tensor:
         pixels = pixels.clone().requires_grad_()
@@ -170,6 +175,7 @@ def test_invalid_pixels_change_no_gradient_of_the_others(lens_camera: dp.Camera,
         return torch.autograd.grad(dp.PlaneLoss(dp.Huber(10.0))(points, target, valid), pixels)[0]
 
     assert torch.equal(gradient(pixels)[~broken], gradient(wrong)[~broken])
+    assert (gradient(pixels)[broken] != 0).all()
     assert (gradient(wrong)[broken] == 0).all()
 
 
@@ -232,43 +238,62 @@ def test_joint_training_finds_the_camera() -> None:
     assert (projector.camera.K[0, 0, 0] / truth.K[0, 0, 0] - 1).abs() < 0.005
 
 
-def _worker(rank: int, address: str, result: str) -> None:
-    torch.distributed.init_process_group("gloo", init_method=f"file://{address}", rank=rank, world_size=2)
+def _gradients(device: str) -> tuple[torch.nn.Module, torch.Tensor]:
+    """A projector, and pixels for two processes."""
     torch.manual_seed(0)
     K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=D)
-    projector = dp.PlaneProjector(
-        dp.Camera(K, t=torch.tensor([0.0, 0, 1000], dtype=D)), dp.Plane.z(0.0), ("focal", "pose")
-    )
+    camera = dp.Camera(K, t=torch.tensor([0.0, 0, 1000], dtype=D))
+    projector = dp.PlaneProjector(camera, dp.Plane.z(0.0), ("focal", "pose"))
+    return projector.to(device), (torch.rand(2, 16, 2, dtype=D) * 400).to(device)
+
+
+def _worker(rank: int, backend: str, world: int, address: str, result: str) -> None:
+    torch.distributed.init_process_group(backend, init_method=f"file://{address}", rank=rank, world_size=world)
+    projector, pixels = _gradients("cpu" if backend == "gloo" else f"cuda:{rank}")
     parallel = torch.nn.parallel.DistributedDataParallel(projector)
-    pixels = torch.rand(2, 16, 2, dtype=D) * 400
-    points, valid = parallel(pixels[rank])
+    points, valid = parallel(pixels[rank] if world == 2 else pixels)
     dp.PlaneLoss()(points, torch.zeros_like(points), valid).backward()
     if rank == 0:
-        torch.save([p.grad for p in projector.parameters()], result)
+        torch.save([p.grad.cpu() for p in projector.parameters()], result)
     torch.distributed.destroy_process_group()
 
 
 @pytest.mark.plain
-def test_two_processes_share_gradients(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "backend",
+    ["gloo", pytest.param("nccl", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"))],
+)
+def test_processes_share_gradients(backend: str, tmp_path: Path) -> None:
     address, result = tmp_path / "rendezvous", tmp_path / "gradients.pt"
-    torch.multiprocessing.spawn(_worker, args=(str(address), str(result)), nprocs=2)
-    torch.manual_seed(0)
-    K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=D)
-    projector = dp.PlaneProjector(
-        dp.Camera(K, t=torch.tensor([0.0, 0, 1000], dtype=D)), dp.Plane.z(0.0), ("focal", "pose")
-    )
-    points, valid = projector(torch.rand(2, 16, 2, dtype=D) * 400)
+    world = 2 if backend == "gloo" else min(2, torch.cuda.device_count())
+    torch.multiprocessing.spawn(_worker, args=(backend, world, str(address), str(result)), nprocs=world)
+    projector, pixels = _gradients("cpu")
+    points, valid = projector(pixels)
     dp.PlaneLoss()(points, torch.zeros_like(points), valid).backward()
     for shared, own in zip(torch.load(result, weights_only=True), projector.parameters(), strict=True):
         torch.testing.assert_close(shared, own.grad, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_on_a_gpu(lens_camera: dp.Camera, pixels: torch.Tensor) -> None:
-    projector = dp.PlaneProjector(lens_camera, dp.Plane.z(0.0), EVERY)
-    want = projector(pixels)[0]
-    points, _ = projector.to("cuda")(pixels.cuda())
-    torch.testing.assert_close(points.cpu(), want, rtol=1e-10, atol=1e-8)
+@pytest.mark.parametrize("learn", [(), EVERY])
+def test_on_a_gpu(learn: tuple[str, ...], lens_camera: dp.Camera, pixels: torch.Tensor) -> None:
+    projector = dp.PlaneProjector(lens_camera, dp.Plane.z(0.0), learn)
+    half = torch.tensor([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]], dtype=D)
+    wants = projector(pixels)[0], projector(pixels, half)[0]
+    projector.to("cuda")
+    for want, points in zip(
+        wants, (projector(pixels.cuda())[0], projector(pixels.cuda(), half.cuda())[0]), strict=True
+    ):
+        torch.testing.assert_close(points.cpu(), want, rtol=1e-10, atol=1e-8)
+    single = projector.to(torch.float32)
+    with torch.autocast("cuda", dtype=torch.float16):
+        points, valid = single(pixels.float().cuda())
+        loss = dp.PlaneLoss(dp.Huber(5.0))(points, torch.zeros_like(points), valid)
+    assert points.dtype == torch.float32
+    torch.testing.assert_close(points.cpu().double(), wants[0], rtol=0, atol=2e-3)
+    if learn:
+        loss.backward()
+        assert all(p.grad.isfinite().all() for p in single.parameters())
 
 
 @pytest.mark.plain

@@ -120,6 +120,22 @@ def test_gradients_to_image_and_camera(lens: dp.BrownConrady) -> None:
         torch.testing.assert_close((gradients[i] * direction).sum(), finite, rtol=1e-4, atol=1e-6)
 
 
+def test_a_plane_and_axes_for_each_image() -> None:
+    heights, places = torch.tensor([0.0, 40.0], dtype=D), torch.tensor([[30.0, 20, 0], [90, 60, 40]], dtype=D)
+    x, y = torch.eye(3, dtype=D)[:2].expand(2, 2, 3).unbind(1)
+    extent = (-40.0, -30.0, 40.0, 30.0)
+    texture = smooth(30, 40)
+    images, shown = dp.render(texture, above(), dp.Plane.z(heights), extent, axes=(places, x, y))
+    tops, _ = dp.rectify(images, above(), dp.Plane.z(heights), extent, 2.0, axes=(places, x, y))
+    assert images.shape == (2, 1, 480, 640)
+    for i in range(2):
+        axes = places[i], x[i], y[i]
+        image, seen = dp.render(texture, above(), dp.Plane.z(float(heights[i])), extent, axes=axes)
+        torch.testing.assert_close(images[i], image)
+        assert torch.equal(shown[i], seen)
+        torch.testing.assert_close(tops[i, :, 2:-2, 2:-2], texture[:, 2:-2, 2:-2], rtol=0, atol=0.1)
+
+
 def test_batches_and_kornia_cameras() -> None:
     images = torch.rand(2, 3, 480, 640)
     cameras = dp.Camera(above().K, above().R, torch.stack([above().t, above().t + 20]), size=(640, 480)).to(
@@ -133,6 +149,19 @@ def test_batches_and_kornia_cameras() -> None:
         assert torch.equal(seen, valid[i])
     pinhole, _ = dp.rectify(images, cameras.to_kornia(), dp.Plane.z(0.0), EXTENT, 4.0)
     torch.testing.assert_close(pinhole, top)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_on_a_gpu(lens: dp.BrownConrady) -> None:
+    texture, camera = smooth(60, 80), above(lens)
+    image, shown = dp.render(texture, camera, dp.Plane.z(0.0), EXTENT)
+    top, valid = dp.rectify(image, camera, dp.Plane.z(0.0), EXTENT, 4.0)
+    image_there, shown_there = dp.render(texture.cuda(), camera.to("cuda"), dp.Plane.z(0.0), EXTENT)
+    top_there, valid_there = dp.rectify(image_there, camera.to("cuda"), dp.Plane.z(0.0), EXTENT, 4.0)
+    torch.testing.assert_close(image_there.cpu(), image)
+    torch.testing.assert_close(top_there.cpu(), top)
+    assert torch.equal(shown_there.cpu(), shown)
+    assert torch.equal(valid_there.cpu(), valid)
 
 
 def squares(top: torch.Tensor, resolution: float) -> tuple[np.ndarray, np.ndarray]:
