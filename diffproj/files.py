@@ -21,12 +21,13 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import torch
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._atomic import write_whole
 from diffproj.board import Views
 from diffproj.calibration import Calibration, Covariance
-from diffproj.camera import Camera
+from diffproj.camera import Camera, as_camera
 from diffproj.lens import BrownConrady, KannalaBrandt
 
 Format = Literal["opencv", "json"]
@@ -40,7 +41,7 @@ _LENSES = {"BrownConrady": BrownConrady, "KannalaBrandt": KannalaBrandt}
 PathLike = str | os.PathLike[str]
 
 
-def save_camera(path: PathLike, camera: Camera | Calibration, format: Format | None = None) -> None:  # noqa: A002
+def save_camera(path: PathLike, camera: Camera | PinholeCamera | Calibration, format: Format | None = None) -> None:  # noqa: A002
     """Save a camera or a calibration.
 
     Args:
@@ -62,8 +63,10 @@ def save_camera(path: PathLike, camera: Camera | Calibration, format: Format | N
         >>> bool(again.rms == calibration.rms)
         True
     """
-    if not isinstance(camera, Camera | Calibration):
+    if not isinstance(camera, Camera | PinholeCamera | Calibration):
         raise TypeError(f"camera: want dp.Camera or dp.Calibration, got {type(camera).__name__}")
+    if isinstance(camera, PinholeCamera):
+        camera = as_camera(camera)
     path = Path(path)
     if _format(path, format) == "json":
         content = _readable(json.dumps(_without_nan(_json_document(camera)), indent=1, allow_nan=False))

@@ -300,9 +300,9 @@ class CalibrationPrior(nn.Module):
         self.register_buffer("center", self._vector(camera.detach()).clone())
         self.register_buffer("precision", precision)
 
-    def forward(self, camera: Camera) -> Float[Tensor, "*batch"]:
+    def forward(self, camera: Camera | PinholeCamera) -> Float[Tensor, "*batch"]:
         """`1/2 d^T C^-1 d` of a camera of batch shape `*B`, such as `projector.camera`; in float64."""
-        off = self._vector(camera) - self.center
+        off = self._vector(as_camera(camera)) - self.center
         return (off * (self.precision * off.unsqueeze(-2)).sum(-1)).sum(-1) / 2
 
     def _vector(self, camera: Camera) -> Tensor:

@@ -8,21 +8,22 @@ large numbers twice (`R^-1 (p_c - T)`, then `- O_c`), which costs two digits: us
 
 import torch
 from jaxtyping import Float
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._numerics import transform
-from diffproj.camera import Camera
+from diffproj.camera import Camera, as_camera
 from diffproj.plane import Plane
 
 
 def paper_route(
-    pixels: Float[Tensor, "*#batch n 2"], camera: Camera, plane: Plane, focal_length: float = 1.0
+    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane, focal_length: float = 1.0
 ) -> Float[Tensor, "*#batch n 3"]:
     """Back-project pixels by the letter of the paper, which knows no lens and no invalid ray.
 
     Args:
         pixels: `(*B, N, 2)`.
-        camera: a pinhole camera without skew, of batch shape `*B`.
+        camera: a pinhole camera without skew, of batch shape `*B`, or Kornia's `PinholeCamera`.
         plane: a plane of batch shape `*B`.
         focal_length: the paper's `f` in world units; with `s_x = f_x / f` and `s_y = f_y / f` it cancels.
 
@@ -38,6 +39,7 @@ def paper_route(
         >>> paper_route(torch.tensor([[370.0, 240.0]], dtype=torch.float64), camera, Plane.z(0.0)).tolist()
         [[100.0, 0.0, 0.0]]
     """
+    camera = as_camera(camera)
     if camera.distortion is not None:
         raise ValueError("camera: want a pinhole, for the paper neglects the lens; undistort the pixels first")
     plane = plane.like(camera.K)

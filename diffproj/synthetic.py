@@ -11,12 +11,13 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, UInt8
 from kornia.filters import gaussian_blur2d
+from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.grid import create_meshgrid
 from torch import Tensor
 
 from diffproj._numerics import transform
 from diffproj.board import Chessboard, Views
-from diffproj.camera import Camera
+from diffproj.camera import Camera, as_camera
 from diffproj.intrinsics import pixel_to_normalized
 from diffproj.lens import Lens
 from diffproj.plane import Plane
@@ -137,7 +138,7 @@ def board_texture(board: Chessboard, texels: int = 32) -> Texture:
 
 
 def photograph(
-    camera: Camera,
+    camera: Camera | PinholeCamera,
     board: Chessboard,
     *,
     blur_px: float = 0.7,
@@ -167,6 +168,7 @@ def photograph(
         >>> photograph(setup.test[0], setup.board).shape
         torch.Size([480, 640])
     """
+    camera = as_camera(camera)
     if camera.size is None:
         raise ValueError("camera: want a size, got None; give Camera(..., size=(width, height))")
     if blur_px < 0 or noise < 0 or not 0 <= vignetting <= 1:
@@ -189,7 +191,7 @@ def photograph(
     return torch.stack(images).reshape(*camera.batch_shape, *images[0].shape)
 
 
-def corner_views(camera: Camera, board: Chessboard, *, noise_px: float = 0.2, seed: int = 0) -> Views:
+def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px: float = 0.2, seed: int = 0) -> Views:
     """The board's corners as cameras of batch shape `(*B, V)` would see them, with Gaussian noise on each coordinate.
 
     Args:
@@ -209,6 +211,7 @@ def corner_views(camera: Camera, board: Chessboard, *, noise_px: float = 0.2, se
         >>> corner_views(setup.fit, setup.board).pixels.shape
         torch.Size([10, 54, 2])
     """
+    camera = as_camera(camera)
     if not camera.batch_shape:
         raise ValueError("camera: want a batch of views (V,), got a single camera; camera.at(R, t) makes one")
     pixels, visible = camera.project(board.points.to(camera.dtype))
@@ -221,7 +224,7 @@ def corner_views(camera: Camera, board: Chessboard, *, noise_px: float = 0.2, se
 
 
 def random_cameras(
-    camera: Camera,
+    camera: Camera | PinholeCamera,
     board: Chessboard,
     views: int,
     *,
@@ -247,6 +250,7 @@ def random_cameras(
         >>> random_cameras(setup.fit[0], setup.board, 20).batch_shape
         torch.Size([20])
     """
+    camera = as_camera(camera)
     if camera.size is None:
         raise ValueError("camera: want a size, got None; give Camera(..., size=(width, height))")
     generator = torch.Generator().manual_seed(seed)
