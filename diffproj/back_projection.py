@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from diffproj import _pytree
 from diffproj._numerics import (
@@ -242,17 +243,17 @@ def _plane_matrix(camera: Camera, plane: Plane) -> Tensor:
     normal, offset = precise(plane.normal), precise(plane.offset)
     b = dot(R, normal.unsqueeze(-2))  # the normal in the camera frame: n . C = -b . t
     center = -dot(R.mT, t.unsqueeze(-2))
-    terms = b * t
-    height = offset + terms.sum(dim=-1)
-    resting = rounding(camera.dtype) * (offset.abs() + terms.abs().sum(dim=-1))
+    height = offset + dot(b, t)
     A = center.unsqueeze(-1) * b.unsqueeze(-2) + height[..., None, None] * R.mT
     M = torch.cat([A, b.unsqueeze(-2)], dim=-2)
     if camera.distortion is None:
         F_inverse = pixel_to_normalized(precise(camera.K))
         M = torch.cat([(M[..., :2].unsqueeze(-1) * F_inverse.unsqueeze(-3)).sum(dim=-2), M[..., 2:]], dim=-1)
-    # The factor changes no point, so no derivative has to pass through it.
-    factor = M.detach().abs().amax(dim=(-2, -1)).reciprocal().copysign(height.detach())
-    return M * torch.where(height.detach().abs() > resting.detach(), factor, 0.0)[..., None, None]
+    with torch.no_grad():  # the factor changes no point, so no derivative has to pass through it
+        resting = rounding(camera.dtype) * (offset.abs() + vector_norm(b, dim=-1) * vector_norm(t, dim=-1))
+        factor = M.abs().amax(dim=(-2, -1)).reciprocal().copysign(height)
+        factor = torch.where(height.abs() > resting, factor, 0.0)
+    return M * factor[..., None, None]
 
 
 _pytree.register(PlaneMap, children=("matrix", "camera"), static=("is_per_point",))

@@ -221,7 +221,8 @@ class Camera:
         """The camera of the same image warped, as a geometric augmentation does: pixels `p` go to `matrix p`.
 
         An affine matrix changes K alone: turned, mirrored, sheared, scaled and shifted images stay exact, behind a lens
-        too. A projective one also turns a pinhole; see `intrinsics.warped`. Gradients flow to the matrix.
+        too. A projective one also turns a pinhole, so that the middle of the image (the principal point, where the
+        camera has no size) stays in front of it. Gradients flow to the matrix.
 
         Args:
             matrix: `(*B, 3, 3)`, from pixels `(u, v, 1)` of this image to those of the warped one, up to a factor;
@@ -230,7 +231,9 @@ class Camera:
 
         Raises:
             TypeError: no floating-point tensor, or another dtype than the camera's.
-            ValueError: wrong shape or device, no inverse, or a projective matrix for a camera with a lens.
+            ValueError: wrong shape or device, no inverse, or a projective matrix for a camera with a lens, for which
+                no lens model describes the warped image. Values are checked where they can be read, not while
+                compiling or under `vmap`.
 
         Example:
             >>> from kornia.augmentation import RandomHorizontalFlip
@@ -246,8 +249,11 @@ class Camera:
         check_same_kind(camera=self.K, matrix=matrix)
         broadcast_batches(camera=self.batch_shape, matrix=matrix.shape[:-2])
         if readable(matrix):
-            check_warp(matrix, behind_lens=self.distortion is not None)
-        K, turn = warped(self.K, matrix)
+            check_warp(matrix, self.K, behind_lens=self.distortion is not None)
+        ahead = self.K[..., :2, 2]
+        if self.size is not None:
+            ahead = self.K.new_tensor([(side - 1) / 2 for side in self.size])
+        K, turn = warped(self.K, matrix, ahead)
         R, t = (turn.unsqueeze(-1) * self.R.unsqueeze(-3)).sum(-2), dot(turn, self.t.unsqueeze(-2))
         return self._with(K=K, R=R, t=t, size=_checked_size(size) or self.size)
 

@@ -33,7 +33,7 @@ def pixel_to_normalized(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch
 
 
 def warped(
-    K: Float[Tensor, "*#batch 3 3"], matrix: Float[Tensor, "*#batch 3 3"]
+    K: Float[Tensor, "*#batch 3 3"], matrix: Float[Tensor, "*#batch 3 3"], ahead: Float[Tensor, "*#batch 2"]
 ) -> tuple[Float[Tensor, "*out 3 3"], Float[Tensor, "*out 3 3"]]:
     """The intrinsics behind a warp of the image, and the rotation of the camera that goes with them.
 
@@ -42,18 +42,20 @@ def warped(
         H K = |g| K' Q,        g the last row of H K, and the last row of Q its direction,
 
     so the warped image is that of a camera with `K'`, turned by `Q`: `X_cam' = Q X_cam`. Of all such rotations Q is the
-    smallest; it is the identity where H is affine. H counts up to its factor, whose sign keeps the principal point in
-    front.
+    smallest; it is the identity where H is affine. H counts up to its factor, whose sign is such that a pixel `ahead`
+    stays in front of the camera.
 
     Args:
         K: `(*B, 3, 3)`.
         matrix: H `(*B, 3, 3)`, from pixels of the image to those of the warped one.
+        ahead: a pixel `(*B, 2)` of the image that the warped image shows.
 
     Returns:
         `K'` and `Q`, both `(*B, 3, 3)` in the dtype of K.
     """
     G = (precise(matrix).unsqueeze(-1) * precise(K).unsqueeze(-3)).sum(-2)
-    G = torch.where(G[..., 2:, 2:] < 0, -G, G)
+    w = (matrix[..., 2, :2] * ahead).sum(-1) + matrix[..., 2, 2]
+    G = torch.where((w < 0)[..., None, None], -G, G)
     length = G[..., 2, :].norm(dim=-1)[..., None, None]
     x, y, z = (G[..., 2, :] / length.squeeze(-1)).unbind(-1)
     rows = [
@@ -94,15 +96,17 @@ def check_no_skew(K: Tensor) -> None:
         raise ValueError("camera: want no skew, got K[..., 0, 1] or K[..., 1, 0] other than 0")
 
 
-def check_warp(matrix: Tensor, behind_lens: bool) -> None:
-    """Check values of a warp.
+def check_warp(matrix: Tensor, K: Tensor, behind_lens: bool) -> None:
+    """Check values of a warp of a camera's image.
 
     Raises:
         ValueError: not finite, no inverse, or a projective warp of an image behind a lens.
     """
     if not bool(matrix.isfinite().all()):
         raise ValueError("matrix: want finite values, got NaN or infinity")
-    rows = matrix / matrix.norm(dim=-1, keepdim=True)  # the last row is some hundred times smaller than the others
+    # Behind K the numbers of a row are of one size, whatever the warp shifts and scales.
+    rows = (precise(matrix).unsqueeze(-1) * precise(K).unsqueeze(-3)).sum(-2)
+    rows = rows / rows.norm(dim=-1, keepdim=True)
     if not bool((torch.linalg.det(rows).abs() > 8 * torch.finfo(matrix.dtype).eps).all()):
         raise ValueError("matrix: want an invertible one, got a singular one")
     if behind_lens and bool((matrix[..., 2, :2] != 0).any()):

@@ -2,8 +2,8 @@
 
 The parameters are chosen so that steps of one size mean much the same for each of them, and none can leave its range:
 
-* focal lengths through their logarithm, `f = f_0 exp(log_focal)`;
-* the principal point in units of the focal length, `c = c_0 + f_0 principal_point`;
+* focal lengths through their logarithm, `f = f_0 exp(log_focal)`, which scales the columns of `F` in general;
+* the principal point in units of the focal length, `c = c_0 + F_0 principal_point`;
 * the lens's coefficients as they are, `k = k_0 + distortion`;
 * poses on their manifold, `R = Q(rotation) R_0`, and `t = t_0 + |t_0| translation` (in world units where t_0 is 0).
 
@@ -24,7 +24,6 @@ from torch import Tensor, nn
 from diffproj.back_projection import back_project
 from diffproj.board import Views
 from diffproj.camera import Camera, as_camera
-from diffproj.intrinsics import check_no_skew, focal_and_center, intrinsic_matrix
 from diffproj.lens import BrownConrady, KannalaBrandt
 from diffproj.plane import Plane
 
@@ -50,7 +49,26 @@ class HasPoints(Protocol):
         ...
 
 
-class LearnableCamera(nn.Module):
+class GeometryModule(nn.Module):
+    """A module of geometry: `network.half()` and `.bfloat16()` pass it by, moves and other dtypes do not.
+
+    Attributes:
+        partly: names of the parameters that are not learned everywhere; see `own`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.partly: set[str] = set()
+
+    def _apply(self, fn, recurse: bool = True):  # type: ignore[override]
+        def lifting(tensor: Tensor) -> Tensor:
+            moved = fn(tensor)
+            return tensor.to(moved.device) if moved.dtype in (torch.float16, torch.bfloat16) else moved
+
+        return super()._apply(lifting, recurse)
+
+
+class LearnableCamera(GeometryModule):
     """A camera, or a batch of them, as a module: calling it gives a `Camera` that carries gradients.
 
     Intrinsics and lens of a batch of poses of one camera, as `Calibration.cameras` is, are one parameter.
@@ -67,7 +85,7 @@ class LearnableCamera(nn.Module):
     Raises:
         TypeError: no camera, or one with a lens of another library.
         ValueError: an unknown part, `"distortion"` of a pinhole, booleans that do not fit or that part what is one
-            parameter, a K with skew, or `one_camera` of different ones.
+            parameter, or `one_camera` of different ones.
 
     Example:
         >>> import diffproj as dp
@@ -94,15 +112,13 @@ class LearnableCamera(nn.Module):
         lens = camera.distortion
         if lens is not None and not isinstance(lens, BrownConrady | KannalaBrandt):
             raise TypeError(f"camera: want a lens of diffproj, got {type(lens).__name__}")
-        check_no_skew(camera.K)
         available = [part for part in PARTS if lens is not None or part != "distortion"]
         chosen = learned_parts(available if learn is None else learn, available)
         self.learn, self.size, self.batch_shape = tuple(chosen), camera.size, camera.batch_shape
         self._lens = None if lens is None else type(lens)
         K = _once(camera.K, 2, one_camera)
-        focal, center = focal_and_center(K).split(2, dim=-1)
-        self.register_buffer("focal_0", focal.clone())
-        self.register_buffer("principal_point_0", center.clone())
+        focal = K[..., 0, :2]
+        self.register_buffer("K_0", K.clone())
         self.register_buffer("R_0", camera.R.clone())
         self.register_buffer("t_0", camera.t.clone())
         reach = camera.t.norm(dim=-1, keepdim=True)
@@ -111,13 +127,12 @@ class LearnableCamera(nn.Module):
             focal[..., :0] if lens is None else _once(lens.expand(*self.batch_shape).coefficients, 1, one_camera)
         )
         self.register_buffer("coefficients_0", coefficients.clone())
-        likes = {"focal": focal, "principal_point": center, "distortion": coefficients, "pose": camera.t}
+        likes = {"focal": focal, "principal_point": focal, "distortion": coefficients, "pose": camera.t}
         for part, names in _PARAMETERS.items():
             for name in names:
                 own(self, name, likes[part], chosen.get(part, False), self.batch_shape)
 
-    focal_0: Tensor
-    principal_point_0: Tensor
+    K_0: Tensor
     R_0: Tensor
     t_0: Tensor
     reach: Tensor
@@ -130,9 +145,10 @@ class LearnableCamera(nn.Module):
 
     def forward(self) -> Camera:
         """The camera as it is now, with the batch shape of the one it was made from."""
-        focal = self.focal_0 * learned(self, "log_focal").exp()
-        center = self.principal_point_0 + self.focal_0 * learned(self, "principal_point")
-        K = intrinsic_matrix(focal, center).expand(*self.batch_shape, 3, 3)
+        scale = nn.functional.pad(learned(self, "log_focal").exp(), (0, 1), value=1.0)
+        shift = (self.K_0[..., :2] * learned(self, "principal_point").unsqueeze(-2)).sum(-1, keepdim=True)
+        K = self.K_0 * scale.unsqueeze(-2) + nn.functional.pad(shift, (2, 0))
+        K = K.expand(*self.batch_shape, 3, 3)
         # Crosswise and elementwise: under autocast a matrix product would round the pose to 8 bits.
         half = learned(self, "rotation").unsqueeze(-1) / 2
         across = torch.linalg.cross(half, self.R_0, dim=-2)
@@ -164,7 +180,7 @@ def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
     return {part: where for part, where in wanted.items() if bool(torch.as_tensor(where).any())}
 
 
-def own(module: nn.Module, name: str, like: Tensor, where: Any, batch: torch.Size) -> None:
+def own(module: GeometryModule, name: str, like: Tensor, where: Any, batch: torch.Size) -> None:
     """Give a module zeros `(*B, k)` of a name: a parameter if it is learned, with a mask if not everywhere.
 
     Args:
@@ -179,32 +195,32 @@ def own(module: nn.Module, name: str, like: Tensor, where: Any, batch: torch.Siz
     """
     zero = torch.zeros_like(like, memory_format=torch.contiguous_format)
     mask = torch.as_tensor(where, device=like.device)
-    if not bool(mask.any()):
-        module.register_buffer(name, zero)
-        return
-    module.register_parameter(name, nn.Parameter(zero))
-    if bool(mask.all()):
-        return
     try:
         mask = mask.bool().expand(batch)
     except RuntimeError:
         raise ValueError(
             f"learn: want booleans that broadcast to the batch shape {tuple(batch)}, got shape {tuple(mask.shape)}"
         ) from None
+    if not bool(mask.any()):
+        module.register_buffer(name, zero)
+        return
+    module.register_parameter(name, nn.Parameter(zero))
+    if bool(mask.all()):
+        return
     for axis, length in enumerate(like.shape[:-1]):
         if length < mask.shape[axis]:
             first = mask.narrow(axis, 0, 1)
             if not bool((mask == first).all()):
                 raise ValueError(f"learn: want the same for all poses of one camera, got {mask.tolist()} for {name}")
             mask = first
+    module.partly.add(name)
     module.register_buffer(f"{name}_learned", mask.unsqueeze(-1).to(like.dtype))
 
 
-def learned(module: nn.Module, name: str) -> Tensor:
+def learned(module: GeometryModule, name: str) -> Tensor:
     """What `own` made, zero where it is not learned."""
     value: Tensor = getattr(module, name)
-    mask: Tensor | None = getattr(module, f"{name}_learned", None)
-    return value if mask is None else value * mask
+    return value * getattr(module, f"{name}_learned") if name in module.partly else value
 
 
 def image_residuals(

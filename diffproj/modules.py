@@ -14,17 +14,18 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor, nn
 
-from diffproj._numerics import check_tensor, precise
+from diffproj._numerics import check_tensor, precise, readable
 from diffproj.back_projection import PlaneMap
 from diffproj.calibration import Calibration
 from diffproj.camera import Camera, as_camera
 from diffproj.intrinsics import focal_and_center
-from diffproj.learnable import PARTS, Learn, LearnableCamera, learned, learned_parts, own
+from diffproj.learnable import PARTS, GeometryModule, Learn, LearnableCamera, learned, learned_parts, own
+from diffproj.lens.coefficients import CoefficientLens
 from diffproj.losses import Loss
 from diffproj.plane import Plane
 
 
-class LearnablePlane(nn.Module):
+class LearnablePlane(GeometryModule):
     """A plane, or a batch of them, as a module: calling it gives a `Plane` that carries gradients.
 
     The normal turns on the sphere, `n = |n_0| unit(n_0 / |n_0| + T tilt)` with T two directions of the plane, and the
@@ -73,20 +74,24 @@ class LearnablePlane(nn.Module):
     def forward(self) -> Plane:
         """The plane as it is now."""
         turned = self.unit_0 + (self.tangents * learned(self, "tilt").unsqueeze(-2)).sum(-1)
-        normal = turned * (self.length_0 / turned.norm(dim=-1)).unsqueeze(-1)
+        normal = turned * (self.length_0 / torch.linalg.vector_norm(turned, dim=-1)).unsqueeze(-1)
         distance = self.distance_0 + self.scale * learned(self, "shift").squeeze(-1)
         return Plane._unchecked(normal, self.length_0 * distance)
 
 
-class PlaneProjector(nn.Module):
+_FROZEN = ("_matrix", "_frozen_K", "_frozen_R", "_frozen_t", "_frozen_coefficients")
+"""What a frozen projector has ready."""
+
+
+class PlaneProjector(GeometryModule):
     """Pixels to points on a plane, as a layer.
 
     Args:
         camera: at its pose, of batch shape `*B`, or Kornia's `PinholeCamera`.
         plane: the plane, of batch shape `*B`.
         learn: what is learned along: any of `"focal"`, `"principal_point"`, `"distortion"`, `"pose"` and `"plane"`;
-            nothing if left out, and then the map is built once. A mapping says it for each camera of a batch, as for
-            `LearnableCamera`: `{"focal": True, "pose": torch.tensor([True, False])}`.
+            nothing if left out, and then the map is built once. A mapping says it for each camera, or plane, of a
+            batch, as for `LearnableCamera`: `{"focal": True, "pose": torch.tensor([True, False])}`.
 
     Raises:
         TypeError: no camera or no plane, or different dtypes.
@@ -100,6 +105,8 @@ class PlaneProjector(nn.Module):
         ([[100.0, 0.0, 0.0]], ['_camera.log_focal', '_camera.rotation', '_camera.translation'])
     """
 
+    _frozen_coefficients: Tensor
+
     def __init__(self, camera: Camera | PinholeCamera, plane: Plane, learn: Learn = ()) -> None:
         super().__init__()
         camera = as_camera(camera).detach()
@@ -110,8 +117,11 @@ class PlaneProjector(nn.Module):
         whole = chosen.pop("plane", False)
         self._camera = LearnableCamera(camera, chosen)
         away = ((plane.normal * camera.center).sum(-1) - plane.offset).abs() / plane.normal.norm(dim=-1)
-        self._plane = LearnablePlane(plane, float(away.mean()), whole)
-        self._built: PlaneMap | None = None
+        self._plane = LearnablePlane(plane, float(away.mean()) or 1.0, whole)
+        # Buffers, so that whatever swaps or writes a module's state (DDP, functional_call) does so here, too.
+        for name in _FROZEN:
+            self.register_buffer(name, None, persistent=False)
+        self._lens: CoefficientLens | None = None
         self._rebuild()
         self.register_load_state_dict_post_hook(_rebuild)
 
@@ -127,7 +137,15 @@ class PlaneProjector(nn.Module):
 
     def map(self) -> PlaneMap:
         """The map as it is now; a frozen projector has it ready."""
-        return PlaneMap(self._camera(), self._plane()) if self._built is None else self._built
+        if self.learn:
+            return PlaneMap(self._camera(), self._plane())
+        lens = self._lens
+        if lens is not None and (torch.compiler.is_compiling() or lens.coefficients is not self._frozen_coefficients):
+            lens = type(lens)._unchecked(self._frozen_coefficients)
+            if readable(self._frozen_coefficients):  # kept, for it remembers what it works out about itself
+                self._lens = lens
+        camera = Camera._unchecked(self._frozen_K, self._frozen_R, self._frozen_t, lens, self._camera.size)
+        return PlaneMap._unchecked(self._matrix, camera, False)
 
     def forward(
         self,
@@ -150,7 +168,7 @@ class PlaneProjector(nn.Module):
             TypeError: no floating-point tensors, or others than the camera's dtype.
             ValueError: shapes or devices that do not fit, or a warp that `Camera.warped` refuses.
         """
-        with torch.autocast(self._camera.t_0.device.type, enabled=False):
+        with torch.autocast(pixels.device.type, enabled=False):
             if warp is None and plane is None:
                 return self.map()(pixels)
             camera = self.camera if warp is None else self.camera.warped(warp)
@@ -162,9 +180,15 @@ class PlaneProjector(nn.Module):
         return self
 
     def _rebuild(self) -> None:
-        if not self.learn:
-            with torch.no_grad():
-                self._built = PlaneMap(self._camera(), self._plane())
+        if self.learn:
+            return
+        with torch.inference_mode(False), torch.no_grad():
+            camera = self._camera()
+            self._matrix = PlaneMap(camera, self._plane()).matrix
+            self._frozen_K, self._frozen_R, self._frozen_t = camera.K.clone(), camera.R.clone(), camera.t.clone()
+            if isinstance(camera.distortion, CoefficientLens):
+                self._frozen_coefficients = camera.distortion.coefficients.clone()
+                self._lens = type(camera.distortion)._unchecked(self._frozen_coefficients)
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""

@@ -90,6 +90,21 @@ def test_the_matrix_counts_up_to_its_factor(factor: float, camera: dp.Camera, pi
     torch.testing.assert_close(got, homogeneous[:, :2] / homogeneous[:, 2:], rtol=1e-10, atol=1e-9)
 
 
+def test_large_shifts_in_float32_and_a_far_principal_point(camera: dp.Camera, pixels: torch.Tensor) -> None:
+    single = camera.to(torch.float32)
+    for scale, shift in ((1.0, -1500.0), (0.1, -300.0)):
+        matrix = torch.tensor([[scale, 0, shift], [0, scale, shift], [0, 0, 1]])
+        torch.testing.assert_close(single.warped(matrix).K[0, 2], scale * single.K[0, 2] + shift)
+    K = torch.tensor([[2000.0, 0, 1920], [0, 2000, 1080], [0, 0, 1]], dtype=D)
+    part = dp.Camera(K, camera.R, camera.t, size=(3840, 2160)).cropped(2320, 0, 640, 480)
+    H = torch.tensor([[1.0, 0, 0], [0, 1, 0], [3e-3, 0, 1]], dtype=D)  # the principal point, u = -400, lies behind
+    points, _ = dp.back_project(pixels, part, dp.Plane.z(0.0))
+    homogeneous = torch.nn.functional.pad(pixels, (0, 1), value=1.0) @ H.T
+    got, valid = part.warped(H).project(points)
+    assert valid.all()
+    torch.testing.assert_close(got, homogeneous[:, :2] / homogeneous[:, 2:], rtol=1e-9, atol=1e-8)
+
+
 def test_what_resizing_and_cropping_do_is_a_warp(lens_camera: dp.Camera) -> None:
     half = torch.tensor([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]], dtype=D)
     torch.testing.assert_close(lens_camera.warped(half).K, lens_camera.resized((320, 240)).K)

@@ -82,6 +82,18 @@ def test_round_trip(name: str, pixels: Tensor, request: pytest.FixtureRequest) -
     torch.testing.assert_close(camera.project(points)[0], pixels, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("reach", [1.0, 1e3, 1e5])
+def test_a_camera_that_rests_on_the_plane_says_so(reach: float, K: Tensor) -> None:
+    """Also where the plane is seen along its normal, and where it is one of the axes'."""
+    R = dp.rotation_from_euler(*torch.randn(3, 200, dtype=D))
+    for normal in (R[:, 2], torch.tensor([0.0, 0, 1], dtype=D).expand(200, 3)):
+        center = reach * torch.nn.functional.normalize(torch.linalg.cross(normal, torch.randn(200, 3, dtype=D)), dim=-1)
+        t = -(R @ center.unsqueeze(-1)).squeeze(-1)
+        camera = dp.Camera(K.float(), R.float(), t.float())
+        reasons = dp.explain(torch.rand(200, 5, 2) * 400, camera, dp.Plane(normal.float(), torch.zeros(200)))
+        assert (reasons == dp.Reason.CAMERA_ON_PLANE).all()
+
+
 def test_equals_kornia(camera: dp.Camera, pixels: Tensor) -> None:
     pinhole = camera.to_kornia()
     points, valid = dp.back_project(pixels, pinhole, dp.Plane.z(0.0))

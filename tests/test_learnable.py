@@ -160,8 +160,32 @@ def test_each_camera_of_a_batch_learns_what_is_its_own(rough: tuple[dp.Camera, d
     assert torch.equal(again().t, now.t)
     with pytest.raises(ValueError, match="learn: want the same for all poses of one camera, got .* for log_focal"):
         dp.LearnableCamera(best.cameras, {"focal": moving})
-    with pytest.raises(ValueError, match=r"learn: want booleans that broadcast to the batch shape \(5,\)"):
-        dp.LearnableCamera(best.cameras, {"pose": torch.tensor([True, False])})
+    for wrong in ([True, False], [True] * 7, [False] * 7 + [True]):
+        with pytest.raises(ValueError, match=r"learn: want booleans that broadcast to the batch shape \(5,\)"):
+            dp.LearnableCamera(best.cameras, {"pose": torch.tensor(wrong)})
+
+
+def test_an_image_that_was_turned_is_learned_too(lens_camera: dp.Camera) -> None:
+    quarter = torch.tensor([[0.0, -1, 479], [1, 0, 0], [0, 0, 1]], dtype=D)
+    turned = lens_camera.warped(quarter, (480, 640))
+    straight, along = dp.LearnableCamera(lens_camera), dp.LearnableCamera(turned)
+    assert torch.equal(along().K, turned.K)
+    with torch.no_grad():
+        for learnable in (straight, along):
+            learnable.log_focal.copy_(torch.tensor([0.1, -0.2]))
+            learnable.principal_point.copy_(torch.tensor([0.03, 0.01]))
+    torch.testing.assert_close(along().K, straight().warped(quarter).K)
+
+
+def test_half_precision_passes_geometry_by(lens_camera: dp.Camera, pixels: torch.Tensor) -> None:
+    projector = dp.PlaneProjector(lens_camera.to(torch.float32), dp.Plane.z(0.0), "pose")
+    network = torch.nn.ModuleDict({"linear": torch.nn.Linear(2, 2), "to_plane": projector})
+    want = projector(pixels.float())[0]
+    network.bfloat16()
+    assert network["linear"].weight.dtype == torch.bfloat16
+    assert torch.equal(projector(pixels.float())[0], want)
+    assert projector(pixels.half())[0].dtype == torch.float32
+    assert network.double()["to_plane"](pixels)[0].dtype == D
 
 
 def test_poses_turn_by_cayleys_map(camera: dp.Camera) -> None:
@@ -246,6 +270,3 @@ def test_bad_input_is_refused_by_name(camera: dp.Camera) -> None:
     for residuals in (dp.image_residuals, dp.plane_residuals):
         with pytest.raises(ValueError, match="camera: want a pose for each of the 13 views"):
             residuals(camera, views, BOARD)
-    skewed = dp.Camera(camera.K + torch.tensor([[0.0, 1, 0], [0, 0, 0], [0, 0, 0]], dtype=D))
-    with pytest.raises(ValueError, match="camera: want no skew"):
-        dp.LearnableCamera(skewed)

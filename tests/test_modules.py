@@ -104,6 +104,29 @@ def test_a_network_loads_its_frozen_projector(lens_camera: dp.Camera, pixels: to
     assert torch.equal(other["to_plane"](pixels)[0], network["to_plane"](pixels)[0])
 
 
+@pytest.mark.parametrize("behind_lens", [False, True])
+def test_a_frozen_projector_is_what_its_buffers_are(
+    behind_lens: bool, camera: dp.Camera, lens_camera: dp.Camera, pixels: torch.Tensor, plane: dp.Plane
+) -> None:
+    near = lens_camera if behind_lens else camera
+    far = near.at(near.R, near.t + 50)
+    projectors = [dp.PlaneProjector(camera, plane) for camera in (near, far)]
+    wants = [projector(pixels)[0] for projector in projectors]
+    assert not torch.equal(*wants)
+    swapped, _ = torch.func.functional_call(projectors[0], dict(projectors[1].named_buffers()), (pixels,))
+    assert torch.equal(swapped, wants[1])
+    assert torch.equal(projectors[0](pixels)[0], wants[0])
+    state = torch.func.stack_module_state(projectors)
+    base = copy.deepcopy(projectors[0])
+    together = torch.func.vmap(lambda *state: torch.func.functional_call(base, state, (pixels,))[0])(*state)
+    for points, want in zip(together, wants, strict=True):
+        torch.testing.assert_close(points, want, rtol=1e-10, atol=1e-10)
+    with torch.no_grad():  # as DistributedDataParallel does from the first process
+        for mine, theirs in zip(projectors[0].buffers(), projectors[1].buffers(), strict=True):
+            mine.copy_(theirs)
+    assert torch.equal(projectors[0](pixels)[0], wants[1])
+
+
 def test_planes_of_a_batch_learn_one_by_one(camera: dp.Camera, pixels: torch.Tensor) -> None:
     planes = dp.Plane.z(torch.tensor([0.0, 30, 60], dtype=D))
     projector = dp.PlaneProjector(camera, planes, {"plane": torch.tensor([False, True, False])})
