@@ -168,7 +168,7 @@ class PlaneProjector(GeometryModule):
             TypeError: no floating-point tensors, or others than the camera's dtype.
             ValueError: shapes or devices that do not fit, or a warp that `Camera.warped` refuses.
         """
-        with torch.autocast(pixels.device.type, enabled=False):
+        with torch.autocast(self._camera.t_0.device.type, enabled=False):
             if warp is None and plane is None:
                 return self.map()(pixels)
             camera = self.camera if warp is None else self.camera.warped(warp)
