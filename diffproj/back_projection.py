@@ -246,7 +246,7 @@ def _plane_matrix(camera: Camera, plane: Plane) -> Tensor:
     height = offset + dot(b, t)
     A = center.unsqueeze(-1) * b.unsqueeze(-2) + height[..., None, None] * R.mT
     M = torch.cat([A, b.unsqueeze(-2)], dim=-2)
-    if camera.distortion is None:
+    if camera.distortion is None:  # so far G is R^T, as behind a lens: a pinhole's M is that times diag(F^-1, 1)
         F_inverse = pixel_to_normalized(precise(camera.K))
         M = torch.cat([(M[..., :2].unsqueeze(-1) * F_inverse.unsqueeze(-3)).sum(dim=-2), M[..., 2:]], dim=-1)
     with torch.no_grad():  # the factor changes no point, so no derivative has to pass through it

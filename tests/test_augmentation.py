@@ -33,10 +33,7 @@ def where_it_is(count: int) -> torch.Tensor:
 def corners(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Some pixels of warped images `(B, N, 2)`, inside of what they show, and the pixels that were there before."""
     height, width = image.shape[-2:]
-    picked = [
-        torch.stack([part[2] > 1 - 1e-6]).squeeze(0)[5 : height - 5, 5 : width - 5].nonzero()[::997].flip(-1) + 5
-        for part in image
-    ]
+    picked = [(part[2] > 1 - 1e-6)[5 : height - 5, 5 : width - 5].nonzero()[::997].flip(-1) + 5 for part in image]
     count = min(map(len, picked))
     after = torch.stack([part[:count] for part in picked])
     before = torch.stack([part[:2, p[:, 1], p[:, 0]].T for part, p in zip(image, after, strict=True)])
