@@ -1,6 +1,7 @@
 """Camera files: round trips, OpenCV reading and being read, what is refused, and that nothing is half written."""
 
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -184,3 +185,32 @@ def test_a_crash_leaves_the_old_file(tmp_path: Path, camera: dp.Camera, monkeypa
     monkeypatch.undo()
     dp.save_camera(path, camera)
     assert path.stat().st_mode & 0o777 == 0o640
+
+
+def test_the_process_mask_is_left_alone(tmp_path: Path, camera: dp.Camera, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = os.umask(0o027)
+    try:
+        monkeypatch.setattr(os, "umask", lambda _: pytest.fail("the mask belongs to the whole process"))
+        dp.save_camera(tmp_path / "camera.json", camera)
+    finally:
+        monkeypatch.undo()
+        os.umask(before)
+    assert (tmp_path / "camera.json").stat().st_mode & 0o777 == 0o640
+
+
+def test_the_content_is_on_the_disk_before_the_rename(
+    tmp_path: Path, camera: dp.Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order = []
+    fsync, replace = os.fsync, _atomic.Path.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: (order.append("fsync"), fsync(handle))[1])
+    monkeypatch.setattr(_atomic.Path, "replace", lambda *paths: (order.append("rename"), replace(*paths))[1])
+    dp.save_camera(tmp_path / "camera.json", camera)
+    assert order == ["fsync", "rename"]
+
+
+def test_a_link_stays_a_link(tmp_path: Path, camera: dp.Camera) -> None:
+    (tmp_path / "link.json").symlink_to(tmp_path / "camera.json")
+    dp.save_camera(tmp_path / "link.json", camera)
+    assert (tmp_path / "link.json").is_symlink()
+    assert_same(dp.load_camera(tmp_path / "camera.json"), camera)
