@@ -17,6 +17,8 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from diffproj._torch_private import in_forward_mode, in_functional_transform
+
 BLOCK_POINTS = 2**16
 """Points handled at once when no derivative is asked: large enough to hide the cost of dispatch, small enough that
 the intermediate results stay in the processor's cache."""
@@ -105,11 +107,20 @@ def broadcast_batches(**shapes: Sequence[int]) -> torch.Size:
 
 def readable(*tensors: Tensor) -> bool:
     """Whether the values of these tensors can be read here: not while compiling, exporting or under `vmap`."""
-    return not (torch.compiler.is_compiling() or _transforming() or any(tensor.is_meta for tensor in tensors))
+    tracing = torch.compiler.is_compiling() or in_functional_transform()
+    return not (tracing or any(tensor.is_meta for tensor in tensors))
 
 
-def _transforming() -> bool:
-    return torch._C._functorch.peek_interpreter_stack() is not None  # type: ignore[attr-defined]
+def converted(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+    """`tensor.to(...)`, with axes that are only expanded left so: a million poses go on sharing one K.
+
+    A matter of memory alone: no result may depend on whether an axis is expanded or holds copies.
+    """
+    shape, strides = tensor.shape, tensor.stride()
+    for axis, (length, stride) in enumerate(zip(shape, strides, strict=True)):
+        if length > 1 and stride == 0:
+            tensor = tensor.narrow(axis, 0, 1)
+    return tensor.to(*args, **kwargs).expand(shape)
 
 
 def index_batch(tensor: Tensor, index: Any, trailing: int) -> Tensor:
@@ -195,8 +206,8 @@ def wants_derivative(*tensors: Tensor) -> bool:
     """
     return (
         torch.compiler.is_compiling()
-        or _transforming()
-        or torch.autograd.forward_ad._current_level >= 0
+        or in_functional_transform()
+        or in_forward_mode()
         or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors))
     )
 

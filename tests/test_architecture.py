@@ -1,6 +1,8 @@
 """The house: imports run downward only, and the package writes no word about the machine it was made on."""
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import diffproj
@@ -8,7 +10,8 @@ import diffproj
 PACKAGE = Path(diffproj.__file__).parent
 
 LEVELS = (
-    ("_numerics", "_pytree", "_atomic"),
+    ("_atomic", "_pytree", "_torch_private"),
+    ("_numerics",),
     ("losses", "rotation", "interop", "intrinsics", "lens"),
     ("solver",),
     ("camera", "plane"),
@@ -60,3 +63,10 @@ def test_imports_run_downward_only() -> None:
 def test_public_names_are_documented_and_sorted() -> None:
     assert diffproj.__all__ == sorted(diffproj.__all__)
     assert all(getattr(diffproj, name).__doc__ for name in diffproj.__all__)
+
+
+def test_import_loads_neither_the_compiler_nor_matplotlib() -> None:
+    """Both take as long as PyTorch itself."""
+    command = "import sys, diffproj; print(*(name in sys.modules for name in ('torch._dynamo', 'matplotlib')))"
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True)
+    assert (done.stdout.strip(), done.stderr) == ("False False", "")

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._numerics import broadcast_batches, check_same_kind, check_tensor, index_batch, readable
-from diffproj.lens.plan import AXES, Model, Plan, domain_of, know, plan_of
+from diffproj._numerics import broadcast_batches, check_same_kind, check_tensor, converted, index_batch, readable
+from diffproj.lens.plan import AXES, Model, Plan, domain_of, plan_of, register_model
 
 L = TypeVar("L", bound="CoefficientLens")
 
@@ -22,6 +22,7 @@ class CoefficientLens(ABC):
 
     counts: tuple[int, ...]
     coefficients: Tensor
+    _model: str  # the key of the class among the models of `plan`
 
     def __init__(self, coefficients: Float[Tensor, "*lens k"]):
         coefficients = check_tensor("coefficients", coefficients, "k")
@@ -34,9 +35,8 @@ class CoefficientLens(ABC):
 
     def _assign(self, coefficients: Any) -> None:
         self.coefficients = coefficients
-        self._version = -1
-        self._known_domain: Tensor | None = None
-        self._known_plan: Plan | None = None
+        # The version of the coefficients, their domain and perhaps their plan: replaced as a whole, for threads.
+        self._known: tuple[int, Tensor, Plan | None] | None = None
         self._origin: tuple[CoefficientLens, Callable[[Tensor, int], Tensor]] | None = None
 
     @classmethod
@@ -68,7 +68,7 @@ class CoefficientLens(ABC):
 
     def to(self: L, *args: Any, **kwargs: Any) -> L:
         """The lens in another dtype or on another device: arguments as `torch.Tensor.to`."""
-        return type(self)(self.coefficients.to(*args, **kwargs))
+        return type(self)(converted(self.coefficients, *args, **kwargs))
 
     def detach(self: L) -> L:
         """The lens cut from the graph of its coefficients."""
@@ -99,7 +99,7 @@ class CoefficientLens(ABC):
     # ----------------------------------------------------------------------------------------------------- the plan
 
     def __init_subclass__(cls) -> None:
-        know(cls.__name__, Model(cls._find_domain, cls._tabulate))
+        cls._model = register_model(cls, Model(cls._find_domain, cls._tabulate))
 
     @staticmethod
     @abstractmethod
@@ -113,30 +113,34 @@ class CoefficientLens(ABC):
 
     def _domain(self) -> Tensor:
         """The domain, all that the way forward needs; remembered for as long as nobody writes to the coefficients."""
-        name = type(self).__name__
         if not readable(self.coefficients):
-            return domain_of(name, self.coefficients)
+            return domain_of(self._model, self.coefficients)
         if self._origin is not None:
             origin, rearrange = self._origin
             return rearrange(origin._domain(), 0)
-        version = 0 if self.coefficients.is_inference() else self.coefficients._version
-        if self._known_domain is None or self._version != version:
-            with torch.inference_mode(False), torch.no_grad():
-                self._version, self._known_domain, self._known_plan = version, domain_of(name, self.coefficients), None
-        return self._known_domain
+        return self._remembered()[1]
 
     def _plan(self) -> Plan:
         """The whole plan, which the way back needs, remembered likewise."""
-        name, domain = type(self).__name__, self._domain()
         if not readable(self.coefficients):
-            return plan_of(name, self.coefficients, domain)
+            return plan_of(self._model, self.coefficients, self._domain())
         if self._origin is not None:
             origin, rearrange = self._origin
             return Plan(*(rearrange(part, axes) for part, axes in zip(origin._plan(), AXES, strict=True)))
-        if self._known_plan is None:
+        version, domain, plan = self._remembered()
+        if plan is None:
             with torch.inference_mode(False), torch.no_grad():
-                self._known_plan = plan_of(name, self.coefficients, domain)
-        return self._known_plan
+                plan = plan_of(self._model, self.coefficients, domain)
+            self._known = version, domain, plan
+        return plan
+
+    def _remembered(self) -> tuple[int, Tensor, Plan | None]:
+        version = 0 if self.coefficients.is_inference() else self.coefficients._version
+        known = self._known
+        if known is None or known[0] != version:
+            with torch.inference_mode(False), torch.no_grad():
+                known = self._known = version, domain_of(self._model, self.coefficients), None
+        return known
 
     def _usable(self, domain: Tensor) -> Tensor:
         """The coefficients, zero where the lens is of no use, so that no NaN gets into a gradient."""

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from diffproj._numerics import wants_derivative
+from diffproj._torch_private import constant_in_graphs, in_forward_mode, in_functional_transform
 
 
 def derivative_wanted(*tensors: Tensor) -> bool:
@@ -20,11 +21,10 @@ def derivative_wanted(*tensors: Tensor) -> bool:
     return reverse or _transforming()
 
 
-@torch.compiler.assume_constant_result
+@constant_in_graphs
 def _transforming() -> bool:
     """Whether the code being compiled runs under a functional transform or in forward mode."""
-    functional = torch._C._functorch.peek_interpreter_stack() is not None  # type: ignore[attr-defined]
-    return functional or torch.autograd.forward_ad._current_level >= 0
+    return in_functional_transform() or in_forward_mode()
 
 
 def coordinates(points: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,6 +4,7 @@ In a compiled graph the plan is one opaque operation. Its hundreds of small step
 the same coefficients would be worked out anew in each call.
 """
 
+import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -49,31 +50,47 @@ class Model(NamedTuple):
     rest: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
 
 
+RECENT = 16
+"""Results that are remembered."""
+
 _models: dict[str, Model] = {}
 _recent: list[tuple[str, tuple[Tensor, ...], tuple[Tensor, ...]]] = []
-RECENT = 16
+_lock = threading.Lock()
+"""Held while entries are added to `_models` or `_recent`, and never while a plan is worked out."""
 
 
-def know(name: str, model: Model) -> None:
-    """Register under a name how a plan is worked out."""
-    _models[name] = model
+def register_model(kind: type, model: Model) -> str:
+    """Say how the plans of a class of lenses are worked out.
+
+    Returns:
+        The class's key: its full name, which a compiled graph can keep across processes, with a number behind it
+        where another class already has that name.
+    """
+    full = key = f"{kind.__module__}.{kind.__qualname__}"
+    with _lock:
+        number = 1
+        while key in _models:
+            number += 1
+            key = f"{full} {number}"
+        _models[key] = model
+    return key
 
 
-def domain_of(name: str, coefficients: Tensor) -> Tensor:
+def domain_of(key: str, coefficients: Tensor) -> Tensor:
     """The domain for coefficients `(*B, k)`, in their type and rounded inward; 0 for those of no use."""
     coefficients = coefficients.detach()
-    return _domain(coefficients, name) if torch.compiler.is_compiling() else _rounded(name, coefficients)
+    return _domain(coefficients, key) if torch.compiler.is_compiling() else _rounded(key, coefficients)
 
 
-def plan_of(name: str, coefficients: Tensor, domain: Tensor) -> Plan:
+def plan_of(key: str, coefficients: Tensor, domain: Tensor) -> Plan:
     """The whole plan for coefficients `(*B, k)` and their domain, in their type."""
     coefficients = coefficients.detach()
     rest = _rest if torch.compiler.is_compiling() else _worked_out
-    return Plan(domain, *rest(coefficients, domain, name))
+    return Plan(domain, *rest(coefficients, domain, key))
 
 
-def _rounded(name: str, coefficients: Tensor) -> Tensor:
-    exact = _models[name].domain(precise(coefficients))
+def _rounded(key: str, coefficients: Tensor) -> Tensor:
+    exact = _models[key].domain(precise(coefficients))
     domain = exact.to(coefficients.dtype)
     domain = torch.where(domain.to(exact.dtype) > exact, torch.nextafter(domain, torch.zeros_like(domain)), domain)
     limits = torch.finfo(coefficients.dtype)
@@ -82,49 +99,56 @@ def _rounded(name: str, coefficients: Tensor) -> Tensor:
     return torch.where(overflows | underflows, 0, domain)
 
 
-def _worked_out(coefficients: Tensor, domain: Tensor, name: str) -> tuple[Tensor, ...]:
-    parts = _models[name].rest(precise(coefficients), precise(domain))
+def _worked_out(coefficients: Tensor, domain: Tensor, key: str) -> tuple[Tensor, ...]:
+    parts = _models[key].rest(precise(coefficients), precise(domain))
     return tuple(part.to(coefficients.dtype) for part in parts)
 
 
 @torch.library.custom_op("diffproj::lens_domain", mutates_args=())
-def _domain(coefficients: Tensor, name: str) -> Tensor:
-    (domain,) = _remembered(f"{name} domain", lambda c: (_rounded(name, c),), coefficients)
+def _domain(coefficients: Tensor, key: str) -> Tensor:
+    (domain,) = _remembered(f"{key} domain", lambda c: (_rounded(key, c),), coefficients)
     return domain
 
 
 @torch.library.custom_op("diffproj::lens_plan", mutates_args=())
-def _rest(coefficients: Tensor, domain: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _rest(coefficients: Tensor, domain: Tensor, key: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     reach, noise, rho_max, ratio = _remembered(
-        name, lambda c, reached: _worked_out(c, reached, name), coefficients, domain
+        key, lambda c, reached: _worked_out(c, reached, key), coefficients, domain
     )
     return reach, noise, rho_max, ratio
 
 
-def _remembered(name: str, function: Callable[..., tuple[Tensor, ...]], *arguments: Tensor) -> tuple[Tensor, ...]:
-    """Copies of the results, from memory if lately asked for. No memory on accelerators, where looking waits."""
+def _remembered(what: str, function: Callable[..., tuple[Tensor, ...]], *arguments: Tensor) -> tuple[Tensor, ...]:
+    """Copies of the results, from memory if lately asked for. No memory on accelerators, where looking waits.
+
+    Safe from any number of threads: whatever is found or worked out is held by this call alone, entries are never
+    changed, and the list is only touched under the lock. Two threads may work the same thing out at the same time.
+    """
     if arguments[0].device.type != "cpu":
         return tuple(part.contiguous() for part in function(*arguments))
-    for index, (known, values, _) in enumerate(_recent):
-        if known == name and all(
-            before.dtype == now.dtype and torch.equal(before, now)
-            for before, now in zip(values, arguments, strict=True)
-        ):
-            _recent.insert(0, _recent.pop(index))
+    with _lock:
+        entries = list(_recent)
+    for entry in entries:
+        if entry[0] == what and _alike(entry[1], arguments):
             break
     else:
-        _recent.insert(0, (name, tuple(argument.clone() for argument in arguments), function(*arguments)))
-        del _recent[RECENT:]
-    return tuple(part.clone(memory_format=torch.contiguous_format) for part in _recent[0][2])
+        entry = what, tuple(argument.clone() for argument in arguments), function(*arguments)
+    with _lock:
+        _recent[:] = [entry, *(other for other in _recent if other is not entry)][:RECENT]
+    return tuple(part.clone(memory_format=torch.contiguous_format) for part in entry[2])
+
+
+def _alike(before: tuple[Tensor, ...], now: tuple[Tensor, ...]) -> bool:
+    return all(a.dtype == b.dtype and torch.equal(a, b) for a, b in zip(before, now, strict=True))
 
 
 @_domain.register_fake
-def _domain_shape(coefficients: Tensor, name: str) -> Tensor:  # noqa: ARG001
+def _domain_shape(coefficients: Tensor, key: str) -> Tensor:  # noqa: ARG001
     return coefficients.new_empty(coefficients.shape[:-1])
 
 
 @_rest.register_fake
-def _rest_shapes(coefficients: Tensor, domain: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # noqa: ARG001
+def _rest_shapes(coefficients: Tensor, domain: Tensor, key: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # noqa: ARG001
     batch = coefficients.shape[:-1]
     reach, noise, rho_max, ratio = (coefficients.new_empty((*batch, *size)) for size in ((), (), (3,), (NODES,)))
     return reach, noise, rho_max, ratio
@@ -132,14 +156,14 @@ def _rest_shapes(coefficients: Tensor, domain: Tensor, name: str) -> tuple[Tenso
 
 @_domain.register_vmap
 def _domain_batched(
-    _info: object, in_dims: tuple[int | None, None], coefficients: Tensor, name: str
+    _info: object, in_dims: tuple[int | None, None], coefficients: Tensor, key: str
 ) -> tuple[Tensor, int]:
-    return _domain(coefficients.movedim(in_dims[0] or 0, 0), name), 0
+    return _domain(coefficients.movedim(in_dims[0] or 0, 0), key), 0
 
 
 @_rest.register_vmap
 def _rest_batched(
-    info: Any, in_dims: tuple[int | None, int | None, None], coefficients: Tensor, domain: Tensor, name: str
+    info: Any, in_dims: tuple[int | None, int | None, None], coefficients: Tensor, domain: Tensor, key: str
 ) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], tuple[int, int, int, int]]:
     coefficients, domain = with_batch_in_front(info, in_dims, coefficients, domain)
-    return _rest(coefficients, domain, name), (0, 0, 0, 0)
+    return _rest(coefficients, domain, key), (0, 0, 0, 0)

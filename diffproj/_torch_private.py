@@ -1,0 +1,31 @@
+"""Everything of PyTorch that this package uses and PyTorch does not promise to keep, in one place.
+
+A release of PyTorch that moves one of these breaks this file and its test, and nothing else.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import torch
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def in_functional_transform() -> bool:
+    """Whether the code runs under a transform of `torch.func`: `vmap`, `grad`, `jvp`, ..."""
+    return torch._C._functorch.peek_interpreter_stack() is not None  # type: ignore[attr-defined]
+
+
+def in_forward_mode() -> bool:
+    """Whether forward-mode differentiation is switched on, by `torch.func.jvp` or `torch.autograd.forward_ad`."""
+    return torch.autograd.forward_ad._current_level >= 0
+
+
+def constant_in_graphs(function: F) -> F:
+    """Mark a function that `torch.compile` is to call once, while it traces, and whose result is a constant.
+
+    `torch.compiler.assume_constant_result` sets the same mark, but imports the whole compiler to do so, which takes
+    as long as PyTorch itself.
+    """
+    function._dynamo_marked_constant = True  # type: ignore[attr-defined]
+    return function
