@@ -24,6 +24,7 @@ from diffproj._numerics import (
     broadcast_batches,
     check_same_kind,
     check_tensor,
+    converted,
     dot,
     entries,
     in_blocks,
@@ -149,7 +150,7 @@ class Camera:
 
     def to(self, *args: Any, **kwargs: Any) -> "Camera":
         """The camera in another dtype or on another device; takes what `torch.Tensor.to` takes."""
-        K, R, t = (part.to(*args, **kwargs) for part in (self.K, self.R, self.t))
+        K, R, t = (converted(part, *args, **kwargs) for part in (self.K, self.R, self.t))
         distortion = None if self.distortion is None else self.distortion.to(*args, **kwargs)
         return self._unchecked(K, R, t, distortion, self.size)
 

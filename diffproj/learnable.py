@@ -78,14 +78,14 @@ class LearnableCamera(GeometryModule):
         learn: which parts are learned, of `"focal"`, `"principal_point"`, `"distortion"` and `"pose"`; all that the
             camera has if left out. A mapping says it for each camera of a batch: from a part to booleans that
             broadcast to the batch shape.
-        one_camera: whether the last batch axis counts poses of one camera, with one K and one lens. If left out, they
-            do where the camera was only expanded over them, which is how `camera.at(R, t)` and calibrations make it; a
-            change of dtype or picking by a list makes copies, and then it has to be said.
+        tied_intrinsics: whether the cameras along a batch axis are one camera at several poses, with one K and one lens
+            to learn. If left out, they are where all start with the same values. True demands it of the last axis;
+            with False each camera learns its own, however they start.
 
     Raises:
         TypeError: no camera, or one with a lens of another library.
         ValueError: an unknown part, `"distortion"` of a pinhole, booleans that do not fit or that part what is one
-            parameter, or `one_camera` of different ones.
+            parameter, or `tied_intrinsics` of different ones.
 
     Example:
         >>> import diffproj as dp
@@ -105,7 +105,7 @@ class LearnableCamera(GeometryModule):
     """
 
     def __init__(
-        self, camera: Camera | PinholeCamera, learn: Learn | None = None, one_camera: bool | None = None
+        self, camera: Camera | PinholeCamera, learn: Learn | None = None, tied_intrinsics: bool | None = None
     ) -> None:
         super().__init__()
         camera = as_camera(camera).detach()
@@ -116,16 +116,15 @@ class LearnableCamera(GeometryModule):
         chosen = learned_parts(available if learn is None else learn, available)
         self.learn, self.size, self.batch_shape = tuple(chosen), camera.size, camera.batch_shape
         self._lens = None if lens is None else type(lens)
-        K = _once(camera.K, 2, one_camera)
+        coefficients = camera.K[..., 0, :0] if lens is None else lens.expand(*self.batch_shape).coefficients
+        tied = _tied_axes(camera.K, coefficients, tied_intrinsics)
+        K, coefficients = (_first_along(tied, part) for part in (camera.K, coefficients))
         focal = K[..., 0, :2]
         self.register_buffer("K_0", K.clone())
         self.register_buffer("R_0", camera.R.clone())
         self.register_buffer("t_0", camera.t.clone())
         reach = camera.t.norm(dim=-1, keepdim=True)
         self.register_buffer("reach", torch.where(reach > 0, reach, 1.0))
-        coefficients = (
-            focal[..., :0] if lens is None else _once(lens.expand(*self.batch_shape).coefficients, 1, one_camera)
-        )
         self.register_buffer("coefficients_0", coefficients.clone())
         likes = {"focal": focal, "principal_point": focal, "distortion": coefficients, "pose": camera.t}
         for part, names in _PARAMETERS.items():
@@ -289,15 +288,23 @@ def _points(board: HasPoints, camera: Camera) -> Tensor:
     return board.points.to(camera.K)
 
 
-def _once(tensor: Tensor, trailing: int, one_camera: bool | None) -> Tensor:
-    """The tensor with length 1 along the batch axes over which it is the same camera."""
-    batch = tensor.ndim - trailing
-    for axis in range(batch):
-        last = axis == batch - 1
-        expanded = tensor.shape[axis] > 1 and tensor.stride(axis) == 0
-        first = tensor.narrow(axis, 0, 1)
-        if last and one_camera and not bool((tensor == first).all()):
-            raise ValueError("one_camera: want one K and one lens for all poses, got different ones")
-        if expanded if one_camera is None or not last else one_camera:
-            tensor = first
+def _tied_axes(K: Tensor, coefficients: Tensor, tied: bool | None) -> list[int]:
+    """The batch axes along which K `(*B, 3, 3)` and lens `(*B, k)` are those of one camera."""
+    if tied is False:
+        return []
+    batch = K.ndim - 2
+    axes = [axis for axis in range(batch) if all(_alike_along(axis, part) for part in (K, coefficients))]
+    if tied and batch and batch - 1 not in axes:
+        raise ValueError("tied_intrinsics: want one K and one lens for all poses, got different ones")
+    return axes
+
+
+def _alike_along(axis: int, tensor: Tensor) -> bool:
+    return bool((tensor == tensor.narrow(axis, 0, 1)).all())
+
+
+def _first_along(axes: list[int], tensor: Tensor) -> Tensor:
+    """The tensor with length 1 along these axes."""
+    for axis in axes:
+        tensor = tensor.narrow(axis, 0, 1)
     return tensor

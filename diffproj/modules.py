@@ -92,6 +92,8 @@ class PlaneProjector(GeometryModule):
         learn: what is learned along: any of `"focal"`, `"principal_point"`, `"distortion"`, `"pose"` and `"plane"`;
             nothing if left out, and then the map is built once. A mapping says it for each camera, or plane, of a
             batch, as for `LearnableCamera`: `{"focal": True, "pose": torch.tensor([True, False])}`.
+        tied_intrinsics: whether the cameras of a batch learn one K and one lens, as for `LearnableCamera`: if left out,
+            where all start with the same.
 
     Raises:
         TypeError: no camera or no plane, or different dtypes.
@@ -107,7 +109,9 @@ class PlaneProjector(GeometryModule):
 
     _frozen_coefficients: Tensor
 
-    def __init__(self, camera: Camera | PinholeCamera, plane: Plane, learn: Learn = ()) -> None:
+    def __init__(
+        self, camera: Camera | PinholeCamera, plane: Plane, learn: Learn = (), tied_intrinsics: bool | None = None
+    ) -> None:
         super().__init__()
         camera = as_camera(camera).detach()
         PlaneMap(camera, plane)  # checks that they fit together
@@ -115,7 +119,7 @@ class PlaneProjector(GeometryModule):
         chosen = learned_parts(learn, (*PARTS, "plane"))
         self.learn = tuple(chosen)
         whole = chosen.pop("plane", False)
-        self._camera = LearnableCamera(camera, chosen)
+        self._camera = LearnableCamera(camera, chosen, tied_intrinsics)
         away = ((plane.normal * camera.center).sum(-1) - plane.offset).abs() / plane.normal.norm(dim=-1)
         self._plane = LearnablePlane(plane, float(away.mean()) or 1.0, whole)
         # Buffers, so that whatever swaps or writes a module's state (DDP, functional_call) does so here, too.

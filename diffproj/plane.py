@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from diffproj import _pytree
-from diffproj._numerics import broadcast_batches, check_same_kind, check_tensor, dot, index_batch, readable
+from diffproj._numerics import broadcast_batches, check_same_kind, check_tensor, converted, dot, index_batch, readable
 
 Numbers = Sequence[float] | float
 
@@ -168,7 +168,7 @@ class Plane:
 
     def to(self, *args: Any, **kwargs: Any) -> "Plane":
         """The plane in another dtype or on another device; takes what `torch.Tensor.to` takes."""
-        normal, offset = self.normal.to(*args, **kwargs), self.offset.to(*args, **kwargs)
+        normal, offset = (converted(part, *args, **kwargs) for part in (self.normal, self.offset))
         return self._unchecked(normal, offset, self.is_per_point)
 
     def detach(self) -> "Plane":

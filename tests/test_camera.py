@@ -292,3 +292,14 @@ def test_what_another_library_cannot_hold_is_refused(lens_camera: dp.Camera, cam
         dp.Camera.from_kornia(pinhole)
     with pytest.raises(TypeError, match="camera: want dp.Camera or kornia"):
         dp.back_project(torch.zeros(1, 2), "camera", dp.Plane.z(0.0))
+
+
+def test_converting_keeps_one_camera_in_memory_once(lens_camera: dp.Camera) -> None:
+    poses = lens_camera.at(lens_camera.R.expand(1000, 3, 3), torch.randn(1000, 3, dtype=D))
+    single = poses.to(torch.float32)
+    assert single.K.untyped_storage().nbytes() == 9 * 4
+    assert single.distortion.coefficients.untyped_storage().nbytes() == 5 * 4
+    assert torch.equal(single.t, poses.t.float())
+    assert torch.equal(single.K, poses.K.float())
+    plane = dp.Plane(torch.tensor([0.0, 0, 1], dtype=D).expand(50, 3), torch.arange(50, dtype=D))
+    assert plane.to(torch.float32).normal.untyped_storage().nbytes() == 3 * 4

@@ -110,15 +110,68 @@ def test_a_camera_at_the_origin_can_move(camera: dp.Camera) -> None:
     assert (learnable.translation.grad == 1).all()
 
 
-def test_one_camera_may_have_to_be_said(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
-    _, _, best = rough
-    copies = best.cameras.to(torch.float32)
-    assert dp.LearnableCamera(copies, one_camera=True).log_focal.shape == (1, 2)
-    assert dp.LearnableCamera(best.cameras, one_camera=False).log_focal.shape == (5, 2)
-    K = best.cameras.K.clone()
-    K[2, 0, 0] += 1
-    with pytest.raises(ValueError, match="one_camera: want one K and one lens"):
-        dp.LearnableCamera(dp.Camera(K, best.cameras.R, best.cameras.t), one_camera=True)
+def same_cameras(cameras: dp.Camera) -> dict[str, dp.Camera]:
+    """Poses of one camera, expanded or as copies, by all the ways that make the one or the other."""
+    K, lens = cameras.K.contiguous(), cameras.distortion
+    return {
+        "as calibrated": cameras,
+        "copied": dp.Camera(K.clone(), cameras.R, cameras.t, dp.BrownConrady(lens.coefficients.clone())),
+        "float32": cameras.to(torch.float32),
+        "picked": cameras[[0, 2, 3]],
+        "a slice": cameras[1:],
+        "a mask": cameras[torch.tensor([True, False, True, True, False])],
+        "two axes": cameras[None].at(cameras.R.expand(2, 5, 3, 3), cameras.t.expand(2, 5, 3)),
+    }
+
+
+@pytest.mark.parametrize("how", ["as calibrated", "copied", "float32", "picked", "a slice", "a mask", "two axes"])
+def test_poses_of_one_camera_learn_one_intrinsics(how: str, rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
+    cameras = same_cameras(rough[2].cameras)[how]
+    batch = tuple(cameras.batch_shape)
+    once = (1,) * len(batch)
+    learnable = dp.LearnableCamera(cameras)
+    projector = dp.PlaneProjector(cameras, dp.Plane.z(0.0), ("focal", "principal_point", "distortion"))
+    for module in (learnable, projector):
+        shapes = {name.split(".")[-1]: tuple(p.shape) for name, p in module.named_parameters()}
+        assert shapes["log_focal"] == shapes["principal_point"] == (*once, 2)
+        assert shapes["distortion"] == (*once, 4)
+    assert torch.equal(learnable().K, cameras.K)
+    for module in (
+        dp.LearnableCamera(cameras, None, False),
+        dp.PlaneProjector(cameras, dp.Plane.z(0.0), "focal", False),
+    ):
+        assert next(p for n, p in module.named_parameters() if "log_focal" in n).shape == (*batch, 2)
+
+
+def test_different_cameras_learn_their_own(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
+    cameras = rough[2].cameras
+    K, coefficients = cameras.K.clone(), cameras.distortion.coefficients.clone()
+    K[2, 0, 0] += 1e-9
+    coefficients[1, 0] += 1e-12
+    other_K = dp.Camera(K, cameras.R, cameras.t, cameras.distortion)
+    other_lens = dp.Camera(cameras.K, cameras.R, cameras.t, dp.BrownConrady(coefficients))
+    for different in (other_K, other_lens):
+        learnable = dp.LearnableCamera(different)
+        assert learnable.log_focal.shape == (5, 2)
+        assert learnable.distortion.shape == (5, 4)
+        projector = dp.PlaneProjector(different, dp.Plane.z(0.0), "distortion")
+        assert [tuple(p.shape) for p in projector.parameters()] == [(5, 4)]
+        for module in (dp.LearnableCamera, lambda *a: dp.PlaneProjector(a[0], dp.Plane.z(0.0), (), a[2])):
+            with pytest.raises(ValueError, match="tied_intrinsics: want one K and one lens"):
+                module(different, None, True)
+
+
+def test_training_in_float32_keeps_one_camera(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
+    camera, views, _ = rough
+    learnable = dp.LearnableCamera(_one_intrinsics(camera).to(torch.float32))
+    optimiser = torch.optim.Adam(learnable.parameters(), lr=1e-3)
+    for _ in range(3):
+        optimiser.zero_grad()
+        cost(learnable, views.to(torch.float32)).backward()
+        optimiser.step()
+    now = learnable()
+    assert (now.K[:1] == now.K).all()
+    assert not torch.equal(now.K[0], camera.K[0].float())
 
 
 def test_starts_as_the_camera_it_was_made_from(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj import _pytree
-from diffproj._numerics import broadcast_batches, check_tensor, lifted, readable
+from diffproj._numerics import broadcast_batches, check_tensor, converted, lifted, readable
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 """What tensors are made of here; nested lists become float64."""
@@ -179,10 +179,10 @@ class Views:
             >>> Views(torch.rand(5, 54, 2)).to(torch.float64).dtype
             torch.float64
         """
-        pixels = self.pixels.to(*args, **kwargs)
+        pixels = converted(self.pixels, *args, **kwargs)
         if not pixels.is_floating_point():
             raise TypeError(f"dtype: want a floating-point one, got {pixels.dtype}")
-        return self._unchecked(lifted(pixels), self.visible.to(pixels.device), self.names, self.size)
+        return self._unchecked(lifted(pixels), converted(self.visible, pixels.device), self.names, self.size)
 
 
 _pytree.register(Views, children=("pixels", "visible"), static=("names", "size"))
