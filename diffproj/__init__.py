@@ -18,23 +18,41 @@ Conventions, which hold everywhere:
 * The world's unit is whatever the board's square is given in. RMS is OpenCV's: `sqrt(sum |e|^2 / number of points)`.
 """
 
-from diffproj.back_projection import PlaneMap, Reason, back_project, explain
-from diffproj.board import BoardNotFoundError, BoardNotFoundWarning, Chessboard, Views, detect, example_views
-from diffproj.calibration import Calibration, CalibrationError, Covariance, Status, calibrate, locate, refine
-from diffproj.camera import Camera
-from diffproj.experiment import Experiment, run_experiment
-from diffproj.files import load_calibration, load_camera, save_camera
-from diffproj.learnable import LearnableCamera, image_residuals, plane_residuals
-from diffproj.lens import BrownConrady, KannalaBrandt, Lens
-from diffproj.losses import Cauchy, Huber, Loss, SoftL1
-from diffproj.maps import AccuracyMap, image_map, plane_map
-from diffproj.measurement import Measurement, Quantity, measure
-from diffproj.modules import CalibrationPrior, LearnablePlane, PlaneLoss, PlaneProjector, ground_resolution
-from diffproj.paper_route import paper_route
-from diffproj.plane import Plane
-from diffproj.rectification import plane_axes, rectify, render
-from diffproj.rotation import euler_from_rotation, rotation_from_euler
-from diffproj.validation import CrossValidation, bootstrap, cross_validate
+from importlib import import_module
+from typing import Any
+
+from diffproj.calibration.calibrate import calibrate, locate, refine
+from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.losses import Cauchy, Huber, Loss, SoftL1
+from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.calibration.solver import Status
+from diffproj.calibration.validation import CrossValidation, bootstrap, cross_validate
+from diffproj.files.load import load_calibration, load_camera
+from diffproj.files.save import save_camera
+from diffproj.geometry.back_projection import PlaneMap, Reason, back_project, explain, ground_resolution
+from diffproj.geometry.camera import Camera
+from diffproj.geometry.euler import euler_from_rotation, rotation_from_euler
+from diffproj.geometry.plane import Plane
+from diffproj.geometry.rectification import plane_axes, rectify, render
+from diffproj.lens.brown_conrady import BrownConrady
+from diffproj.lens.kannala_brandt import KannalaBrandt
+from diffproj.lens.protocol import Lens
+from diffproj.measurement.accuracy_map import AccuracyMap, image_map, plane_map
+from diffproj.measurement.measure import Measurement, Quantity, measure
+from diffproj.nn.camera import LearnableCamera
+from diffproj.nn.loss import PlaneLoss
+from diffproj.nn.plane import LearnablePlane
+from diffproj.nn.prior import CalibrationPrior
+from diffproj.nn.projector import PlaneProjector
+from diffproj.paper.experiment import Experiment, run_experiment
+from diffproj.paper.route import paper_route
+from diffproj.paper.setup import PaperSetup, paper_setup
+from diffproj.targets import synthetic as synthetic
+from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.detection import BoardNotFoundError, BoardNotFoundWarning, detect
+from diffproj.targets.examples import example_views
+from diffproj.targets.residuals import image_residuals, plane_residuals
+from diffproj.targets.views import Views
 
 __version__ = "0.1.0"
 
@@ -59,6 +77,7 @@ __all__ = [
     "Lens",
     "Loss",
     "Measurement",
+    "PaperSetup",
     "Plane",
     "PlaneLoss",
     "PlaneMap",
@@ -84,6 +103,7 @@ __all__ = [
     "locate",
     "measure",
     "paper_route",
+    "paper_setup",
     "plane_axes",
     "plane_map",
     "plane_residuals",
@@ -94,3 +114,10 @@ __all__ = [
     "run_experiment",
     "save_camera",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """`diffproj.figures` at its first use: it needs matplotlib, which nothing else does."""
+    if name == "figures":
+        return import_module("diffproj.figures")
+    raise AttributeError(f"module 'diffproj' has no attribute {name!r}")

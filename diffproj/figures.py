@@ -7,8 +7,8 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from diffproj.experiment import Experiment
-from diffproj.maps import AccuracyMap
+from diffproj.measurement.accuracy_map import AccuracyMap
+from diffproj.paper.experiment import Experiment
 
 EXACT, APPROXIMATED, ERROR = "#8a8f98", "#0b6bcb", "#d6336c"
 

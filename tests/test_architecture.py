@@ -10,16 +10,12 @@ import diffproj
 PACKAGE = Path(diffproj.__file__).parent
 
 LEVELS = (
-    ("_atomic", "_pytree", "_torch_private"),
-    ("_numerics",),
-    ("losses", "rotation", "interop", "intrinsics", "lens"),
-    ("solver",),
-    ("camera", "plane"),
-    ("back_projection", "paper_route"),
-    ("board", "rectification"),
-    ("calibration", "learnable", "synthetic"),
-    ("experiment", "files", "measurement", "modules", "validation"),
-    ("maps",),
+    ("_core",),
+    ("lens",),
+    ("geometry",),
+    ("targets",),
+    ("calibration",),
+    ("files", "measurement", "nn", "paper"),
     ("figures",),
     ("cli",),
     ("__main__",),

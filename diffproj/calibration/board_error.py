@@ -12,17 +12,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from diffproj.back_projection import back_project
 from diffproj.calibration.reprojection import COEFFICIENTS, Reprojection, make_lens
-from diffproj.camera import Camera
-from diffproj.intrinsics import intrinsic_matrix
-from diffproj.plane import Plane
-from diffproj.solver import LocalState
+from diffproj.calibration.solver import LocalState
+from diffproj.geometry.back_projection import back_project
+from diffproj.geometry.camera import Camera
+from diffproj.geometry.intrinsics import intrinsic_matrix
+from diffproj.geometry.plane import Plane
 
 
 @dataclass(eq=False)
 class BoardError(Reprojection):
-    """The residuals on the board, as a problem of `diffproj.solver`; the attributes are those of `Reprojection`."""
+    """The residuals on the board, as a problem of `solver.solve`; the attributes are those of `Reprojection`."""
 
     def linearise(self, shared: Tensor, local: LocalState) -> Tensor:
         """The panel in world units; not finite where a corner that counts cannot be put back on the board."""

@@ -15,20 +15,20 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from diffproj.board import Views
-from diffproj.calibration import initial, start
+from diffproj.calibration import closed_form, start
 from diffproj.calibration.board_error import assembled
 from diffproj.calibration.covariance import Covariance, reshaped
 from diffproj.calibration.data import Data, PlanarTarget
 from diffproj.calibration.fit import Fit, Progress, Task, fit
 from diffproj.calibration.implicit import differentiated
-from diffproj.calibration.parameters import Priors, free_basis, held_at, make_prior
+from diffproj.calibration.losses import Loss
+from diffproj.calibration.parametrisation import Priors, free_basis, held_at, make_prior
 from diffproj.calibration.reprojection import COEFFICIENTS, LensModel, shared_names
 from diffproj.calibration.result import Calibration, CalibrationError, Objective
+from diffproj.calibration.solver import Prior, Solution, Status, chosen
 from diffproj.calibration.verdict import verdicts
-from diffproj.camera import Camera, as_camera
-from diffproj.losses import Loss
-from diffproj.solver import Prior, Solution, Status, chosen
+from diffproj.geometry.camera import Camera, as_camera
+from diffproj.targets.views import Views
 
 REJECT = 5.0
 """Robust deviations beyond which a corner is an outlier: of Gaussian residuals, 4 in a million."""
@@ -101,7 +101,7 @@ def calibrate(
     if views.size is None:
         raise ValueError("views: want the photographs' size, got None; give Views(..., size=(width, height))")
     options = _Options(objective, bow, fixed, tied_focal, priors, loss, reject_outliers)
-    shared, local = initial.from_nothing(data, distortion, views.size, tied_focal, bow)
+    shared, local = start.from_nothing(data, distortion, views.size, tied_focal, bow)
     steps = {"max_iterations": max_iterations, "tolerance": tolerance, "progress": progress}
     # The start is a guess from the corners; what is held, or known, is not.
     reference = shared.clone()
@@ -179,7 +179,7 @@ def refine(
     data = Data(views, board, weights)
     camera = as_camera(camera)
     options = _Options(objective, bow, fixed, tied_focal, priors, loss, reject_outliers)
-    shared, local, model = initial.from_camera(camera, data, bow)
+    shared, local, model = start.from_camera(camera, data, bow)
     steps = {"max_iterations": max_iterations, "tolerance": tolerance, "progress": progress}
     found, prior = _fitted(data, options, model, shared, local, shared, **steps)
     if differentiable:
@@ -242,7 +242,7 @@ def locate(
             f"camera: want a batch shape that broadcasts to {tuple(data.batch)}, got {tuple(camera.batch_shape)}; "
             "index it, or take calibration.camera"
         )
-    shared, (R, t), model = initial.from_camera(camera, data, bow=False)
+    shared, (R, t), model = start.from_camera(camera, data, bow=False)
     # Each view is a problem of its own, with a step and an end of its own, from each of its two starts.
     V = len(views)
     single = Task(
@@ -255,7 +255,7 @@ def locate(
         basis=shared.new_zeros(len(shared) * V, shared.shape[-1], 0),
     )
     held = shared.repeat_interleave(V, dim=0)
-    starts = (R, t), start.other_pose(R, t, data.points)
+    starts = (R, t), closed_form.other_pose(R, t, data.points)
     one, other = (
         fit(
             single,

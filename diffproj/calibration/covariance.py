@@ -1,6 +1,6 @@
 """The covariance of a calibration: of intrinsics, lens and every pose together, kept in blocks.
 
-Let the normal equations at the minimum have the blocks `U, E_v, W_v` (see `diffproj.solver`), and let the scores, the
+Let the normal equations at the minimum have the blocks `U, E_v, W_v` (see `solver.py`), and let the scores, the
 gradients of the residuals' cost, have covariances `M`. By first order of the minimiser
 
     dx   = -S^-1 sum u_v              u_v = g_v - F_v h_v     F_v = E_v W_v^-1     S = U - sum E_v W_v^-1 E_v^T
@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj.solver import Equations
+from diffproj.calibration.solver import Equations
 
 SINGULAR = 2e-15
 """Eigenvalue of the reduced equations, relative to the unreduced ones, at and below which it is rounding."""

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._numerics import precise
-from diffproj.board import Views
+from diffproj._core.numerics import precise
 from diffproj.calibration.fit import Task
 from diffproj.calibration.reprojection import LensModel
+from diffproj.targets.views import Views
 
 
 @runtime_checkable

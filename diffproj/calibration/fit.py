@@ -15,10 +15,10 @@ from torch import Tensor
 from diffproj.calibration import covariance as covariances
 from diffproj.calibration.board_error import BoardError
 from diffproj.calibration.covariance import Covariance, Scores
+from diffproj.calibration.losses import Loss
 from diffproj.calibration.reprojection import POSE, LensModel, Reprojection, shared_names
 from diffproj.calibration.result import Objective
-from diffproj.losses import Loss
-from diffproj.solver import Equations, Prior, Solution, chosen, solve
+from diffproj.calibration.solver import Equations, Prior, Solution, chosen, solve
 
 BLOCK_CORNERS = 24_000
 """Corners solved at once on a CPU, those of some thirty cameras of 13 views: enough to hide the cost of calls, and few

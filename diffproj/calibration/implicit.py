@@ -11,13 +11,13 @@ theta to rounding. H has the arrow shape of the normal equations and is reduced 
 import torch
 from torch import Tensor
 
-from diffproj.back_projection import back_project
 from diffproj.calibration.board_error import assembled
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, Task
 from diffproj.calibration.reprojection import POSE, bow_shape, moved
-from diffproj.plane import Plane
-from diffproj.solver import Prior
+from diffproj.calibration.solver import Prior
+from diffproj.geometry.back_projection import back_project
+from diffproj.geometry.plane import Plane
 
 
 def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:

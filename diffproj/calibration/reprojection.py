@@ -22,8 +22,9 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.lens_derivatives import brown_conrady, fisheye, pinhole
-from diffproj.lens import BrownConrady, KannalaBrandt
-from diffproj.solver import LocalState
+from diffproj.calibration.solver import LocalState
+from diffproj.lens.brown_conrady import BrownConrady
+from diffproj.lens.kannala_brandt import KannalaBrandt
 
 LensModel = Literal["none", "brown4", "brown5", "brown8", "brown12", "brown14", "fisheye"]
 """The lenses that can be fitted: none, Brown-Conrady by its number of coefficients, Kannala-Brandt."""
@@ -103,7 +104,7 @@ def _cross_generators(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 @dataclass(eq=False)
 class Reprojection:
-    """The residuals on the image, as a problem of `diffproj.solver`.
+    """The residuals on the image, as a problem of `diffproj.calibration.solver`.
 
     Attributes:
         points: the board's points `(N, 3)`, flat.

@@ -9,12 +9,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from diffproj.board import Views
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.reprojection import COEFFICIENT_NAMES, bow_shape
-from diffproj.camera import Camera
-from diffproj.lens import BrownConrady, KannalaBrandt
-from diffproj.solver import Status
+from diffproj.calibration.solver import Status
+from diffproj.geometry.camera import Camera
+from diffproj.lens.brown_conrady import BrownConrady
+from diffproj.lens.kannala_brandt import KannalaBrandt
+from diffproj.targets.views import Views
 
 Objective = Literal["image", "plane"]
 """What is minimised: the distance on the image in pixels, or on the board in world units."""

@@ -5,10 +5,10 @@ import math
 import torch
 from torch import Tensor
 
-from diffproj.board import Chessboard
+from diffproj.calibration.closed_form import homographies
 from diffproj.calibration.fit import Fit, Task
-from diffproj.calibration.start import homographies
-from diffproj.solver import Status
+from diffproj.calibration.solver import Status
+from diffproj.targets.chessboard import Chessboard
 
 WORST_DEVIATION = 0.1
 """Standard deviation of a focal length or principal point, relative to the focal length, beyond which the views are

@@ -9,11 +9,11 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from diffproj.board import BoardNotFoundWarning
-from diffproj.calibration import CalibrationError
+from diffproj.calibration.result import CalibrationError
 from diffproj.cli import calibrate, experiment, measure
 from diffproj.cli.inputs import shielded
 from diffproj.cli.terminal import failure, note
+from diffproj.targets.detection import BoardNotFoundWarning
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -8,12 +8,15 @@ from typing import get_args
 from rich.markup import escape
 from rich.table import Table
 
-from diffproj.board import Chessboard
-from diffproj.calibration import Calibration, LensModel, calibrate
+from diffproj.calibration.calibrate import calibrate
+from diffproj.calibration.reprojection import LensModel
+from diffproj.calibration.result import Calibration
 from diffproj.cli.inputs import Commands, board_size, camera_file, find_corners, photographs, square_side
 from diffproj.cli.terminal import RESULTS, aligned, progress_bars, result, rounded
-from diffproj.files import save_camera
-from diffproj.lens import BrownConrady, KannalaBrandt
+from diffproj.files.save import save_camera
+from diffproj.lens.brown_conrady import BrownConrady
+from diffproj.lens.kannala_brandt import KannalaBrandt
+from diffproj.targets.chessboard import Chessboard
 
 DESCRIPTION = """\
 Finds a camera from photographs of a chessboard: focal lengths, principal point

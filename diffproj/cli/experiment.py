@@ -7,14 +7,18 @@ from typing import get_args
 from rich.markup import escape
 from rich.table import Table
 
-from diffproj import figures, synthetic
-from diffproj._atomic import write_whole
-from diffproj.board import Chessboard, Views, example_views
-from diffproj.calibration import LensModel
+from diffproj import figures
+from diffproj._core.atomic import write_whole
+from diffproj.calibration.reprojection import LensModel
 from diffproj.cli.inputs import Commands, board_size, find_corners, photographs, square_side
 from diffproj.cli.terminal import RESULTS, progress_bars, result
-from diffproj.experiment import Experiment, choose, default_split, parse_split, run_experiment
-from diffproj.files import save_camera
+from diffproj.files.save import save_camera
+from diffproj.paper.experiment import Experiment, choose, default_split, parse_split, run_experiment
+from diffproj.paper.setup import paper_setup
+from diffproj.targets import synthetic
+from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.examples import example_views
+from diffproj.targets.views import Views
 
 
 def add_command(commands: Commands) -> None:
@@ -99,7 +103,7 @@ def _corners(options: argparse.Namespace) -> tuple[Views, Chessboard, tuple[list
             views = find_corners(photographs(options.images), board, bars)
         return views, board, default_split(len(views))
     if options.data == "synthetic":
-        setup = synthetic.paper_setup()
+        setup = paper_setup()
         with progress_bars() as bars:
             cameras = [setup.cameras[i] for i in range(len(setup.names))]
             images = [

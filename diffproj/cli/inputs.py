@@ -9,8 +9,10 @@ from typing import Any
 
 from rich.progress import Progress
 
-from diffproj.board import Chessboard, Views, detect
-from diffproj.board.images import SUFFIXES, Source, listed
+from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.detection import detect
+from diffproj.targets.images import SUFFIXES, Source, listed
+from diffproj.targets.views import Views
 
 Commands = Any  # argparse's own type for what add_subparsers returns is private
 CAMERA_SUFFIXES = (".json", ".yaml", ".yml", ".xml")

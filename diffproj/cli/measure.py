@@ -11,23 +11,16 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from diffproj.back_projection import Reason, explain
-from diffproj.board import Chessboard
-from diffproj.calibration import Calibration, CalibrationError, locate
-from diffproj.camera import Camera
-from diffproj.cli.inputs import (
-    Commands,
-    board_size,
-    camera_file,
-    find_corners,
-    numbers,
-    photographs,
-    square_side,
-)
+from diffproj.calibration.calibrate import locate
+from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.cli.inputs import Commands, board_size, camera_file, find_corners, numbers, photographs, square_side
 from diffproj.cli.terminal import RESULTS, aligned, progress_bars, result, rounded
-from diffproj.files import load_calibration, load_camera
-from diffproj.measurement import Measurement, Quantity, measure
-from diffproj.plane import Plane
+from diffproj.files.load import load_calibration, load_camera
+from diffproj.geometry.back_projection import Reason, explain
+from diffproj.geometry.camera import Camera
+from diffproj.geometry.plane import Plane
+from diffproj.measurement.measure import Measurement, Quantity, measure
+from diffproj.targets.chessboard import Chessboard
 
 DESCRIPTION = """\
 Turns pixels of a photograph into points on a plane, and prints them with the

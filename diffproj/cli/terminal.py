@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from diffproj.calibration import CalibrationError, Status
+from diffproj.calibration.result import CalibrationError
+from diffproj.calibration.solver import Status
 
 RESULTS = Console(highlight=False, emoji=False)
 NOTES = Console(stderr=True, highlight=False, emoji=False)

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj import _pytree
-from diffproj._numerics import in_blocks
+from diffproj._core import pytree
+from diffproj._core.numerics import in_blocks
 from diffproj.lens import brown_domain
 from diffproj.lens.brown_equations import COUNTS, Terms, bend, radial
 from diffproj.lens.brown_inverse import newton, search, squared_domain, untilted
@@ -153,4 +153,4 @@ class BrownConrady(CoefficientLens):
         return reach, noise, table.rho_max, table.ratio
 
 
-_pytree.register(BrownConrady, children=("coefficients",))
+pytree.register(BrownConrady, children=("coefficients",))

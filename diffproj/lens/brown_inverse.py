@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._numerics import precise, readable
+from diffproj._core.numerics import precise, readable
 from diffproj.lens.brown_equations import Jacobian, Terms, bend, bend_off, newton_direction, term_growth, tilted
 from diffproj.lens.compiling import coordinates, with_batch_in_front
 from diffproj.lens.plan import Plan

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._numerics import broadcast_batches, check_same_kind, check_tensor, converted, index_batch, readable
+from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, converted, index_batch, readable
 from diffproj.lens.plan import AXES, Model, Plan, domain_of, plan_of, register_model
 
 L = TypeVar("L", bound="CoefficientLens")

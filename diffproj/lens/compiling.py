@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._numerics import wants_derivative
-from diffproj._torch_private import constant_in_graphs, in_forward_mode, in_functional_transform
+from diffproj._core.numerics import wants_derivative
+from diffproj._core.torch_private import constant_in_graphs, in_forward_mode, in_functional_transform
 
 
 def derivative_wanted(*tensors: Tensor) -> bool:

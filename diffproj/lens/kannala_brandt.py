@@ -21,8 +21,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj import _pytree
-from diffproj._numerics import in_blocks, precise, readable
+from diffproj._core import pytree
+from diffproj._core.numerics import in_blocks, precise, readable
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.compiling import coordinates, derivative_wanted, with_batch_in_front
 from diffproj.lens.domain import first_failure
@@ -154,7 +154,7 @@ class KannalaBrandt(CoefficientLens):
         return rise(end.unsqueeze(-1)).squeeze(-1), noise, table.rho_max, table.ratio
 
 
-_pytree.register(KannalaBrandt, children=("coefficients",))
+pytree.register(KannalaBrandt, children=("coefficients",))
 
 
 def _angles(like: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffproj._numerics import precise
+from diffproj._core.numerics import precise
 from diffproj.lens.compiling import with_batch_in_front
 from diffproj.lens.table import NODES
 

@@ -19,11 +19,11 @@ class Lens(Protocol):
     **A lens of your own** needs no base class. Give it these attributes and methods and a camera accepts it. Tensors
     of the lens carry its batch axes in front (`coefficients (*B, k)`), which broadcast against those of the points. To
     be carried by `vmap`, `torch.func` and `torch.compile` it must be known to `torch.utils._pytree` as well;
-    `diffproj._pytree.register` is how the lenses of this package do it.
+    `diffproj._core.pytree.register` is how the lenses of this package do it.
 
     Example:
-        >>> from diffproj.lens import BrownConrady, Lens
-        >>> isinstance(BrownConrady(torch.zeros(5)), Lens)
+        >>> import diffproj as dp
+        >>> isinstance(dp.BrownConrady(torch.zeros(5)), dp.Lens)
         True
     """
 

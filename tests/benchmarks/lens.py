@@ -14,7 +14,7 @@ import kornia.geometry
 import numpy as np
 import torch
 
-from diffproj.lens import BrownConrady
+from diffproj.lens.brown_conrady import BrownConrady
 
 CASES = {
     "5 coefficients": [-0.2535, 0.0924, -0.0006, 0.0007, -0.0191],

@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffproj.lens import BrownConrady, KannalaBrandt
+from diffproj.lens.brown_conrady import BrownConrady
+from diffproj.lens.kannala_brandt import KannalaBrandt
 
 CASES = {
     "brown5": (BrownConrady, [-0.2535, 0.0924, -0.0006, 0.0007, -0.0191]),

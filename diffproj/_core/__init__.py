@@ -1,0 +1,1 @@
+"""What every room builds on: numerical ground rules, trees of tensors, whole files, PyTorch's insides."""

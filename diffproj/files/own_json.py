@@ -1,0 +1,205 @@
+"""The own JSON: any batch of cameras, or a whole calibration with its corners and its covariance."""
+
+import json
+import math
+import re
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.result import Calibration
+from diffproj.geometry.camera import Camera
+from diffproj.lens.brown_conrady import BrownConrady
+from diffproj.lens.kannala_brandt import KannalaBrandt
+from diffproj.targets.views import Views
+
+JSON_FORMAT = "diffproj camera"
+
+
+JSON_VERSION = 1
+
+
+_LENSES = {"BrownConrady": BrownConrady, "KannalaBrandt": KannalaBrandt}
+
+
+def dumps(item: Camera | Calibration) -> str:
+    """A camera or a calibration as the text of a file.
+
+    Raises:
+        ValueError: a lens of another library.
+    """
+    return _readable(json.dumps(_without_nan(_document(item)), indent=1, allow_nan=False))
+
+
+def read_camera(path: Path) -> Camera:
+    """The camera of a file; of a calibration, the one without a pose.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no camera file of this package, or damaged.
+    """
+    return _camera(path, _read(path)["camera"])
+
+
+def read_calibration(path: Path) -> Calibration:
+    """The calibration in a file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no camera file of this package, holds a camera alone, or is damaged.
+    """
+    document = _read(path)
+    if "calibration" not in document:
+        raise ValueError(f"{path}: want a calibration, got a camera alone; load_camera reads it")
+    camera = _camera(path, document["camera"])
+    try:
+        found = document["calibration"]
+        R, t, points, pixels = (_tensor(found[key], torch.float64) for key in ("R", "t", "points", "pixels"))
+        visible = torch.tensor(found["visible"], dtype=torch.bool)
+        views = Views(pixels, visible, found["names"], _size(found["size"]))
+        used, rejected = (torch.tensor(found[key], dtype=torch.bool) for key in ("used", "rejected"))
+        status, iterations = (torch.tensor(found[key]) for key in ("status", "iterations"))
+        bow = None if found["bow"] is None else _tensor(found["bow"], torch.float64)
+        posed = camera if not camera.batch_shape else camera[..., None]
+        covariance = _covariance_from_fields(found["covariance"])
+        return Calibration(
+            camera,
+            posed.at(R, t),
+            views,
+            points,
+            used,
+            rejected,
+            status,
+            iterations,
+            bow,
+            found["objective"],
+            tuple(found["causes"]),
+            None if found["pixel_sigma"] is None else _tensor(_with_nan(found["pixel_sigma"]), torch.float64),
+            None if covariance is None else partial(_same, covariance),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
+
+
+def _document(item: Camera | Calibration) -> dict[str, Any]:
+    camera = item.camera if isinstance(item, Calibration) else item
+    lens = camera.distortion
+    if not (lens is None or (isinstance(lens, BrownConrady | KannalaBrandt) and type(lens).__name__ in _LENSES)):
+        raise ValueError(f"distortion: want one of {', '.join(_LENSES)}, got {type(lens).__name__}")
+    document: dict[str, Any] = {
+        "format": JSON_FORMAT,
+        "version": JSON_VERSION,
+        "camera": {
+            "dtype": str(camera.dtype).removeprefix("torch."),
+            "size": camera.size,
+            "K": camera.K.tolist(),
+            "R": camera.R.tolist(),
+            "t": camera.t.tolist(),
+            "lens": None
+            if lens is None
+            else {"model": type(lens).__name__, "coefficients": lens.coefficients.tolist()},
+        },
+    }
+    if isinstance(item, Calibration):
+        document["calibration"] = {
+            "rms": item.rms.tolist(),
+            "status": item.status.tolist(),
+            "iterations": item.iterations.tolist(),
+            "objective": item.objective,
+            "bow": None if item.bow is None else item.bow.tolist(),
+            "R": item.cameras.R.tolist(),
+            "t": item.cameras.t.tolist(),
+            "points": item.points.tolist(),
+            "names": item.views.names,
+            "size": item.views.size,
+            "pixels": item.views.pixels.tolist(),
+            "visible": item.views.visible.tolist(),
+            "used": item.used.tolist(),
+            "rejected": item.rejected.tolist(),
+            "causes": item.causes,
+            "pixel_sigma": None if item.pixel_sigma is None else item.pixel_sigma.tolist(),
+            "covariance": _covariance_fields(item),
+        }
+    return document
+
+
+def _same(covariance: Covariance) -> Covariance:
+    return covariance
+
+
+def _covariance_fields(item: Calibration) -> dict[str, Any] | None:
+    """The blocks of the covariance; what is infinite is 0 here and known by the masks, for JSON has no infinity."""
+    if not item.has_covariance:
+        return None
+    known = item.covariance
+    fields = {key: getattr(known, f"_{key}").tolist() for key in ("follow", "mixed", "alone")}
+    fields |= {key: getattr(known, key).tolist() for key in ("undetermined", "undetermined_views")}
+    shared = torch.where(known.shared.isfinite(), known.shared, 0.0)
+    return {"names": known.names, "shared": shared.tolist(), **fields}
+
+
+def _covariance_from_fields(fields: dict[str, Any] | None) -> Covariance | None:
+    if fields is None:
+        return None
+    unknown, unknown_views = (
+        torch.tensor(fields[key], dtype=torch.bool) for key in ("undetermined", "undetermined_views")
+    )
+    shared, *blocks = (_tensor(fields[key], torch.float64) for key in ("shared", "follow", "mixed", "alone"))
+    infinite = torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(shared))
+    return Covariance(tuple(fields["names"]), shared + infinite, unknown, unknown_views, *blocks)
+
+
+def _without_nan(value: Any) -> Any:
+    """The same with `None` for what is no finite number, for JSON has only those."""
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _with_nan(value: Any) -> Any:
+    """The same with NaN for `None`."""
+    return [_with_nan(item) for item in value] if isinstance(value, list) else math.nan if value is None else value
+
+
+def _readable(text: str) -> str:
+    """Indented JSON with each innermost list on one line; a line break never stands inside a JSON string."""
+    return re.sub(r"\[[^\[\]{}]*\]", lambda match: re.sub(r"\s*\n\s*", " ", match[0]), text) + "\n"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: want a JSON file, got something else ({error})") from error
+    if not isinstance(document, dict) or document.get("format") != JSON_FORMAT or "camera" not in document:
+        raise ValueError(f"{path}: want a camera file of diffproj, got another JSON file")
+    if document.get("version") != JSON_VERSION:
+        raise ValueError(
+            f"{path}: want version {JSON_VERSION}, got {document.get('version')}; a newer diffproj reads it"
+        )
+    return document
+
+
+def _camera(path: Path, fields: dict[str, Any]) -> Camera:
+    try:
+        dtype = {"float32": torch.float32, "float64": torch.float64}[fields["dtype"]]
+        K, R, t = (_tensor(fields[key], dtype) for key in ("K", "R", "t"))
+        lens = fields["lens"]
+        distortion = lens and _LENSES[lens["model"]](_tensor(lens["coefficients"], dtype))
+        return Camera(K, R, t, distortion, _size(fields["size"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: the camera in this file is damaged ({error})") from error
+
+
+def _size(size: list[int] | None) -> tuple[int, int] | None:
+    return None if size is None else (size[0], size[1])
+
+
+def _tensor(numbers: Any, dtype: torch.dtype) -> Tensor:
+    return torch.tensor(numbers, dtype=dtype)

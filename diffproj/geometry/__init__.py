@@ -1,0 +1,1 @@
+"""Cameras, planes, and the maps between pixels, rays and world points."""

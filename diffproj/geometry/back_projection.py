@@ -1,0 +1,290 @@
+"""Pixels to points of a plane: one 4x3 matrix for each camera and plane.
+
+Write `p = (u - c_x, v - c_y, 1)` for a pinhole's pixel, or the viewing direction in the camera frame that the lens
+gives, and `r = G p` for the ray in the world, where `G = R^T diag(1/f_x, 1/f_y, 1)`, or `R^T` behind a lens. The ray
+from the centre `C` meets the plane `n . X = d` at
+
+    X = C + s r,    s = (d - n . C) / (n . r).
+
+Both parts of the fraction are linear in `p`, so one matrix holds camera and plane together:
+
+    b = G^T n        A = C b^T + (d - n . C) G        M = [A; b] (4, 3)        X = A p / (b . p).
+
+`s` is the depth along the optical axis (behind a fisheye lens, the distance along the ray), so the point lies in front
+of the camera where `s > 0`. The sign of `M` is free and is chosen so that `d - n . C >= 0`: then one comparison,
+`b . p > rounding`, says that the ray neither runs parallel to the plane nor meets it behind the camera. Pixels are
+centred before they meet `M`, which keeps float32 accurate; `M` itself is built in float64.
+"""
+
+import enum
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+from torch.linalg import vector_norm
+
+from diffproj._core import pytree
+from diffproj._core.numerics import (
+    broadcast_batches,
+    check_same_kind,
+    check_tensor,
+    dot,
+    entries,
+    in_blocks,
+    interleaved,
+    linear,
+    precise,
+    rounding,
+)
+from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.intrinsics import pixel_to_normalized
+from diffproj.geometry.plane import Plane
+
+
+class Reason(enum.IntEnum):
+    """Why a pixel has no point on the plane, as `explain` reports it."""
+
+    VALID = 0
+    """It has one."""
+    NOT_FINITE = 1
+    """The pixel is NaN or infinite."""
+    OUTSIDE_LENS = 2
+    """The lens has no inverse there: no viewing ray reaches this pixel."""
+    CAMERA_ON_PLANE = 3
+    """The centre of projection lies in the plane."""
+    PARALLEL = 4
+    """The ray is parallel to the plane, to within rounding."""
+    BEHIND = 5
+    """The ray meets the plane behind the camera."""
+
+
+class PlaneMap:
+    """The map from pixels to points of a plane, built once for a camera and a plane and then applied at will.
+
+    `back_project` builds one for each call; keep one where camera and plane stay as they are. It is a PyTree.
+
+    Attributes:
+        matrix: `M (*B, 4, 3)` up to a positive factor, in the camera's dtype.
+        camera: the camera, whose principal point and lens lead from pixels to `p`.
+        is_per_point: whether the last batch axis runs over the points.
+
+    Example:
+        >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+        >>> camera = Camera(K, t=torch.tensor([0.0, 0, 1000], dtype=torch.float64))
+        >>> to_board = PlaneMap(camera, Plane.z(0.0))
+        >>> points, valid = to_board(torch.tensor([[370.0, 240.0]], dtype=torch.float64))
+        >>> points.tolist()
+        [[100.0, 0.0, 0.0]]
+    """
+
+    __slots__ = ("camera", "is_per_point", "matrix")
+
+    matrix: Tensor
+    camera: Camera
+    is_per_point: bool
+
+    def __init__(self, camera: Camera | PinholeCamera, plane: Plane) -> None:
+        """Build the map.
+
+        Raises:
+            TypeError: not a camera and a plane, or of different dtypes.
+            ValueError: different devices, or batch shapes that do not broadcast.
+        """
+        camera = as_camera(camera)
+        if not isinstance(plane, Plane):
+            raise TypeError(f"plane: want a dp.Plane, got {type(plane).__name__}")
+        plane = plane.like(camera.K)
+        check_same_kind(camera=camera.K, plane=plane.normal)
+        if plane.is_per_point:
+            camera = camera[..., None]
+        broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape)
+        self.matrix = _plane_matrix(camera, plane).to(camera.dtype)
+        self.camera, self.is_per_point = camera, plane.is_per_point
+
+    @classmethod
+    def _unchecked(cls, matrix: Any, camera: Any, is_per_point: bool) -> "PlaneMap":
+        plane_map = cls.__new__(cls)
+        plane_map.matrix, plane_map.camera, plane_map.is_per_point = matrix, camera, is_per_point
+        return plane_map
+
+    def __call__(
+        self, pixels: Float[Tensor, "*#batch n 2"]
+    ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
+        """Points `(*B, N, 3)` and `valid (*B, N)` of pixels `(*B, N, 2)`; see `back_project`."""
+        rows = entries(self.matrix)
+
+        def to_plane(pixels: Tensor) -> tuple[Tensor, Tensor]:
+            return self._to_plane(pixels, rows)
+
+        points, valid = in_blocks(to_plane, self._checked(pixels), self.matrix, *self.camera.tensors())
+        return (points.squeeze(-2), valid.squeeze(-1)) if self.is_per_point else (points, valid)
+
+    def explain(self, pixels: Float[Tensor, "*#batch n 2"]) -> Int[Tensor, "*#batch n"]:
+        """`Reason` codes `(*B, N)` of pixels `(*B, N, 2)`; see the function `explain`."""
+        (reasons,) = in_blocks(self._explain, self._checked(pixels), self.matrix, *self.camera.tensors())
+        return reasons.squeeze(-1) if self.is_per_point else reasons
+
+    def _to_plane(self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
+        sight, seen = self._sight(pixels)
+        denominator, threshold = _denominator(rows[3], sight)
+        valid = denominator > threshold  # false for NaN, too
+        if seen is not None:
+            valid = valid & seen
+        # Where there is no point, the denominator becomes infinite and p finite before anything is divided, so that
+        # neither values nor gradients of infinite or parallel rays ever arise.
+        sight = [component if component is None else component.nan_to_num(0.0, 0.0, 0.0) for component in sight]
+        *numerators, denominator = linear(rows, sight)
+        inverse = torch.where(valid, denominator, torch.inf).reciprocal()
+        return interleaved([numerator * inverse for numerator in numerators]), valid
+
+    def _explain(self, pixels: Tensor) -> tuple[Tensor]:
+        sight, seen = self._sight(pixels)
+        denominator, threshold = _denominator(entries(self.matrix)[3], sight)
+        reasons = torch.where(denominator > threshold, Reason.VALID, Reason.PARALLEL)
+        reasons = torch.where(denominator < -threshold, Reason.BEHIND, reasons)
+        reasons = torch.where((self.matrix[..., 3, :] == 0).all(dim=-1, keepdim=True), Reason.CAMERA_ON_PLANE, reasons)
+        if seen is not None:
+            reasons = torch.where(seen, reasons, Reason.OUTSIDE_LENS)
+        return (torch.where(pixels.isfinite().all(dim=-1), reasons, Reason.NOT_FINITE),)
+
+    def _sight(self, pixels: Tensor) -> tuple[list[Tensor | None], Tensor | None]:
+        """The components of `p` (`None` for a constant 1), and where the lens has an inverse (`None`: everywhere)."""
+        if self.camera.distortion is None:
+            center = self.camera.K[..., :2, 2, None].unbind(-2)
+            return [*(x - c for x, c in zip(pixels.unbind(-1), center, strict=True)), None], None
+        direction, seen = self.camera.directions(pixels)
+        return list(direction.unbind(-1)), seen
+
+    def _checked(self, pixels: Tensor) -> Tensor:
+        if self.is_per_point and isinstance(pixels, Tensor) and pixels.ndim >= 2:
+            pixels = pixels.unsqueeze(-2)
+        pixels = self.camera._checked("pixels", pixels, 2)
+        batch = broadcast_batches(map=self.matrix.shape[:-2], pixels=pixels.shape[:-2])
+        return pixels.expand(*batch, *pixels.shape[-2:])
+
+
+def back_project(
+    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane
+) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
+    """Intersect the viewing rays of pixels with a plane.
+
+    Differentiable in the pixels and in every parameter of camera and plane, in reverse and forward mode and to any
+    order; works under `vmap` and `torch.compile(fullgraph=True)`. Long inputs are handled in blocks when no derivative
+    is asked.
+
+    Args:
+        pixels: `(*B, N, 2)`; half and bfloat16 are lifted to the camera's dtype.
+        camera: a camera of batch shape `*B`, or Kornia's `PinholeCamera`.
+        plane: a plane of batch shape `*B`, or one for each point (`Plane.per_point`) of batch shape `(*B, N)`.
+
+    Returns:
+        World points `(*B, N, 3)` in the dtype of the camera, and `valid (*B, N)`: false where the pixel is not finite,
+        the lens has no inverse, the ray is parallel to the plane or within rounding of it, or meets it behind the
+        camera. Points are (0, 0, 0) there, and their gradient is zero.
+
+    Raises:
+        TypeError: tensors of integers or of mixed dtypes.
+        ValueError: wrong shapes, mixed devices, or batch shapes that do not broadcast.
+
+    Example:
+        >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64, requires_grad=True)
+        >>> camera = Camera(K, t=torch.tensor([0.0, 0, 1000], dtype=torch.float64))
+        >>> pixels = torch.tensor([[370.0, 240.0], [320.0, 250.0]], dtype=torch.float64)
+        >>> points, valid = back_project(pixels, camera, Plane.z(0.0))
+        >>> points.tolist(), valid.tolist()
+        ([[100.0, 0.0, 0.0], [0.0, 20.0, 0.0]], [True, True])
+        >>> points[0, 0].backward()
+        >>> K.grad[0, 0].item()  # millimetres for one pixel more of focal length
+        -0.2
+    """
+    return PlaneMap(camera, plane)(pixels)
+
+
+def explain(
+    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane
+) -> Int[Tensor, "*#batch n"]:
+    """Say for each pixel why it has no point on the plane, or that it has one.
+
+    Args:
+        pixels: `(*B, N, 2)`.
+        camera: as for `back_project`.
+        plane: as for `back_project`.
+
+    Returns:
+        Integers `(*B, N)`: the codes of `Reason`, 0 where the point is valid. Of several reasons the first in the
+        order of the pixel's way counts: not finite, outside the lens, camera on the plane, parallel, behind.
+
+    Raises:
+        TypeError: as `back_project`.
+        ValueError: as `back_project`.
+
+    Example:
+        >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+        >>> floor = Plane([0.0, 1.0, 0.0], 1.5)  # 1.5 below a camera that looks to the horizon
+        >>> pixels = torch.tensor([[320.0, 300.0], [320.0, 240.0], [320.0, 100.0]], dtype=torch.float64)
+        >>> [Reason(code).name for code in explain(pixels, Camera(K), floor).tolist()]
+        ['VALID', 'PARALLEL', 'BEHIND']
+    """
+    return PlaneMap(camera, plane).explain(pixels)
+
+
+def ground_resolution(
+    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane
+) -> tuple[Float[Tensor, "*#batch n"], Bool[Tensor, "*#batch n"]]:
+    """World units that a pixel covers on the plane along its worst direction.
+
+    Args:
+        pixels: `(*B, N, 2)`.
+        camera: as for `back_project`.
+        plane: as for `back_project`.
+
+    Returns:
+        `(*B, N)`, 0 where not valid; and `valid (*B, N)`.
+
+    Example:
+        >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+        >>> ground_resolution(torch.tensor([[320.0, 240.0]]), Camera(K, t=torch.tensor([0.0, 0, 1000])), Plane.z(0.0))
+        (tensor([2.]), tensor([True]))
+    """
+    to_plane = PlaneMap(camera, plane)
+    pixels = check_tensor("pixels", pixels, "N", 2)
+    right, down = torch.zeros_like(pixels), torch.zeros_like(pixels)
+    right[..., 0], down[..., 1] = 1.0, 1.0
+    (_, valid), (by_u, _) = torch.func.jvp(to_plane, (pixels,), (right,))[:2]
+    by_v = torch.func.jvp(to_plane, (pixels,), (down,))[1][0]
+    # The larger singular value of the 3 x 2 Jacobian, from its 2 x 2 Gram matrix.
+    a, b, c = (by_u * by_u).sum(-1), (by_u * by_v).sum(-1), (by_v * by_v).sum(-1)
+    spread = torch.hypot((a - c) / 2, b)
+    return ((a + c) / 2 + spread).sqrt(), valid
+
+
+def _denominator(b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
+    """`b . p`, and the size below which rounding decides its sign."""
+    terms = [entry if component is None else component * entry for component, entry in zip(sight, b, strict=True)]
+    threshold = (terms[0].abs() + terms[1].abs() + terms[2].abs()) * rounding(terms[0].dtype)
+    return terms[0] + terms[1] + terms[2], threshold
+
+
+def _plane_matrix(camera: Camera, plane: Plane) -> Tensor:
+    """`M (*B, 4, 3)` in float64, scaled to `max |M| = 1`; zero where the camera's centre lies in the plane."""
+    R, t = precise(camera.R), precise(camera.t)
+    normal, offset = precise(plane.normal), precise(plane.offset)
+    b = dot(R, normal.unsqueeze(-2))  # the normal in the camera frame: n . C = -b . t
+    center = -dot(R.mT, t.unsqueeze(-2))
+    height = offset + dot(b, t)
+    A = center.unsqueeze(-1) * b.unsqueeze(-2) + height[..., None, None] * R.mT
+    M = torch.cat([A, b.unsqueeze(-2)], dim=-2)
+    if camera.distortion is None:  # so far G is R^T, as behind a lens: a pinhole's M is that times diag(F^-1, 1)
+        F_inverse = pixel_to_normalized(precise(camera.K))
+        M = torch.cat([(M[..., :2].unsqueeze(-1) * F_inverse.unsqueeze(-3)).sum(dim=-2), M[..., 2:]], dim=-1)
+    with torch.no_grad():  # the factor changes no point, so no derivative has to pass through it
+        resting = rounding(camera.dtype) * (offset.abs() + vector_norm(b, dim=-1) * vector_norm(t, dim=-1))
+        factor = M.abs().amax(dim=(-2, -1)).reciprocal().copysign(height)
+        factor = torch.where(height.abs() > resting, factor, 0.0)
+    return M * factor[..., None, None]
+
+
+pytree.register(PlaneMap, children=("matrix", "camera"), static=("is_per_point",))

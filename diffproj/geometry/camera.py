@@ -1,0 +1,471 @@
+"""`Camera`: intrinsics, lens and pose of one camera or of a batch of them.
+
+A world point reaches its pixel in three steps, and a pixel goes back by the same steps reversed:
+
+    X_cam = R X_world + t              pose: world to camera frame (x right, y down, z forward)
+    xy    = lens(X_cam)                lens: direction to distorted point on the normalised plane; x / z, y / z if none
+    uv    = F xy + c                   intrinsics: K = [[F, c], [0, 0, 1]], F usually diag(f_x, f_y)
+
+`F` may be any invertible 2x2 matrix: skew, or an image that an augmentation has turned, stays exact.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+from torch.utils._pytree import tree_leaves
+
+from diffproj._core import pytree
+from diffproj._core.numerics import (
+    broadcast_batches,
+    check_same_kind,
+    check_tensor,
+    converted,
+    dot,
+    entries,
+    in_blocks,
+    index_batch,
+    linear,
+    readable,
+    transform,
+)
+from diffproj.geometry import interop
+from diffproj.geometry.interop import ArrayLike
+from diffproj.geometry.intrinsics import check_intrinsics, check_warp, pixel_to_normalized, warped
+from diffproj.lens.brown_conrady import BrownConrady
+from diffproj.lens.kannala_brandt import KannalaBrandt
+from diffproj.lens.protocol import Lens
+
+ROTATION_TOLERANCE = 1e-5
+"""How far `R^T R` may be from the identity, entry by entry, where a user hands a camera in."""
+
+
+class Camera:
+    """A calibrated camera, or a batch of them with batch shape `*B`; the parts broadcast to it.
+
+    The camera is immutable in spirit: methods return new cameras that share tensors, and gradients flow to whatever
+    tensors it was built from. It is a PyTree: `vmap`, `torch.func`, `torch.compile` and `torch.export` carry it.
+
+    Attributes:
+        K: intrinsics `(*B, 3, 3)` in pixels, integer coordinates at pixel centres; the last row is (0, 0, 1).
+        R: rotation world to camera `(*B, 3, 3)`.
+        t: translation world to camera `(*B, 3)` in world units: `X_cam = R X_world + t`.
+        distortion: the lens, or `None` for a pinhole.
+        size: image size `(width, height)` in pixels, or `None`.
+
+    Example:
+        >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+        >>> camera = Camera(K, t=torch.tensor([0.0, 0, 1000], dtype=torch.float64), size=(640, 480))
+        >>> pixels, valid = camera.project(torch.tensor([[100.0, 0, 0]], dtype=torch.float64))
+        >>> pixels.tolist(), valid.tolist()  # 100 to the right at a distance of 1000: 50 px
+        ([[370.0, 240.0]], [True])
+    """
+
+    __slots__ = ("K", "R", "distortion", "size", "t")
+
+    K: Tensor
+    R: Tensor
+    t: Tensor
+    distortion: Lens | None
+    size: tuple[int, int] | None
+
+    def __init__(
+        self,
+        K: Float[Tensor, "*#batch 3 3"],
+        R: Float[Tensor, "*#batch 3 3"] | None = None,
+        t: Float[Tensor, "*#batch 3"] | None = None,
+        distortion: Lens | None = None,
+        size: tuple[int, int] | None = None,
+    ) -> None:
+        """Build a camera and check it.
+
+        Args:
+            K: intrinsics `(*B, 3, 3)`.
+            R: rotation world to camera `(*B, 3, 3)`; the identity if left out.
+            t: translation world to camera `(*B, 3)`; zero if left out.
+            distortion: `BrownConrady(...)`, `KannalaBrandt(...)` or another `Lens`.
+            size: image size `(width, height)` in pixels.
+
+        Raises:
+            TypeError: no floating-point tensors, or mixed dtypes.
+            ValueError: wrong shapes or devices, a K without inverse, an R that is no rotation to 1e-5, or values
+                that are not finite. Values are checked where they can be read, not while compiling or under `vmap`.
+        """
+        K = check_tensor("K", K, 3, 3)
+        R = torch.eye(3, dtype=K.dtype, device=K.device) if R is None else check_tensor("R", R, 3, 3)
+        t = torch.zeros(3, dtype=K.dtype, device=K.device) if t is None else check_tensor("t", t, 3)
+        if distortion is not None and not hasattr(distortion, "unproject"):  # dynamo knows no protocols
+            raise TypeError(
+                f"distortion: want a lens such as dp.BrownConrady(coefficients), got {type(distortion).__name__}"
+            )
+        if readable(K, R, t):
+            check_intrinsics(K)
+            _check_pose(R, t)
+        self._assign(K, R, t, distortion, _checked_size(size))
+
+    def _assign(self, K: Tensor, R: Tensor, t: Tensor, distortion: Lens | None, size: tuple[int, int] | None) -> None:
+        check_same_kind(K=K, R=R, t=t, distortion=distortion)
+        shapes = {"K": K.shape[:-2], "R": R.shape[:-2], "t": t.shape[:-1]}
+        if distortion is not None:
+            shapes["distortion"] = distortion.batch_shape
+        batch = broadcast_batches(**shapes)
+        self.K = K.expand(*batch, 3, 3)
+        self.R = R.expand(*batch, 3, 3)
+        self.t = t.expand(*batch, 3)
+        # A lens that fits already stays the same object, with whatever it has computed about itself.
+        if distortion is not None and distortion.batch_shape != batch:
+            distortion = distortion.expand(*batch)
+        self.distortion = distortion
+        self.size = size
+
+    @classmethod
+    def _unchecked(cls, K: Any, R: Any, t: Any, distortion: Any, size: tuple[int, int] | None) -> "Camera":
+        """Build without looking at anything: for parts that come from a camera, or from inside a transformation."""
+        camera = cls.__new__(cls)
+        camera.K, camera.R, camera.t, camera.distortion, camera.size = K, R, t, distortion, size
+        return camera
+
+    def _with(self, **changes: Any) -> "Camera":
+        camera = type(self).__new__(type(self))
+        camera._assign(**({name: getattr(self, name) for name in self.__slots__} | changes))
+        return camera
+
+    # ------------------------------------------------------------------------------------------------- as a tensor
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """The batch shape `*B`."""
+        return self.K.shape[:-2]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The floating-point type of all parts."""
+        return self.K.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """The device of all parts."""
+        return self.K.device
+
+    def to(self, *args: Any, **kwargs: Any) -> "Camera":
+        """The camera in another dtype or on another device; takes what `torch.Tensor.to` takes."""
+        K, R, t = (converted(part, *args, **kwargs) for part in (self.K, self.R, self.t))
+        distortion = None if self.distortion is None else self.distortion.to(*args, **kwargs)
+        return self._unchecked(K, R, t, distortion, self.size)
+
+    def detach(self) -> "Camera":
+        """The same camera cut off from the graph."""
+        distortion = None if self.distortion is None else self.distortion.detach()
+        return self._unchecked(self.K.detach(), self.R.detach(), self.t.detach(), distortion, self.size)
+
+    def __getitem__(self, index: Any) -> "Camera":
+        """Cameras picked from the batch, as one indexes a tensor of shape `*B`."""
+        distortion = None if self.distortion is None else self.distortion[index]
+        K, R, t = index_batch(self.K, index, 2), index_batch(self.R, index, 2), index_batch(self.t, index, 1)
+        return self._unchecked(K, R, t, distortion, self.size)
+
+    def __repr__(self) -> str:
+        lens = "pinhole" if self.distortion is None else type(self.distortion).__name__
+        return f"Camera(batch_shape={tuple(self.batch_shape)}, {lens}, size={self.size}, {self.dtype}, {self.device})"
+
+    # ------------------------------------------------------------------------------------------------ other cameras
+
+    @property
+    def center(self) -> Float[Tensor, "*batch 3"]:
+        """The centre of projection in the world, `C = -R^T t`, in world units."""
+        return -dot(self.R.mT, self.t.unsqueeze(-2))
+
+    def at(self, R: Float[Tensor, "*#batch 3 3"], t: Float[Tensor, "*#batch 3"]) -> "Camera":
+        """The same intrinsics and lens at another pose, or at many: the batch shapes broadcast.
+
+        Args:
+            R: rotation world to camera `(*B, 3, 3)`.
+            t: translation world to camera `(*B, 3)`.
+
+        Raises:
+            TypeError: no floating-point tensors, or other dtypes than the camera's.
+            ValueError: wrong shapes or devices, or an R that is no rotation.
+        """
+        R, t = check_tensor("R", R, 3, 3), check_tensor("t", t, 3)
+        if readable(R, t):
+            _check_pose(R, t)
+        return self._with(R=R, t=t)
+
+    def without_pose(self) -> "Camera":
+        """The same intrinsics and lens with the world frame in the camera: what one saves of a calibration."""
+        identity = torch.eye(3, dtype=self.dtype, device=self.device)
+        return self._with(R=identity, t=torch.zeros_like(identity[0]))
+
+    def resized(self, size: tuple[int, int]) -> "Camera":
+        """The camera of the same image resized to `size = (width, height)`: `c -> s c + (s - 1) / 2`.
+
+        Raises:
+            ValueError: the camera does not know its own size.
+        """
+        if self.size is None:
+            raise ValueError(
+                "resized: want a camera with a size, got size=None; give Camera(..., size=(width, height))"
+            )
+        width, height = _checked_size(size) or (0, 0)
+        scale = (width / self.size[0], height / self.size[1])
+        factors = self.K.new_tensor([[scale[0]], [scale[1]], [1.0]])
+        shift = self.K.new_tensor([[0, 0, (scale[0] - 1) / 2], [0, 0, (scale[1] - 1) / 2], [0, 0, 0]])
+        return self._with(K=self.K * factors + shift, size=(width, height))
+
+    def cropped(self, left: float, top: float, width: int, height: int) -> "Camera":
+        """The camera of the crop whose first pixel was pixel `(left, top)`: the principal point moves along."""
+        shift = self.K.new_tensor([[0, 0, left], [0, 0, top], [0, 0, 0]])
+        return self._with(K=self.K - shift, size=_checked_size((width, height)))
+
+    def warped(self, matrix: Float[Tensor, "*#batch 3 3"], size: tuple[int, int] | None = None) -> "Camera":
+        """The camera of the same image warped, as a geometric augmentation does: pixels `p` go to `matrix p`.
+
+        An affine matrix changes K alone: turned, mirrored, sheared, scaled and shifted images stay exact, behind a lens
+        too. A projective one also turns a pinhole, so that the middle of the image (the principal point, where the
+        camera has no size) stays in front of it. Gradients flow to the matrix.
+
+        Args:
+            matrix: `(*B, 3, 3)`, from pixels `(u, v, 1)` of this image to those of the warped one, up to a factor;
+                what Kornia's augmentations keep as `transform_matrix`.
+            size: `(width, height)` of the warped image; that of this one if left out.
+
+        Raises:
+            TypeError: no floating-point tensor, or another dtype than the camera's.
+            ValueError: wrong shape or device, no inverse, or a projective matrix for a camera with a lens, for which
+                no lens model describes the warped image. Values are checked where they can be read, not while
+                compiling or under `vmap`.
+
+        Example:
+            >>> from kornia.augmentation import RandomHorizontalFlip
+            >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+            >>> camera = Camera(K, t=torch.tensor([0.0, 0, 1000]), size=(640, 480))
+            >>> flip = RandomHorizontalFlip(p=1.0)
+            >>> image = flip(torch.rand(1, 3, 480, 640))
+            >>> pixels, _ = camera.warped(flip.transform_matrix).project(torch.tensor([[100.0, 0, 0]]))
+            >>> pixels.tolist()  # 639 - 370
+            [[[269.0, 240.0]]]
+        """
+        matrix = check_tensor("matrix", matrix, 3, 3)
+        check_same_kind(camera=self.K, matrix=matrix)
+        broadcast_batches(camera=self.batch_shape, matrix=matrix.shape[:-2])
+        if readable(matrix):
+            check_warp(matrix, self.K, behind_lens=self.distortion is not None)
+        ahead = self.K[..., :2, 2]
+        if self.size is not None:
+            ahead = self.K.new_tensor([(side - 1) / 2 for side in self.size])
+        K, turn = warped(self.K, matrix, ahead)
+        R, t = (turn.unsqueeze(-1) * self.R.unsqueeze(-3)).sum(-2), dot(turn, self.t.unsqueeze(-2))
+        return self._with(K=K, R=R, t=t, size=_checked_size(size) or self.size)
+
+    # ------------------------------------------------------------------------------------------- points and pixels
+
+    def project(
+        self, points: Float[Tensor, "*#batch n 3"]
+    ) -> tuple[Float[Tensor, "*#batch n 2"], Bool[Tensor, "*#batch n"]]:
+        """Project world points to pixels.
+
+        Args:
+            points: world points `(*B, N, 3)`.
+
+        Returns:
+            Pixels `(*B, N, 2)` and `valid (*B, N)`: false where the point is not finite, not in front of a
+            perspective camera, or outside the domain of the lens. Pixels are (0, 0) there, with zero gradient. A pixel
+            may be valid and lie outside the image.
+
+        Raises:
+            TypeError: no floating-point tensor, or another dtype than the camera's.
+            ValueError: wrong shape or device, or batch shapes that do not broadcast.
+        """
+        points = self._checked("points", points, 3)
+
+        def project(points: Tensor) -> tuple[Tensor, Tensor]:
+            rotated = linear(entries(self.R), points.unbind(-1))
+            direction = [x + shift.unsqueeze(-1) for x, shift in zip(rotated, self.t.unbind(-1), strict=True)]
+            if self.distortion is None:
+                xy, valid = _pinhole(direction)
+            else:
+                xy_lens, valid = self.distortion.project_direction(torch.stack(direction, dim=-1))
+                xy = list(xy_lens.unbind(-1))
+            uv = linear(entries(self.K[..., :2, :]), [*xy, None])
+            return torch.stack([torch.where(valid, x, 0.0) for x in uv], dim=-1), valid
+
+        pixels, valid = in_blocks(project, points, *self.tensors())
+        return pixels, valid
+
+    def directions(
+        self, pixels: Float[Tensor, "*#batch n 2"]
+    ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
+        """Viewing directions in the camera frame, of any length: (x, y, 1) for a perspective camera.
+
+        Args:
+            pixels: `(*B, N, 2)`.
+
+        Returns:
+            Directions `(*B, N, 3)` and `valid (*B, N)`: false where a pixel is not finite or the lens has no inverse;
+            the direction is (0, 0, 1) there, with zero gradient.
+
+        Raises:
+            TypeError: no floating-point tensor, or another dtype than the camera's.
+            ValueError: wrong shape or device, or batch shapes that do not broadcast.
+        """
+        pixels = self._checked("pixels", pixels, 2)
+        finite = pixels.isfinite().all(dim=-1)
+        offset = torch.where(finite.unsqueeze(-1), pixels - self.K[..., None, :2, 2], 0.0)
+        xy = transform(pixel_to_normalized(self.K), offset)
+        if self.distortion is None:
+            return torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1), finite
+        direction, valid = self.distortion.unproject(xy)
+        return direction, valid & finite
+
+    def rays(
+        self, pixels: Float[Tensor, "*#batch n 2"]
+    ) -> tuple[Float[Tensor, "*#batch n 3"], Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
+        """Viewing rays in the world frame.
+
+        Args:
+            pixels: `(*B, N, 2)`.
+
+        Returns:
+            `(origin, direction, valid)`: the centre of projection for each ray and its unit direction, both
+            `(*B, N, 3)` in the world frame, and `valid (*B, N)` as `directions` gives it.
+
+        Raises:
+            TypeError: no floating-point tensor, or another dtype than the camera's.
+            ValueError: wrong shape or device, or batch shapes that do not broadcast.
+        """
+        in_camera, valid = self.directions(pixels)
+        direction = transform(self.R.mT, in_camera)
+        direction = direction / direction.norm(dim=-1, keepdim=True)
+        return self.center.unsqueeze(-2).expand_as(direction), direction, valid
+
+    def _checked(self, name: str, value: object, length: int) -> Tensor:
+        """Check points or pixels against the camera, lift half precision, expand to the common batch shape."""
+        tensor = check_tensor(name, value, "N", length)
+        if tensor is not value:  # lifted: any precision of the camera holds a half exactly
+            tensor = tensor.to(self.dtype)
+        check_same_kind(**{"camera": self.K, name: tensor})
+        batch = broadcast_batches(**{"camera": self.batch_shape, name: tensor.shape[:-2]})
+        return tensor.expand(*batch, *tensor.shape[-2:])
+
+    def tensors(self) -> list[Tensor]:
+        """All tensors of the camera, the lens's included."""
+        lens = [leaf for leaf in tree_leaves(self.distortion) if isinstance(leaf, Tensor)]
+        return [self.K, self.R, self.t, *lens]
+
+    # ----------------------------------------------------------------------------------------------- other libraries
+
+    @classmethod
+    def from_opencv(
+        cls,
+        K: ArrayLike,
+        dist: ArrayLike | None = None,
+        rvec: ArrayLike | None = None,
+        tvec: ArrayLike | None = None,
+        size: tuple[int, int] | None = None,
+        fisheye: bool = False,
+    ) -> "Camera":
+        """A camera from what OpenCV's calibration returns.
+
+        Args:
+            K: camera matrix `(*B, 3, 3)`. Arrays become float64 tensors; a tensor keeps its dtype, device and graph.
+            dist: 4, 5, 8, 12 or 14 coefficients in OpenCV's order (fisheye: 4), as `(*B, k)` or as OpenCV's row or
+                column; `None` or an empty array for a pinhole.
+            rvec: rotation vector world to camera `(*B, 3)` in radians, or OpenCV's `(3, 1)` column.
+            tvec: translation world to camera `(*B, 3)` in world units, or OpenCV's `(3, 1)` column.
+            size: image size `(width, height)` in pixels.
+            fisheye: whether `dist` belongs to OpenCV's fisheye model.
+
+        Raises:
+            ValueError: wrong shapes or values, as the constructor says.
+
+        Example:
+            >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+            >>> Camera.from_opencv(K, [-0.2, 0.1, 0, 0, 0], np.zeros(3), [0, 0, 800], size=(640, 480))
+            Camera(batch_shape=(), BrownConrady, size=(640, 480), torch.float64, cpu)
+        """
+        K, coefficients, R, t = interop.tensors_from_opencv(K, dist, rvec, tvec)
+        lens = KannalaBrandt if fisheye else BrownConrady
+        return cls(K, R, t, None if coefficients is None else lens(coefficients), size)
+
+    def to_opencv(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """`(K, dist, rvec, tvec)` as float64 arrays for OpenCV's functions, batch axes in front.
+
+        `dist` is empty for a pinhole. Whether the coefficients are the fisheye model's is for the caller to remember.
+
+        Raises:
+            ValueError: the camera has skew or a turned image, which OpenCV would ignore, or another library's lens.
+        """
+        if self.distortion is not None and not isinstance(self.distortion, BrownConrady | KannalaBrandt):
+            raise ValueError(f"distortion: want a lens that OpenCV has, got {type(self.distortion).__name__}")
+        coefficients = None if self.distortion is None else self.distortion.coefficients
+        return interop.arrays_for_opencv(self.K, coefficients, self.R, self.t)
+
+    @classmethod
+    def from_kornia(cls, pinhole: PinholeCamera) -> "Camera":
+        """A camera of batch shape `(B,)` from Kornia's `PinholeCamera`, whose conventions are the same.
+
+        Raises:
+            ValueError: the cameras of the batch have images of different sizes, or values are not a camera's.
+        """
+        K, R, t, size = interop.tensors_from_kornia(pinhole)
+        return cls(K, R, t, size=size)
+
+    def to_kornia(self) -> PinholeCamera:
+        """Kornia's `PinholeCamera` of batch size `B`; a single camera becomes a batch of one.
+
+        Raises:
+            ValueError: what `PinholeCamera` cannot hold: a lens, no size, or more than one batch axis.
+        """
+        if self.distortion is not None:
+            raise ValueError("distortion: want None, for PinholeCamera holds no lens; undistort first")
+        if self.size is None:
+            raise ValueError("size: want (width, height), got None, and PinholeCamera needs it")
+        return interop.pinhole_from_tensors(self.K, self.R, self.t, self.size)
+
+
+def as_camera(camera: Camera | PinholeCamera) -> Camera:
+    """A `Camera` as it is, Kornia's `PinholeCamera` converted.
+
+    Raises:
+        TypeError: it is neither.
+    """
+    if isinstance(camera, Camera):
+        return camera
+    if isinstance(camera, PinholeCamera):
+        return Camera.from_kornia(camera)
+    raise TypeError(f"camera: want dp.Camera or kornia's PinholeCamera, got {type(camera).__name__}")
+
+
+def _pinhole(direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
+    """Perspective division, valid where the point is finite and in front."""
+    x, y, z = direction
+    reach = x.abs() + y.abs()
+    valid = (z > torch.finfo(z.dtype).eps * reach) & (reach + z).isfinite()
+    inverse_depth = torch.where(valid, z, 1.0).reciprocal()
+    return [torch.where(valid, component, 0.0) * inverse_depth for component in (x, y)], valid
+
+
+def _checked_size(size: Any) -> tuple[int, int] | None:
+    if size is None:
+        return None
+    if len(size) != 2 or any(int(side) != side or side < 1 for side in size):
+        raise ValueError(f"size: want (width, height) in whole pixels, got {size}")
+    return int(size[0]), int(size[1])
+
+
+def _check_pose(R: Tensor, t: Tensor) -> None:
+    if not bool(t.isfinite().all()):
+        raise ValueError("t: want finite values, got NaN or infinity")
+    error = (R.mT @ R - torch.eye(3, dtype=R.dtype, device=R.device)).abs()
+    if not bool((error <= ROTATION_TOLERANCE).all() and (torch.linalg.det(R) > 0).all()):
+        raise ValueError(
+            "R: want rotation matrices (orthonormal to 1e-5, determinant +1), got others; "
+            "kornia's axis_angle_to_rotation_matrix makes them from rotation vectors"
+        )
+
+
+pytree.register(Camera, children=("K", "R", "t", "distortion"), static=("size",))

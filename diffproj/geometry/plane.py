@@ -1,0 +1,281 @@
+"""`Plane`: the plane `a x + b y + c z = d` in the world, or a batch of planes.
+
+Convention: `n . X = d` with `n = (a, b, c)`, which need not be a unit vector; scaling `n` and `d` together changes
+nothing. (Kornia's `Hyperplane` has the opposite sign of the offset: `n . X + d = 0`.)
+
+A plane made of Python numbers alone, such as `Plane.z(0.0)`, has no dtype of its own to defend: like a Python number
+in PyTorch's arithmetic it takes on the dtype and device of the camera or points that it meets.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from diffproj._core import pytree
+from diffproj._core.numerics import (
+    broadcast_batches,
+    check_same_kind,
+    check_tensor,
+    converted,
+    dot,
+    index_batch,
+    readable,
+)
+
+Numbers = Sequence[float] | float
+
+
+class Plane:
+    """A plane `n . X = d`, or a batch of planes with batch shape `*B`.
+
+    The plane is immutable in spirit and a PyTree, as `Camera` is.
+
+    Attributes:
+        normal: `(*B, 3)`, any length but zero.
+        offset: `(*B,)`, in world units times the length of the normal.
+        is_per_point: whether the last batch axis runs over the points, one plane for each (`Plane.per_point`).
+        adopts: whether the plane was made of Python numbers and takes on others' dtype and device.
+
+    Example:
+        >>> plane = Plane([0.0, 0.0, 2.0], 50.0)  # 2 z = 50
+        >>> plane.distance(torch.tensor([[1.0, 2.0, 30.0]])).tolist()
+        [5.0]
+    """
+
+    __slots__ = ("adopts", "is_per_point", "normal", "offset")
+
+    normal: Tensor
+    offset: Tensor
+    is_per_point: bool
+    adopts: bool
+
+    def __init__(
+        self, normal: Float[Tensor, "*#batch 3"] | Numbers, offset: Float[Tensor, "*#batch"] | Numbers = 0.0
+    ) -> None:
+        """Build a plane and check it.
+
+        Args:
+            normal: `(a, b, c)`, a tensor `(*B, 3)` or three numbers.
+            offset: `d`, a tensor `(*B,)` or a number.
+
+        Raises:
+            TypeError: tensors that are not of floating-point type, or of mixed dtypes.
+            ValueError: wrong shapes or devices, a zero normal, or values that are not finite (checked where values
+                can be read).
+        """
+        adopts = not isinstance(normal, Tensor) and not isinstance(offset, Tensor)
+        normal, offset = _as_tensors(normal, offset)
+        normal, offset = check_tensor("normal", normal, 3), check_tensor("offset", offset)
+        check_same_kind(normal=normal, offset=offset)
+        batch = broadcast_batches(normal=normal.shape[:-1], offset=offset.shape)
+        if readable(normal, offset):
+            if not bool(normal.isfinite().all() and offset.isfinite().all()):
+                raise ValueError("plane: want a finite normal and offset, got NaN or infinity")
+            if bool((normal == 0).all(dim=-1).any()):
+                raise ValueError("normal: want a vector other than zero, got (0, 0, 0)")
+        self.normal, self.offset = normal.expand(*batch, 3), offset.expand(batch)
+        self.is_per_point, self.adopts = False, adopts
+
+    @classmethod
+    def _unchecked(cls, normal: Any, offset: Any, is_per_point: bool = False, adopts: bool = False) -> "Plane":
+        plane = cls.__new__(cls)
+        plane.normal, plane.offset, plane.is_per_point, plane.adopts = normal, offset, is_per_point, adopts
+        return plane
+
+    # ------------------------------------------------------------------------------------------------ ways to make
+
+    @classmethod
+    def z(cls, offset: Float[Tensor, "*batch"] | float = 0.0) -> "Plane":
+        """The plane `z = offset`, in world units: `Plane.z(0.0)` is the chessboard's.
+
+        Example:
+            >>> Plane.z(12.5)
+            Plane(normal=[0.0, 0.0, 1.0], offset=12.5)
+        """
+        if not isinstance(offset, Tensor):
+            return cls([0.0, 0.0, 1.0], offset)
+        return cls(torch.tensor([0.0, 0.0, 1.0], dtype=offset.dtype, device=offset.device), offset)
+
+    @classmethod
+    def per_point(
+        cls, normal: Float[Tensor, "*#points 3"] | Numbers, offset: Float[Tensor, "*#points"] | Numbers
+    ) -> "Plane":
+        """A plane for each point: the last batch axis `N` runs along with the pixels' axis.
+
+        Args:
+            normal: `(*B, N, 3)`, or one normal for all.
+            offset: `(*B, N)`, or one offset for all.
+
+        Raises:
+            TypeError: as the constructor.
+            ValueError: as the constructor, or neither argument has a points' axis.
+
+        Example:
+            >>> heights = torch.tensor([0.0, 10.0, 20.0])
+            >>> Plane.per_point([0.0, 0.0, 1.0], heights).is_per_point
+            True
+        """
+        plane = cls(normal, offset)
+        if not plane.batch_shape:
+            raise ValueError("per_point: want normal (*B, N, 3) or offset (*B, N), got a single plane")
+        plane.is_per_point = True
+        return plane
+
+    @classmethod
+    def from_points(cls, points: Float[Tensor, "*batch n 3"]) -> "Plane":
+        """The plane through points in the sense of least squared orthogonal distances; `rms` gives its fit error.
+
+        The unit normal's largest component is positive. Derivatives with respect to the points are exact to second
+        order, also for symmetric arrangements such as a grid, where those of an eigendecomposition are not finite.
+
+        Args:
+            points: `(*B, N, 3)` with N >= 3, not all on one line, in world units.
+
+        Raises:
+            TypeError: `points` is no floating-point tensor.
+            ValueError: fewer than three points, points on a line, or values that are not finite.
+
+        Example:
+            >>> corners = torch.tensor([[0.0, 0, 1], [4, 0, 1], [0, 4, 1], [4, 4, 1.4]], dtype=torch.float64)
+            >>> plane = Plane.from_points(corners)
+            >>> round(float(plane.rms(corners)), 4)  # world units
+            0.0998
+        """
+        points = check_tensor("points", points, "N", 3)
+        if points.shape[-2] < 3:
+            raise ValueError(f"points: want at least 3, got {points.shape[-2]}")
+        if readable(points) and not bool(points.isfinite().all()):
+            raise ValueError("points: want finite values, got NaN or infinity")
+        centroid = points.mean(dim=-2)
+        spread = points - centroid.unsqueeze(-2)
+        scatter = (spread.unsqueeze(-1) * spread.unsqueeze(-2)).sum(dim=-3)
+        normal = _smallest_eigenvector(scatter)
+        sign = normal.detach().gather(-1, normal.detach().abs().argmax(dim=-1, keepdim=True)).sign()
+        normal = normal * sign
+        return cls._unchecked(normal, dot(normal, centroid))
+
+    # ------------------------------------------------------------------------------------------------- as a tensor
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """The batch shape `*B`; `(*B, N)` for planes per point."""
+        return self.offset.shape
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The floating-point type."""
+        return self.normal.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """The device."""
+        return self.normal.device
+
+    def to(self, *args: Any, **kwargs: Any) -> "Plane":
+        """The plane in another dtype or on another device; takes what `torch.Tensor.to` takes."""
+        normal, offset = (converted(part, *args, **kwargs) for part in (self.normal, self.offset))
+        return self._unchecked(normal, offset, self.is_per_point)
+
+    def detach(self) -> "Plane":
+        """The same plane cut off from the graph."""
+        return self._unchecked(self.normal.detach(), self.offset.detach(), self.is_per_point, self.adopts)
+
+    def like(self, tensor: Tensor) -> "Plane":
+        """The plane ready to meet `tensor`: one made of Python numbers takes on its dtype and device."""
+        return self.to(tensor.device, tensor.dtype) if self.adopts else self
+
+    def __getitem__(self, index: Any) -> "Plane":
+        """Planes picked from the batch, as one indexes a tensor of shape `*B`; one for each point is not indexed.
+
+        Raises:
+            IndexError: the planes belong to points.
+        """
+        if self.is_per_point:
+            raise IndexError("plane: want a batch of planes to index, got planes per point; index normal and offset")
+        return self._unchecked(
+            index_batch(self.normal, index, 1), index_batch(self.offset, index, 0), False, self.adopts
+        )
+
+    def __repr__(self) -> str:
+        if self.batch_shape or not readable(self.normal):
+            return f"Plane(batch_shape={tuple(self.batch_shape)}, per_point={self.is_per_point}, {self.dtype})"
+        return f"Plane(normal={self.normal.tolist()}, offset={self.offset.item():g})"
+
+    # ---------------------------------------------------------------------------------------------------- geometry
+
+    @property
+    def unit_normal(self) -> Float[Tensor, "*batch 3"]:
+        """The normal scaled to length 1."""
+        return self.normal / self.normal.norm(dim=-1, keepdim=True)
+
+    def parallel(self, distance: Float[Tensor, "*#batch"] | float) -> "Plane":
+        """The parallel plane at a signed distance along the normal, in world units.
+
+        Example:
+            >>> Plane([0.0, 0.0, -2.0], 0.0).parallel(3.0)  # the normal points down
+            Plane(normal=[0.0, 0.0, -2.0], offset=6)
+        """
+        offset = self.offset + distance * self.normal.norm(dim=-1)
+        normal = self.normal.expand(*offset.shape, 3)
+        return self._unchecked(normal, offset, self.is_per_point, self.adopts and not isinstance(distance, Tensor))
+
+    def distance(self, points: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*#batch n"]:
+        """Signed orthogonal distances of points `(*B, N, 3)`, positive on the normal's side, in world units."""
+        plane = self.like(points)
+        points = check_tensor("points", points, "N", 3)
+        check_same_kind(plane=plane.normal, points=points)
+        normal, offset = plane.unit_normal, plane.offset / plane.normal.norm(dim=-1)
+        if not self.is_per_point:
+            normal, offset = normal.unsqueeze(-2), offset.unsqueeze(-1)
+        return dot(points, normal) - offset
+
+    def rms(self, points: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*#batch"]:
+        """Root mean square of the points' distances, in world units: the fit error of `from_points`."""
+        return self.distance(points).square().mean(dim=-1).sqrt()
+
+
+def _as_tensors(normal: Any, offset: Any) -> tuple[Any, Any]:
+    """Python numbers in the dtype and on the device of the tensor beside them, in float64 if there is none."""
+    given = next((value for value in (normal, offset) if isinstance(value, Tensor)), None)
+    kind = torch.empty(0, dtype=torch.float64) if given is None or not given.is_floating_point() else given
+
+    def convert(name: str, value: Any) -> Any:
+        if isinstance(value, Tensor):
+            return value
+        try:
+            return torch.as_tensor(value, dtype=kind.dtype, device=kind.device)
+        except (TypeError, ValueError, RuntimeError):
+            raise TypeError(f"{name}: want a tensor or numbers, got {type(value).__name__}") from None
+
+    return convert("normal", normal), convert("offset", offset)
+
+
+def _smallest_eigenvector(scatter: Tensor) -> Tensor:
+    """Unit eigenvector of the smallest eigenvalue of symmetric `(*B, 3, 3)`, with exact first and second derivatives.
+
+    An eigendecomposition's derivative divides by all gaps between eigenvalues, also by the one between the two large
+    ones, which is zero for a square grid. So: decompose without a tape, then two Newton steps with the tape on for
+    `S n - m n = 0, n0 . n = 1`, whose system is regular as long as the smallest eigenvalue is simple.
+    """
+    with torch.no_grad():
+        values, vectors = torch.linalg.eigh(scatter.detach())
+        if readable(values) and bool((values[..., 1] <= 64 * torch.finfo(values.dtype).eps * values[..., 2]).any()):
+            raise ValueError("points: want three that are not on one line, got points on a line")
+        start, value = vectors[..., 0], values[..., 0]
+    identity = torch.eye(3, dtype=scatter.dtype, device=scatter.device)
+    normal = start
+    for _ in range(2):
+        shifted = scatter - value[..., None, None] * identity
+        top = torch.cat([shifted, -normal.unsqueeze(-1)], dim=-1)
+        bottom = torch.cat([start, torch.zeros_like(start[..., :1])], dim=-1).unsqueeze(-2)
+        constraint = dot(start, normal) - 1
+        residual = torch.cat([dot(shifted, normal.unsqueeze(-2)), constraint.unsqueeze(-1)], dim=-1)
+        step = torch.linalg.solve(torch.cat([top, bottom], dim=-2), residual)
+        normal, value = normal - step[..., :3], value - step[..., 3]
+    return normal / normal.norm(dim=-1, keepdim=True)
+
+
+pytree.register(Plane, children=("normal", "offset"), static=("is_per_point", "adopts"))

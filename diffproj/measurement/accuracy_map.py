@@ -1,0 +1,175 @@
+"""Maps of how well a calibrated camera measures on a plane: over the image, or over a region of the plane.
+
+Two figures for each place: the ground resolution, world units that one pixel covers along its worst direction, which is
+geometry; and the predicted standard deviation of a point measured there, along its worst direction, which adds what the
+calibration does not know. Places beyond the horizon or the lens's reach are not valid. `covered` tells the part of the
+image that the calibration's corners surround: outside of it a lens model extrapolates, and the deviation tells how far.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from kornia.geometry.grid import create_meshgrid
+from torch import Tensor
+
+from diffproj.calibration.result import Calibration
+from diffproj.geometry.plane import Plane
+from diffproj.measurement.measure import measure, view_number
+
+
+@dataclass(frozen=True, eq=False)
+class AccuracyMap:
+    """How well points of a plane are measured, on a grid of rows and columns.
+
+    Attributes:
+        pixels: where the places are in the image `(H, W, 2)`, in px.
+        points: where they are on the plane `(H, W, 3)`, in world units; NaN where a pixel has none.
+        valid: whether a pixel has a point on the plane, or a point a pixel in the image `(H, W)`.
+        covered: whether the calibration's corners surround the pixel `(H, W)`.
+        resolution: world units a pixel along the worst direction `(H, W)`; NaN where not valid.
+        deviation: standard deviation of a measured point along its worst direction in world units `(H, W)`; NaN where
+            not valid, infinite where the calibration does not determine it.
+    """
+
+    pixels: Float[Tensor, "h w 2"]
+    points: Float[Tensor, "h w 3"]
+    valid: Bool[Tensor, "h w"]
+    covered: Bool[Tensor, "h w"]
+    resolution: Float[Tensor, "h w"]
+    deviation: Float[Tensor, "h w"]
+
+
+def image_map(
+    calibration: Calibration,
+    plane: Plane | None = None,
+    view: int | str = 0,
+    step: float = 8.0,
+    pixel_sigma: float | None = None,
+) -> AccuracyMap:
+    """The map over the whole image.
+
+    Args:
+        calibration: of one camera, with its covariance.
+        plane: in the frame of the board that the view saw; the board's own, z = 0, if left out.
+        view: the number or the name of the view whose pose holds.
+        step: about how far apart the places are in px; the first and the last row and column lie on the image's edge.
+        pixel_sigma: noise of a measured pixel; the calibration's residual level if left out.
+
+    Raises:
+        ValueError: many cameras, no size, no such view, or a step that is not positive.
+
+    Example:
+        >>> import diffproj as dp
+        >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+        >>> accuracy = image_map(calibration, step=40)
+        >>> accuracy.deviation.shape, bool(accuracy.covered[6, 8])
+        (torch.Size([13, 17]), True)
+    """
+    size = calibration.camera.size
+    if calibration.views.batch_shape or size is None:
+        raise ValueError("calibration: want one camera of known size; index the views, or give them a size")
+    if not step > 0:
+        raise ValueError(f"step: want a positive distance in px, got {step}")
+    columns, rows = (math.ceil((side - 1) / step) + 1 for side in size)
+    unit = create_meshgrid(rows, columns, normalized_coordinates=True, dtype=torch.float64)[0]
+    last = torch.tensor(size, dtype=torch.float64) - 1
+    pixels = ((unit + 1) / 2 * last).to(calibration.points.device)
+    return _mapped(pixels, calibration, plane or Plane.z(0.0), view, pixel_sigma)
+
+
+def plane_map(
+    calibration: Calibration,
+    extent: Sequence[float],
+    plane: Plane | None = None,
+    view: int | str = 0,
+    shape: Sequence[int] = (60, 80),
+    pixel_sigma: float | None = None,
+) -> AccuracyMap:
+    """The map over a rectangle of the board's x and y, on a plane that is a height over them.
+
+    Args:
+        calibration: of one camera, with its covariance.
+        extent: `(x_min, y_min, x_max, y_max)` in world units of the board's frame.
+        plane: in that frame, not at right angles to the board; the board's own, z = 0, if left out.
+        view: the number or the name of the view whose pose holds.
+        shape: rows, along y, and columns, along x.
+        pixel_sigma: noise of a measured pixel; the calibration's residual level if left out.
+
+    Raises:
+        ValueError: many cameras, no such view, an empty extent, or an upright plane.
+
+    Example:
+        >>> import diffproj as dp
+        >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+        >>> accuracy = plane_map(calibration, (0, 0, 200, 125), shape=(6, 9))
+        >>> bool(accuracy.valid.all()), bool((accuracy.deviation < 0.2).all())  # millimetres
+        (True, True)
+    """
+    if calibration.views.batch_shape:
+        raise ValueError(f"calibration: want one camera, got batch shape {tuple(calibration.views.batch_shape)}")
+    if len(extent) != 4:
+        raise ValueError(f"extent: want (x_min, y_min, x_max, y_max), got {tuple(extent)}")
+    x_min, y_min, x_max, y_max = extent
+    if not (x_max > x_min and y_max > y_min):
+        raise ValueError(f"extent: want (x_min, y_min, x_max, y_max) with room between, got {tuple(extent)}")
+    plane = (plane or Plane.z(0.0)).to(torch.float64)
+    if bool(plane.normal[..., 2].abs() < 1e-9 * plane.normal.norm(dim=-1)):
+        raise ValueError("plane: want one that is a height over the board's x and y, got an upright one")
+    unit = (create_meshgrid(*shape, normalized_coordinates=True, dtype=torch.float64)[0] + 1) / 2
+    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in ((x_min, y_min), (x_max, y_max)))
+    xy = (low + unit * (high - low)).to(calibration.points.device)
+    z = (plane.offset - (plane.normal[:2] * xy).sum(-1)) / plane.normal[2]
+    points = torch.cat([xy, z.unsqueeze(-1)], dim=-1)
+    number = view_number(calibration, view)
+    camera = calibration.cameras[number]
+    pixels, seen = camera.project(points.reshape(-1, 3))
+    if camera.size is not None:
+        last = torch.tensor(camera.size, dtype=torch.float64, device=pixels.device) - 0.5
+        seen = seen & ((pixels >= -0.5) & (pixels <= last)).all(-1)
+    pixels = torch.where(seen.unsqueeze(-1), pixels, torch.nan).reshape(*points.shape[:2], 2)
+    return replace(_mapped(pixels, calibration, plane, view, pixel_sigma), points=points)
+
+
+def _mapped(
+    pixels: Tensor, calibration: Calibration, plane: Plane, view: int | str, pixel_sigma: float | None
+) -> AccuracyMap:
+    shape = pixels.shape[:2]
+    flat = pixels.reshape(-1, 2)
+    measured = measure(flat, calibration, plane, view, pixel_sigma)
+    unit = measure(flat, calibration, plane, view, pixel_sigma=1.0)
+    resolution = torch.linalg.svdvals(unit._own)[:, 0]
+    covariance = measured.covariance
+    infinite = covariance.isinf().any(-1).any(-1)
+    finite = torch.where(infinite[:, None, None], 0.0, covariance)
+    deviation = torch.linalg.eigvalsh(finite)[:, -1].clamp(min=0).sqrt()
+    deviation = torch.where(infinite, torch.inf, deviation)
+    valid = measured.valid
+
+    def shown(values: Tensor) -> Tensor:
+        return torch.where(valid, values, torch.nan).reshape(shape)
+
+    return AccuracyMap(
+        pixels,
+        torch.where(valid.unsqueeze(-1), measured.points, torch.nan).reshape(*shape, 3),
+        valid.reshape(shape),
+        _surrounded(flat, calibration).reshape(shape),
+        shown(resolution),
+        shown(deviation),
+    )
+
+
+def _surrounded(pixels: Tensor, calibration: Calibration) -> Tensor:
+    """Which pixels `(N, 2)` lie in the convex hull of all corners that were used."""
+    corners = calibration.views.pixels[calibration.used].detach().cpu().numpy().astype(np.float32)
+    if len(corners) < 3:
+        return torch.zeros(len(pixels), dtype=torch.bool, device=pixels.device)
+    hull = torch.from_numpy(cv2.convexHull(corners).reshape(-1, 2)).to(pixels)
+    edge = hull.roll(-1, 0) - hull
+    offset = pixels.unsqueeze(1) - hull
+    side = edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0]
+    return (side >= 0).all(-1) | (side <= 0).all(-1)

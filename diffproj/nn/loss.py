@@ -1,0 +1,57 @@
+"""`PlaneLoss`: a loss in world units over the points that are valid."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from diffproj._core.numerics import check_tensor
+from diffproj.calibration.losses import Loss
+
+
+class PlaneLoss(nn.Module):
+    """Squared or robust distance between points in world units, over those that are valid.
+
+    The sum is divided by the number of all points, valid or not: then a point that becomes invalid takes nothing from
+    the others and changes no gradient of theirs.
+
+    Args:
+        loss: a robust loss, its scale in world units (in pixels with `resolution`); squared distances if left out.
+
+    Example:
+        >>> points = torch.tensor([[3.0, 4.0, 0.0], [9.0, 9.0, 9.0]])
+        >>> PlaneLoss()(points, torch.zeros(2, 3), torch.tensor([True, False]))
+        tensor(12.5000)
+    """
+
+    def __init__(self, loss: Loss | None = None) -> None:
+        super().__init__()
+        if loss is not None and not isinstance(loss, Loss):
+            raise TypeError(f"loss: want one such as dp.Huber(5.0), got {type(loss).__name__}")
+        self.loss = loss
+
+    def forward(
+        self,
+        points: Float[Tensor, "*batch n 3"],
+        target: Float[Tensor, "*#batch n 3"],
+        valid: Bool[Tensor, "*#batch n"] | None = None,
+        weights: Float[Tensor, "*#batch n"] | None = None,
+        resolution: Float[Tensor, "*#batch n"] | None = None,
+    ) -> Float[Tensor, ""]:
+        """The loss, a number.
+
+        Args:
+            points: `(*B, N, 3)`, in world units.
+            target: where they should be.
+            valid: which count; all if left out.
+            weights: of the points.
+            resolution: world units a pixel at each point (`ground_resolution`): distances are divided by it, so that
+                far points, which a pixel moves further, count as much as near ones.
+        """
+        points, target = check_tensor("points", points, "N", 3), check_tensor("target", target, "N", 3)
+        counts = torch.ones_like(points[..., 0], dtype=torch.bool) if valid is None else valid
+        off = torch.where(counts.unsqueeze(-1), points - target.to(points), 0.0)
+        if resolution is not None:
+            off = off / torch.where(counts, resolution, 1.0).detach().unsqueeze(-1).to(off)
+        value = off.square().sum(-1)
+        value = value if self.loss is None else self.loss.value(value)
+        return (value if weights is None else value * weights.to(value)).mean()

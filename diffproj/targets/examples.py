@@ -1,0 +1,128 @@
+"""The bundled corners: a real board in 26 real photographs, measured once and shipped as numbers.
+
+The photographs, 640 x 480 px by the left and the right camera of a stereo pair, are those of the folder
+`examples/data` in Debian's package `opencv-doc` 4.6.0. They are not shipped. `python -m diffproj.targets FOLDER`
+measures them again; `data/left.json` and `data/right.json` say how they came about.
+"""
+
+import json
+import os
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from typing import Literal, get_args
+
+import cv2
+import numpy as np
+
+from diffproj._core.atomic import write_whole
+from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.detection import detect
+from diffproj.targets.views import Views
+
+Side = Literal["left", "right"]
+"""The two cameras of the stereo pair."""
+
+NUMBERS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14)
+"""The photographs of each camera; the package has no number 10."""
+
+BOARD = Chessboard(columns=9, rows=6, square=25.0)
+"""The board in the photographs; `left_intrinsics.yml` beside them gives its square's side as 0.025 m."""
+
+REGENERATE = "python -m diffproj.targets FOLDER"
+"""The command that measures the photographs in a folder again."""
+
+DIGITS = 4
+"""Decimals of the recorded pixels, far below what corner detection resolves."""
+
+
+def example_views(side: Side | str) -> Views:
+    """The corners of the 9 x 6 board with 25 mm squares in 13 photographs of one of two real cameras.
+
+    Measured by `detect`, in px with whole numbers at pixel centres. The lens bends straight lines visibly. Left and
+    right photographs of the same number were taken at the same moment.
+
+    Args:
+        side: `"left"` or `"right"`.
+
+    Returns:
+        The views, float64, named by their photographs.
+
+    Raises:
+        ValueError: another side.
+
+    Example:
+        >>> views = example_views("left")
+        >>> views
+        Views(13 views of 54 corners, 640 x 480 px, torch.float64)
+        >>> views[2:5].names
+        ('left03.jpg', 'left04.jpg', 'left05.jpg')
+    """
+    if side not in get_args(Side):
+        raise ValueError(f"side: want one of {', '.join(map(repr, get_args(Side)))}, got {side!r}")
+    record = json.loads(
+        resources.files("diffproj.targets").joinpath("data", f"{side}.json").read_text(encoding="utf-8")
+    )
+    corners = np.array([view["corners_px"] for view in record["views"]], dtype=np.float64)
+    return Views(
+        corners.reshape(len(corners), -1, 2), names=[view["file"] for view in record["views"]], size=record["size_px"]
+    )
+
+
+def photographs(folder: str | os.PathLike[str], side: Side) -> list[Path]:
+    """The files of one camera's photographs in a folder, in order."""
+    return [Path(folder) / f"{side}{number:02d}.jpg" for number in NUMBERS]
+
+
+def regenerate(
+    folder: str | os.PathLike[str],
+    target: str | os.PathLike[str] | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> list[Path]:
+    """Measure the photographs again and write `left.json` and `right.json`, whole, once all is measured.
+
+    Args:
+        folder: where the 26 photographs are.
+        target: where to write; the package's own data by default.
+        progress: called with `(done, total)` after each photograph.
+
+    Returns:
+        The files written.
+
+    Raises:
+        FileNotFoundError: a photograph is missing.
+        ValueError: the board is not found in every photograph, or one is no image. Nothing is written then.
+        OSError: the target is no folder that can be written.
+    """
+    target = Path(target) if target is not None else Path(__file__).parent / "data"
+    files = [file for side in get_args(Side) for file in photographs(folder, side)]
+    views = detect(files, BOARD, progress)
+    if len(views) != len(files):
+        raise ValueError(f"{folder}: want the board in all {len(files)} photographs, found it in {len(views)}")
+    texts = {}
+    for number, side in enumerate(get_args(Side)):
+        first = number * len(NUMBERS)
+        texts[target / f"{side}.json"] = _as_json(views[first : first + len(NUMBERS)], side)
+    for path, text in texts.items():
+        write_whole(path, text)
+    return list(texts)
+
+
+def _as_json(views: Views, side: str) -> str:
+    """The record of one camera as text for people to read: a line for each row of the board."""
+    record = {
+        "about": f"Inner corners of a chessboard in the {side} camera's photographs, in px, whole numbers at pixel "
+        "centres, row by row in the order of diffproj.Chessboard.points.",
+        "source": {"distribution": "Debian", "package": "opencv-doc", "version": "4.6.0", "folder": "examples/data"},
+        "measured_by": {"function": "diffproj.detect", "opencv": cv2.__version__, "rounded_to_px": 10.0**-DIGITS},
+        "regenerate": REGENERATE,
+        "board": {"columns": BOARD.columns, "rows": BOARD.rows, "square_mm": BOARD.square},
+        "size_px": views.size,
+    }
+    header = "".join(f"{json.dumps(key)}: {json.dumps(value)},\n" for key, value in record.items())
+    grids = views.pixels.reshape(len(views), BOARD.rows, BOARD.columns, 2).numpy().round(DIGITS).tolist()
+    entries = []
+    for name, grid in zip(views.names, grids, strict=True):
+        rows = ",\n  ".join(json.dumps(row) for row in grid)
+        entries.append(f'{{"file": {json.dumps(name)}, "corners_px": [\n  {rows}]}}')
+    return f'{{{header}"views": [\n' + ",\n".join(entries) + "]}\n"

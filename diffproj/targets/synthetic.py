@@ -1,0 +1,247 @@
+"""Board photographs and corner sets with known truth: the paper's set-up, rendered through the package's own kernel.
+
+A photograph is the board's print, `board_texture`, seen by `diffproj.render`: each pixel asks the question that
+back-projection answers. Vignetting and a Gaussian blur stand for the optics, Gaussian noise for the sensor.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, UInt8
+from kornia.filters import gaussian_blur2d
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.grid import create_meshgrid
+from torch import Tensor
+
+from diffproj._core.numerics import transform
+from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.euler import rotation_from_euler
+from diffproj.geometry.intrinsics import pixel_to_normalized
+from diffproj.geometry.plane import Plane
+from diffproj.geometry.rectification import render
+from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.views import Views
+
+BLACK, WHITE, TABLE = 0.12, 0.88, 0.55
+"""Grey values of the print, the paper and the table that the board lies on, in 0..1."""
+
+
+class Texture(NamedTuple):
+    """What is printed on a plane, as `diffproj.render` takes it.
+
+    Attributes:
+        image: grey values `(1, rows, columns)` in 0..1.
+        extent: `(s_min, t_min, s_max, t_max)` in world units.
+        axes: `(origin, axis_s, axis_t)`, each `(3,)`.
+    """
+
+    image: Float[Tensor, "1 rows columns"]
+    extent: tuple[float, float, float, float]
+    axes: tuple[Tensor, Tensor, Tensor]
+
+
+def board_texture(board: Chessboard, texels: int = 32) -> Texture:
+    """The board as it is printed on z = 0, s to the right along its rows and t down along its columns.
+
+    One square of white paper surrounds the printed squares, and one square of table the paper.
+
+    Args:
+        board: in either frame.
+        texels: along the side of a square; edges fall between them.
+
+    Example:
+        >>> import diffproj as dp
+        >>> texture = board_texture(dp.Chessboard(columns=4, rows=3, square=10.0), texels=2)
+        >>> texture.image.shape, texture.extent
+        (torch.Size([1, 16, 18]), (-30.0, -30.0, 60.0, 50.0))
+    """
+    if texels < 1:
+        raise ValueError(f"texels: want at least 1 along a square, got {texels}")
+    # Squares by number: 0 lies behind the first inner corner.
+    row, column = (torch.arange(-3, count + 2) for count in (board.rows, board.columns))
+    row = row.unsqueeze(-1)
+    printed = (row >= -1) & (row < board.rows) & (column >= -1) & (column < board.columns)
+    paper = (row >= -2) & (row <= board.rows) & (column >= -2) & (column <= board.columns)
+    grey = torch.where(paper, torch.where(printed & ((row + column) % 2 == 0), BLACK, WHITE), TABLE)
+    low, side = -3 * board.square, board.square
+    extent = (low, low, (board.columns + 2) * side, (board.rows + 2) * side)
+    x, y = torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0])
+    axes = (torch.zeros(3), y, x) if board.axes == "paper" else (torch.zeros(3), x, y)
+    return Texture(grey.repeat_interleave(texels, 0).repeat_interleave(texels, 1)[None], extent, axes)
+
+
+def photograph(
+    camera: Camera | PinholeCamera,
+    board: Chessboard,
+    *,
+    blur_px: float = 0.7,
+    noise: float = 4 / 255,
+    vignetting: float = 0.3,
+    seed: int = 0,
+) -> UInt8[Tensor, "*batch h w"]:
+    """Render grey photographs of a board that lies on z = 0.
+
+    Args:
+        camera: a camera of known size, of any batch shape `*B`.
+        board: the board; one square of white paper surrounds the printed squares.
+        blur_px: standard deviation of the optics' Gaussian blur in pixels; 0 for none.
+        noise: standard deviation of the sensor's noise, in units of the full range.
+        vignetting: how much of the law of natural vignetting the image shows: 1 for light that falls off with the
+            fourth power of the cosine of the angle from the axis, 0 for an even image.
+        seed: of the noise.
+
+    Returns:
+        Images `(*B, H, W)`.
+
+    Raises:
+        ValueError: the camera has no size, or an argument is out of its range.
+
+    Example:
+        >>> import diffproj as dp
+        >>> setup = dp.paper_setup()
+        >>> photograph(setup.test[0], setup.board).shape
+        torch.Size([480, 640])
+    """
+    camera = as_camera(camera)
+    if camera.size is None:
+        raise ValueError("camera: want a size, got None; give Camera(..., size=(width, height))")
+    if blur_px < 0 or noise < 0 or not 0 <= vignetting <= 1:
+        given = f"{blur_px}, {noise} and {vignetting}"
+        raise ValueError(f"photograph: want blur_px >= 0, noise >= 0 and vignetting from 0 to 1, got {given}")
+    generator = torch.Generator().manual_seed(seed)
+    cameras = [camera] if not camera.batch_shape else [camera[i] for i in _indices(camera.batch_shape)]
+    images = []
+    for single in cameras:
+        # In float32, right to 1e-6 of the scene: a thousandth of a pixel.
+        single = single.detach().to("cpu", torch.float32)
+        texture = board_texture(board, _texels(single, board))
+        shown, seen = render(texture.image, single, Plane.z(0.0), texture.extent, axes=texture.axes)
+        image = torch.where(seen, shown[0], TABLE) * (1 - vignetting * (1 - _falloff(single)))
+        if blur_px > 0:
+            kernel = 2 * round(4 * blur_px) + 1
+            image = gaussian_blur2d(image[None, None], (kernel, kernel), (blur_px, blur_px))[0, 0]
+        image = image + noise * torch.randn(image.shape, generator=generator, dtype=image.dtype)
+        images.append((image.clamp(0, 1) * 255).round().to(torch.uint8))
+    return torch.stack(images).reshape(*camera.batch_shape, *images[0].shape)
+
+
+def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px: float = 0.2, seed: int = 0) -> Views:
+    """The board's corners as cameras of batch shape `(*B, V)` would see them, with Gaussian noise on each coordinate.
+
+    Args:
+        camera: the true cameras.
+        board: the board.
+        noise_px: standard deviation of the noise in pixels.
+        seed: of the noise.
+
+    Returns:
+        Views `(*B, V, N, 2)`; corners outside the image, or that the camera cannot see, are marked as not visible.
+
+    Raises:
+        ValueError: the camera has no axis of views.
+
+    Example:
+        >>> import diffproj as dp
+        >>> setup = dp.paper_setup()
+        >>> corner_views(setup.fit, setup.board).pixels.shape
+        torch.Size([10, 54, 2])
+    """
+    camera = as_camera(camera)
+    if not camera.batch_shape:
+        raise ValueError("camera: want a batch of views (V,), got a single camera; camera.at(R, t) makes one")
+    pixels, visible = camera.project(board.points.to(camera.dtype))
+    generator = torch.Generator().manual_seed(seed)
+    pixels = pixels + noise_px * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
+    if camera.size is not None:
+        last = torch.tensor(camera.size, dtype=pixels.dtype) - 0.5
+        visible = visible & ((pixels >= -0.5) & (pixels <= last)).all(dim=-1)
+    return Views(pixels, visible, size=camera.size)
+
+
+def random_cameras(
+    camera: Camera | PinholeCamera,
+    board: Chessboard,
+    views: int,
+    *,
+    tilt: float = math.radians(40),
+    distance: tuple[float, float] = (1.5, 3.0),
+    seed: int = 0,
+) -> Camera:
+    """The camera at random poses from which it sees the whole board, batch shape `(*B, V)`.
+
+    Args:
+        camera: of batch shape `*B` and known size; its pose does not matter.
+        board: the board, in either frame.
+        views: V.
+        tilt: the board's tilts about x and y, and turns about z, are uniform up to this in radians.
+        distance: of the board's middle from the camera, uniform between these multiples of the board's longer side.
+        seed: of the draws.
+
+    Raises:
+        ValueError: the camera has no size, or sees the whole board from hardly any such pose.
+
+    Example:
+        >>> import diffproj as dp
+        >>> setup = dp.paper_setup()
+        >>> random_cameras(setup.fit[0], setup.board, 20).batch_shape
+        torch.Size([20])
+    """
+    camera = as_camera(camera)
+    if camera.size is None:
+        raise ValueError("camera: want a size, got None; give Camera(..., size=(width, height))")
+    generator = torch.Generator().manual_seed(seed)
+    points = board.points.to(camera.dtype)
+    middle, extent = points.mean(dim=0), float((points.amax(dim=0) - points.amin(dim=0)).amax())
+    upright = torch.eye(3, dtype=camera.dtype)
+    if board.axes == "paper":
+        upright = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=camera.dtype)
+    singles = [camera] if not camera.batch_shape else [camera[i] for i in _indices(camera.batch_shape)]
+    rotations, shifts = [], []
+    for single in singles:
+        R, t = torch.zeros(0, 3, 3, dtype=camera.dtype), torch.zeros(0, 3, dtype=camera.dtype)
+        for _ in range(100):
+            count = 8 * views
+            draw = torch.rand(count, 6, generator=generator, dtype=camera.dtype)
+            turned = rotation_from_euler(*((2 * draw[:, :3] - 1) * tilt).unbind(-1)) @ upright
+            depth = (distance[0] + (distance[1] - distance[0]) * draw[:, 3]) * extent
+            # The middle of the board falls anywhere on the image.
+            width, height = single.size or (0, 0)
+            where = draw[:, 4:] * torch.tensor([width - 1.0, height - 1.0], dtype=camera.dtype)
+            direction, valid = single.without_pose().directions(where)
+            direction = direction / direction.norm(dim=-1, keepdim=True)
+            shift = direction * depth.unsqueeze(-1) - turned @ middle
+            pixels, seen = single.at(turned, shift).project(points)
+            last = torch.tensor([width - 1.0, height - 1.0], dtype=camera.dtype)
+            whole = valid & (seen & (pixels >= 0).all(-1) & (pixels <= last).all(-1)).all(-1)
+            R, t = torch.cat([R, turned[whole]]), torch.cat([t, shift[whole]])
+            if len(R) >= views:
+                break
+        else:
+            raise ValueError("distance: the camera sees the whole board from hardly any such pose; move it away")
+        rotations.append(R[:views])
+        shifts.append(t[:views])
+    R = torch.stack(rotations).reshape(*camera.batch_shape, views, 3, 3)
+    t = torch.stack(shifts).reshape(*camera.batch_shape, views, 3)
+    return (camera if not camera.batch_shape else camera[..., None]).at(R, t)
+
+
+def _texels(camera: Camera, board: Chessboard) -> int:
+    """Texels along a square, about two for each pixel where the board is nearest."""
+    pixels, valid = camera.project(board.points.to(camera.dtype))
+    pixels = torch.where(valid.unsqueeze(-1), pixels, torch.nan).reshape(board.rows, board.columns, 2)
+    sides = torch.cat([pixels.diff(dim=axis).norm(dim=-1).flatten() for axis in (0, 1)])
+    longest = sides[sides.isfinite()]
+    return min(256, max(8, math.ceil(2 * float(longest.amax())))) if len(longest) else 8
+
+
+def _falloff(camera: Camera) -> Float[Tensor, "h w"]:
+    """The fourth power of the cosine of the angle under which light meets the sensor, `1 / (1 + r^2)^2`."""
+    width, height = camera.size or (0, 0)
+    pixels = create_meshgrid(height, width, normalized_coordinates=False, dtype=camera.dtype).reshape(-1, 2)
+    xy = transform(pixel_to_normalized(camera.K), pixels - camera.K[:2, 2])
+    return (1 + xy.square().sum(-1)).reshape(height, width) ** -2
+
+
+def _indices(shape: torch.Size) -> list[tuple[int, ...]]:
+    return [tuple(index) for index in torch.cartesian_prod(*map(torch.arange, shape)).reshape(-1, len(shape)).tolist()]

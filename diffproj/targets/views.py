@@ -1,0 +1,279 @@
+"""`Views`: the corners of a board as one camera, or many side by side, saw them in several photographs."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from diffproj._core import pytree
+from diffproj._core.numerics import broadcast_batches, check_tensor, converted, lifted, readable
+
+ArrayLike = Tensor | np.ndarray | Sequence[Any]
+"""What tensors are made of here; nested lists become float64."""
+
+
+class Views:
+    """The pixels of a board's corners in V photographs, with a mask that says which corners were seen.
+
+    Immutable in spirit: every method returns new views, and the caller's tensors are never written. Gradients flow
+    through the pixels to the caller's tensor. It is a PyTree: `vmap` and `torch.func` carry it.
+
+    Attributes:
+        pixels: `(*B, V, N, 2)`, `(u, v)` in px, whole numbers at pixel centres; 0 where the corner was not seen. N
+            counts the corners in the board's order; `*B` are cameras side by side.
+        visible: `(*B, V, N)`, false where a corner was not seen.
+        names: the names of the V photographs.
+        size: `(width, height)` of the photographs in px, or `None`.
+
+    Example:
+        >>> views = Views(torch.rand(5, 54, 2), size=(640, 480))
+        >>> views
+        Views(5 views of 54 corners, 640 x 480 px, torch.float32)
+        >>> len(views), views[1:3].names
+        (5, ('view 2', 'view 3'))
+    """
+
+    __slots__ = ("names", "pixels", "size", "visible")
+
+    pixels: Float[Tensor, "*batch v n 2"]
+    visible: Bool[Tensor, "*batch v n"]
+    names: tuple[str, ...]
+    size: tuple[int, int] | None
+
+    def __init__(
+        self,
+        pixels: ArrayLike,
+        visible: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+        size: Sequence[int] | None = None,
+    ) -> None:
+        """Copy pixels and mask, and check them.
+
+        Args:
+            pixels: `(*B, V, N, 2)`. A tensor keeps its dtype and device (half precision is lifted to float32); a
+                NumPy array and a nested list of numbers are taken as well. (OpenCV 4 gives the corners of a view as
+                `(N, 1, 2)`: `reshape(-1, 2)` brings them here.)
+            visible: booleans `(*B, V, N)`; all true if left out. What `pixels` holds where it is false, be it NaN,
+                does not matter.
+            names: V strings; `"view 1"`, `"view 2"`, ... if left out.
+            size: `(width, height)` in px, where known.
+
+        Raises:
+            TypeError: pixels are not of floating-point type, visible is not boolean, names are not strings, or size
+                is not two whole numbers.
+            ValueError: shapes or lengths do not fit, devices differ, or a visible corner is not finite (checked where
+                values can be read).
+        """
+        points = check_tensor("pixels", _as_tensor("pixels", pixels), "V", "N", 2)
+        mask = _check_visible(visible, points)
+        self.names = _check_names(names, points.shape[-3])
+        self.size = _check_size(size)
+        batch = broadcast_batches(pixels=points.shape[:-3], visible=mask.shape[:-2])
+        points, mask = points.expand(*batch, *points.shape[-3:]), mask.expand(*batch, *mask.shape[-2:])
+        _check_finite(points, mask, self.names)
+        self.pixels, self.visible = _masked(points, mask), mask.clone()
+
+    @classmethod
+    def _unchecked(
+        cls, pixels: Any, visible: Any, names: tuple[str, ...] = (), size: tuple[int, int] | None = None
+    ) -> "Views":
+        """Build without looking at anything: for parts that come from views, or from inside a transformation."""
+        views = cls.__new__(cls)
+        views.pixels, views.visible, views.names, views.size = pixels, visible, names, size
+        return views
+
+    def __repr__(self) -> str:
+        batch = f"{' x '.join(map(str, self.batch_shape))} cameras, " if self.batch_shape else ""
+        views = f"{len(self)} view{'' if len(self) == 1 else 's'} of {self.pixels.shape[-2]} corners"
+        hidden = ""
+        if readable(self.visible) and not self.visible.all():
+            hidden = f" ({int((~self.visible).sum())} hidden)"
+        size = f", {self.size[0]} x {self.size[1]} px" if self.size is not None else ""
+        return f"Views({batch}{views}{hidden}{size}, {self.dtype})"
+
+    # ----------------------------------------------------------------------------------------------- what it is
+
+    def __len__(self) -> int:
+        """The number of views, V."""
+        return self.pixels.shape[-3]
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """`*B`: the cameras side by side; empty for one camera."""
+        return self.pixels.shape[:-3]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The type of the pixels."""
+        return self.pixels.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where the pixels lie."""
+        return self.pixels.device
+
+    # ------------------------------------------------------------------------------------------------ what it gives
+
+    def __getitem__(self, index: Any) -> "Views":
+        """Choose views; names go along, and the axis of views always stays.
+
+        Args:
+            index: along the axis of views: a number (one view, still as a `Views`, of length 1), a slice, a list of
+                numbers, or a mask of V booleans. Iterating gives one `Views` of length 1 after the other.
+
+        Raises:
+            IndexError: out of range, a mask of another length, or something else than the above.
+
+        Example:
+            >>> views = Views(torch.rand(5, 54, 2))
+            >>> views[3].pixels.shape, views[[0, 3]].names
+            (torch.Size([1, 54, 2]), ('view 1', 'view 4'))
+            >>> [len(view) for view in views]
+            [1, 1, 1, 1, 1]
+        """
+        chosen = _positions(index, len(self))
+        where = torch.tensor(chosen, dtype=torch.long, device=self.device)
+        pixels, visible = self.pixels.index_select(-3, where), self.visible.index_select(-2, where)
+        return self._unchecked(pixels, visible, tuple(self.names[i] for i in chosen), self.size)
+
+    def hiding(self, mask: ArrayLike) -> "Views":
+        """Hide corners as if they had not been seen; their pixels become 0.
+
+        Args:
+            mask: booleans, true where a corner is to be hidden: `(N,)` for the same corners in every view, or
+                `(*B, V, N)`.
+
+        Raises:
+            TypeError: the mask is not boolean.
+            ValueError: its shape does not fit.
+
+        Example:
+            Fit to every second corner, and keep the others for a test.
+
+            >>> views = Views(torch.rand(5, 54, 2))
+            >>> odd = torch.arange(54) % 2 == 1
+            >>> fit, test = views.hiding(odd), views.hiding(~odd)
+            >>> fit
+            Views(5 views of 54 corners (135 hidden), torch.float32)
+        """
+        hidden = _as_tensor("mask", mask).to(self.device)
+        if hidden.dtype != torch.bool:
+            raise TypeError(f"mask: want booleans, got {hidden.dtype}")
+        try:
+            visible = self.visible & ~hidden.expand(self.visible.shape)
+        except RuntimeError:
+            want = tuple(self.visible.shape)
+            raise ValueError(f"mask: want shape ({want[-1]},) or {want}, got {tuple(hidden.shape)}") from None
+        return self._unchecked(_masked(self.pixels, visible), visible, self.names, self.size)
+
+    def to(self, *args: Any, **kwargs: Any) -> "Views":
+        """Move to a dtype or a device, with the arguments of `torch.Tensor.to`; half precision becomes float32.
+
+        Raises:
+            TypeError: the dtype is not of floating-point type.
+
+        Example:
+            >>> Views(torch.rand(5, 54, 2)).to(torch.float64).dtype
+            torch.float64
+        """
+        pixels = converted(self.pixels, *args, **kwargs)
+        if not pixels.is_floating_point():
+            raise TypeError(f"dtype: want a floating-point one, got {pixels.dtype}")
+        return self._unchecked(lifted(pixels), converted(self.visible, pixels.device), self.names, self.size)
+
+
+pytree.register(Views, children=("pixels", "visible"), static=("names", "size"))
+
+
+# ------------------------------------------------------------------------------------------------------ the checks
+
+
+def _as_tensor(name: str, value: Any) -> Tensor:
+    """A tensor as it is, an array with its dtype, and Python's numbers, which have none to defend, as float64."""
+    if isinstance(value, Tensor):
+        return value
+    try:
+        array = np.asarray(value)
+        if array is not value and np.issubdtype(array.dtype, np.integer):
+            array = array.astype(np.float64)
+        return torch.tensor(array)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name}: want a tensor or an array, got {type(value).__name__} ({error})") from None
+
+
+def _masked(pixels: Tensor, visible: Tensor) -> Tensor:
+    """A copy with 0 at unseen corners: selected, not multiplied, for NaN times 0 is NaN, in the gradient too."""
+    return torch.where(visible.unsqueeze(-1), pixels, torch.zeros_like(pixels))
+
+
+def _check_visible(visible: Any, pixels: Tensor) -> Tensor:
+    shape = pixels.shape[-3:-1]
+    if visible is None:
+        return torch.ones(shape, dtype=torch.bool, device=pixels.device)
+    tensor = _as_tensor("visible", visible)
+    if tensor.dtype != torch.bool:
+        raise TypeError(f"visible: want booleans, got {tensor.dtype}")
+    if tensor.shape[-2:] != shape:
+        raise ValueError(f"visible: want shape (*B, {shape[0]}, {shape[1]}) as pixels, got {tuple(tensor.shape)}")
+    if isinstance(visible, Tensor) and tensor.device != pixels.device:
+        raise ValueError(f"visible: want device {pixels.device} as pixels has, got {tensor.device}")
+    return tensor.to(pixels.device)
+
+
+def _check_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:
+    if names is None:
+        return tuple(f"view {i}" for i in range(1, count + 1))
+    if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        raise TypeError(f"names: want {count} strings, got {names!r}")
+    if len(names) != count:
+        raise ValueError(f"names: want {count}, one for each view, got {len(names)}")
+    return tuple(names)
+
+
+def _check_size(size: Any) -> tuple[int, int] | None:
+    if size is None:
+        return None
+    try:
+        width, height = (int(extent) for extent in size)
+        whole = (width, height) == tuple(size)
+    except (TypeError, ValueError):
+        whole, width, height = False, 0, 0
+    if not whole:
+        raise TypeError(f"size: want (width, height) in whole px, got {size!r}")
+    if width < 1 or height < 1:
+        raise ValueError(f"size: want a positive width and height, got {size!r}")
+    return width, height
+
+
+def _check_finite(pixels: Tensor, visible: Tensor, names: tuple[str, ...]) -> None:
+    """Refuse a visible corner that is not finite, and say where it is, wherever values can be read."""
+    if not readable(pixels, visible):
+        return
+    wrong = visible & ~pixels.isfinite().all(dim=-1)
+    if wrong.any():
+        *camera, view, corner = wrong.nonzero()[0].tolist()
+        where = f"camera {tuple(camera)}, " * bool(camera) + f"{names[view]!r} (view {view}), corner {corner}"
+        got = pixels[(*camera, view, corner)].tolist()
+        raise ValueError(f"pixels: want finite values at visible corners, got {got} at {where}; visible=... hides it")
+
+
+def _positions(index: Any, count: int) -> list[int]:
+    """What `index` chooses among `count` views, as numbers from 0."""
+    if isinstance(index, slice):
+        return list(range(count))[index]
+    array = index.detach().cpu().numpy() if isinstance(index, Tensor) else np.asarray(index)
+    if array.size == 0 and array.ndim == 1:
+        return []
+    if array.dtype == np.bool_:
+        if array.shape != (count,):
+            raise IndexError(f"index: want a mask of {count} booleans, one for each view, got shape {array.shape}")
+        return np.flatnonzero(array).tolist()
+    if not np.issubdtype(array.dtype, np.integer) or array.ndim > 1:
+        raise IndexError(f"index: want a number, a slice, a list of numbers or a mask, got {index!r}")
+    for position in array.reshape(-1).tolist():
+        if not -count <= position < count:
+            raise IndexError(f"index: want a view from {-count} to {count - 1}, got {position}")
+    return (array.reshape(-1) % max(count, 1)).tolist()

@@ -1,0 +1,43 @@
+"""What the package uses of PyTorch beyond its promises still does what it is used for."""
+
+import torch
+from torch.autograd import forward_ad
+
+from diffproj._core.torch_private import constant_in_graphs, in_forward_mode, in_functional_transform
+
+
+def test_functional_transforms_are_seen() -> None:
+    seen = []
+
+    def function(x: torch.Tensor) -> torch.Tensor:
+        seen.append(in_functional_transform())
+        return x.sum()
+
+    x = torch.ones(2, 2)
+    function(x)
+    torch.func.vmap(function)(x)
+    torch.func.grad(function)(x)
+    torch.func.jvp(function, (x,), (x,))
+    function(x)
+    assert seen == [False, True, True, True, False]
+
+
+def test_forward_mode_is_seen() -> None:
+    assert not in_forward_mode()
+    with forward_ad.dual_level():
+        assert in_forward_mode()
+        with torch.no_grad():
+            assert in_forward_mode()
+    assert not in_forward_mode()
+
+
+def test_a_constant_is_marked_as_pytorch_marks_it() -> None:
+    def ours() -> bool:
+        return True
+
+    def theirs() -> bool:
+        return True
+
+    constant_in_graphs(ours)
+    torch.compiler.assume_constant_result(theirs)
+    assert vars(ours) == vars(theirs) != {}

@@ -1,0 +1,226 @@
+"""Metric top views and rendered textures."""
+
+import os
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import interpolate
+
+import diffproj as dp
+from diffproj import synthetic
+
+D = torch.float64
+PHOTOS = os.environ.get("DIFFPROJ_PHOTOS")
+EXTENT = (-20.0, -20.0, 220.0, 140.0)
+
+
+def smooth(rows: int, columns: int, channels: int = 1) -> torch.Tensor:
+    """A texture without anything finer than ten pixels."""
+    coarse = torch.rand(1, channels, rows // 10, columns // 10, dtype=D)
+    return interpolate(coarse, size=(rows, columns), mode="bicubic")[0]
+
+
+def above(lens: dp.Lens | None = None) -> dp.Camera:
+    """A camera that sees the whole extent at a slant."""
+    K = torch.tensor([[700.0, 0, 319.5], [0, 700, 239.5], [0, 0, 1]], dtype=D)
+    R = dp.rotation_from_euler(*torch.tensor([0.3, -0.2, 0.1], dtype=D))
+    return dp.Camera(K, R, torch.tensor([-100.0, -60, 450], dtype=D), lens, (640, 480))
+
+
+def test_a_texture_comes_back(lens: dp.BrownConrady) -> None:
+    texture = smooth(200, 300, channels=3)
+    for camera in (above(), above(lens)):
+        image, shown = dp.render(texture, camera, dp.Plane.z(0.0), EXTENT)
+        assert image.shape == (3, 480, 640)
+        assert 0.2 < shown.double().mean() < 0.9
+        back, valid = dp.rectify(image, camera, dp.Plane.z(0.0), EXTENT, 0.8)
+        assert back.shape == texture.shape
+        inner = torch.zeros_like(valid)
+        inner[5:-5, 5:-5] = True  # the rim mixes with what is not texture
+        assert valid[inner].all()
+        assert (back - texture)[:, inner].abs().mean() < 0.01
+
+
+def test_places_are_the_projections(lens: dp.BrownConrady) -> None:
+    camera = above(lens)
+    row, column = torch.meshgrid(torch.arange(480, dtype=D), torch.arange(640, dtype=D), indexing="ij")
+    image = torch.stack([column, row])  # an image that shows where it is
+    top, valid = dp.rectify(image, camera, dp.Plane.z(0.0), EXTENT, 2.0)
+    s, t = torch.meshgrid(torch.arange(-19, 220, 2, dtype=D), torch.arange(-19, 140, 2, dtype=D), indexing="xy")
+    pixels, seen = camera.project(torch.stack([s, t, 0 * s], dim=-1).reshape(-1, 3))
+    inside = seen & ((pixels >= 1) & (pixels <= torch.tensor([638.0, 478]))).all(-1)
+    want = pixels.T.reshape(2, *top.shape[1:])
+    # A pixel is the mean of samples about its middle: the same up to the lens's and the perspective's second order.
+    assert (top - want)[:, inside.reshape(top.shape[1:])].abs().max() < 0.02
+    assert torch.equal(valid, valid & seen.reshape(valid.shape))
+
+
+def test_coarse_views_do_not_alias() -> None:
+    stripes = (torch.arange(640, dtype=D) % 2).expand(1, 480, 640)  # every other column is white
+    K = torch.tensor([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], dtype=D)
+    camera = dp.Camera(K, t=torch.tensor([0.0, 0, 500], dtype=D), size=(640, 480))
+    top, valid = dp.rectify(stripes, camera, dp.Plane.z(0.0), (-300, -200, 300, 200), 4.0)
+    assert valid.all()
+    assert (top - 0.5).abs().max() < 0.15
+
+
+def test_outside_of_the_image_is_not_valid() -> None:
+    image = torch.ones(1, 480, 640, dtype=D)
+    top, valid = dp.rectify(image, above(), dp.Plane.z(0.0), (-3000, -3000, 3000, 3000), 20.0)
+    assert valid.any()
+    assert not valid[0, 0]
+    assert (top[:, ~valid] == 0).all()
+    assert (top[:, valid] > 0.4).all()
+
+
+def test_axes_of_an_oblique_plane() -> None:
+    plane = dp.Plane(
+        torch.tensor([[0.3, -0.2, 2.0], [5.0, 0.1, 0.3], [0.1, 0.2, -1.0]], dtype=D),
+        torch.tensor([3.0, 7, -2], dtype=D),
+    )
+    origin, s, t = dp.plane_axes(plane)
+    torch.testing.assert_close((plane.normal * origin).sum(-1), plane.offset)
+    n = plane.normal / plane.normal.norm(dim=-1, keepdim=True)
+    for axis in (s, t):
+        torch.testing.assert_close((axis * n).sum(-1), torch.zeros(3, dtype=D), rtol=0, atol=1e-14)
+        torch.testing.assert_close(axis.norm(dim=-1), torch.ones(3, dtype=D))
+    assert (torch.linalg.cross(s, t)[:, 2] > 0).all()
+    texture = smooth(60, 80)
+    slanted = dp.Plane(torch.tensor([0.2, -0.1, 1.0], dtype=D), torch.tensor(5.0, dtype=D))
+    image, _ = dp.render(texture, above(), slanted, (20, 10, 180, 130))
+    back, valid = dp.rectify(image, above(), slanted, (20, 10, 180, 130), 2.0)
+    assert (back - texture)[:, 3:-3, 3:-3].abs().mean() < 0.02
+    assert valid[3:-3, 3:-3].all()
+
+
+def test_gradients_to_image_and_camera(lens: dp.BrownConrady) -> None:
+    texture = smooth(40, 60)
+    small = above(lens).resized((64, 48))
+
+    def view(texture: torch.Tensor, K: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        image, _ = dp.render(texture, dp.Camera(K, small.R, t, lens, small.size), dp.Plane.z(0.0), EXTENT)
+        return image[:, 10:38:5, 15:50:5]
+
+    arguments = [part.clone().requires_grad_() for part in (texture, small.K, small.t)]
+    image = view(*arguments)
+    weights = torch.rand_like(image)
+    gradients = torch.autograd.grad((image * weights).sum(), arguments)
+    for i, step in enumerate((1e-4, 1e-5, 1e-5)):
+        direction = torch.rand_like(arguments[i])
+        if i == 1:
+            direction = direction * torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 0]], dtype=D)
+        sides = []
+        for sign in (1, -1):
+            moved = [argument.detach() for argument in arguments]
+            moved[i] = moved[i] + sign * step * direction
+            sides.append((view(*moved) * weights).sum())
+        finite = (sides[0] - sides[1]) / (2 * step)
+        torch.testing.assert_close((gradients[i] * direction).sum(), finite, rtol=1e-4, atol=1e-6)
+
+
+def test_a_plane_and_axes_for_each_image() -> None:
+    heights, places = torch.tensor([0.0, 40.0], dtype=D), torch.tensor([[30.0, 20, 0], [90, 60, 40]], dtype=D)
+    x, y = torch.eye(3, dtype=D)[:2].expand(2, 2, 3).unbind(1)
+    extent = (-40.0, -30.0, 40.0, 30.0)
+    texture = smooth(30, 40)
+    images, shown = dp.render(texture, above(), dp.Plane.z(heights), extent, axes=(places, x, y))
+    tops, _ = dp.rectify(images, above(), dp.Plane.z(heights), extent, 2.0, axes=(places, x, y))
+    assert images.shape == (2, 1, 480, 640)
+    for i in range(2):
+        axes = places[i], x[i], y[i]
+        image, seen = dp.render(texture, above(), dp.Plane.z(float(heights[i])), extent, axes=axes)
+        torch.testing.assert_close(images[i], image)
+        assert torch.equal(shown[i], seen)
+        torch.testing.assert_close(tops[i, :, 2:-2, 2:-2], texture[:, 2:-2, 2:-2], rtol=0, atol=0.1)
+
+
+def test_batches_and_kornia_cameras() -> None:
+    images = torch.rand(2, 3, 480, 640)
+    cameras = dp.Camera(above().K, above().R, torch.stack([above().t, above().t + 20]), size=(640, 480)).to(
+        torch.float32
+    )
+    top, valid = dp.rectify(images, cameras, dp.Plane.z(0.0), EXTENT, 4.0)
+    assert top.shape == (2, 3, 40, 60)
+    for i in range(2):
+        single, seen = dp.rectify(images[i], cameras[i], dp.Plane.z(0.0), EXTENT, 4.0)
+        torch.testing.assert_close(single, top[i])
+        assert torch.equal(seen, valid[i])
+    pinhole, _ = dp.rectify(images, cameras.to_kornia(), dp.Plane.z(0.0), EXTENT, 4.0)
+    torch.testing.assert_close(pinhole, top)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_on_a_gpu(lens: dp.BrownConrady) -> None:
+    texture, camera = smooth(60, 80), above(lens)
+    image, shown = dp.render(texture, camera, dp.Plane.z(0.0), EXTENT)
+    top, valid = dp.rectify(image, camera, dp.Plane.z(0.0), EXTENT, 4.0)
+    image_there, shown_there = dp.render(texture.cuda(), camera.to("cuda"), dp.Plane.z(0.0), EXTENT)
+    top_there, valid_there = dp.rectify(image_there, camera.to("cuda"), dp.Plane.z(0.0), EXTENT, 4.0)
+    torch.testing.assert_close(image_there.cpu(), image)
+    torch.testing.assert_close(top_there.cpu(), top)
+    assert torch.equal(shown_there.cpu(), shown)
+    assert torch.equal(valid_there.cpu(), valid)
+
+
+def squares(top: torch.Tensor, resolution: float) -> tuple[np.ndarray, np.ndarray]:
+    """Sides of the board's squares and cosines of their angles, detected in a top view."""
+    grey = (top[0] * 255).to(torch.uint8).numpy()
+    found, corners = cv2.findChessboardCorners(grey, (9, 6))
+    assert found
+    half = round(0.3 * 25 / resolution / 2)
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
+    corners = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop).reshape(6, 9, 2) * resolution
+    along, down = np.diff(corners, axis=1), np.diff(corners, axis=0)
+    sides = np.concatenate([np.linalg.norm(along, axis=-1).ravel(), np.linalg.norm(down, axis=-1).ravel()])
+    a, d = along[:-1], down[:, :-1]
+    return sides, (a * d).sum(-1) / np.linalg.norm(a, axis=-1) / np.linalg.norm(d, axis=-1)
+
+
+@pytest.mark.skipif(PHOTOS is None, reason="DIFFPROJ_PHOTOS names no folder with the photographs")
+def test_squares_of_a_photograph_are_square() -> None:
+    views, board = dp.example_views("left"), dp.Chessboard()
+    calibration = dp.calibrate(views, board)
+    sides, cosines = [], []
+    for i in (2, 3, 5, 7, 11):
+        grey = cv2.imread(f"{PHOTOS}/{views.names[i]}", cv2.IMREAD_GRAYSCALE)
+        image = torch.from_numpy(grey)[None].float() / 255
+        camera = calibration.cameras[i].to(torch.float32)
+        top, _ = dp.rectify(image, camera, dp.Plane.z(0.0), (-40, -40, 240, 165), 0.25)
+        side, cosine = squares(top, 0.25)
+        sides.append(side)
+        cosines.append(cosine.ravel())
+    assert abs(np.concatenate(sides).mean() - 25) < 0.02
+    assert np.concatenate(sides).std() < 0.15
+    assert np.abs(np.concatenate(cosines).mean()) < 1e-3
+
+
+def test_squares_of_a_rendered_photograph_are_square() -> None:
+    setup = dp.paper_setup()
+    image = synthetic.photograph(setup.test[3], setup.board)[None].float() / 255
+    # The paper's x runs down the board: its axes are given, so that the top view is upright.
+    z = torch.zeros(3)
+    axes = z, torch.tensor([0.0, 1, 0]), torch.tensor([1.0, 0, 0])
+    camera = setup.test[3].to(torch.float32)
+    top, _ = dp.rectify(image, camera, dp.Plane.z(0.0), (-50, -50, 250, 175), 0.5, axes)
+    side, cosine = squares(top, 0.5)
+    assert abs(side.mean() - 25) < 0.02
+    assert side.std() < 0.15
+    assert np.abs(cosine).max() < 0.02
+
+
+@pytest.mark.plain
+def test_bad_input_is_refused_by_name() -> None:
+    image, z = torch.rand(1, 48, 64, dtype=D), dp.Plane.z(0.0)
+    bare = dp.Camera(above().K, above().R, above().t)
+    cases = [
+        (TypeError, "image: want a floating-point tensor", lambda: dp.rectify(image.int(), above(), z, EXTENT, 1.0)),
+        (ValueError, "extent: want", lambda: dp.rectify(image, above(), z, (0, 0, 0, 1), 1.0)),
+        (ValueError, "resolution: want", lambda: dp.rectify(image, above(), z, EXTENT, 0.0)),
+        (ValueError, "size: want", lambda: dp.render(image, bare, z, EXTENT)),
+        (TypeError, "camera: want dp.Camera", lambda: dp.render(image, None, z, EXTENT)),
+    ]
+    for kind, message, call in cases:
+        with pytest.raises(kind, match=message):
+            call()
