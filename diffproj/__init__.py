@@ -36,6 +36,7 @@ from diffproj.geometry.plane import Plane
 from diffproj.geometry.rectification import plane_axes, rectify, render
 from diffproj.lens.brown_conrady import BrownConrady
 from diffproj.lens.kannala_brandt import KannalaBrandt
+from diffproj.lens.models import register_lens
 from diffproj.lens.protocol import Lens
 from diffproj.measurement.accuracy_map import AccuracyMap, image_map, plane_map
 from diffproj.measurement.measure import Measurement, Quantity, measure
@@ -109,6 +110,7 @@ __all__ = [
     "plane_residuals",
     "rectify",
     "refine",
+    "register_lens",
     "render",
     "rotation_from_euler",
     "run_experiment",

@@ -123,14 +123,6 @@ def converted(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
     return tensor.to(*args, **kwargs).expand(shape)
 
 
-def index_batch(tensor: Tensor, index: Any, trailing: int) -> Tensor:
-    """Index the batch axes of a tensor and keep its `trailing` last axes whole, also when `index` has an ellipsis."""
-    index = index if isinstance(index, tuple) else (index,)
-    if not any(part is Ellipsis for part in index):
-        index = (*index, Ellipsis)
-    return tensor[(*index, *(slice(None),) * trailing)]
-
-
 # ------------------------------------------------------------------------------------------------- linear algebra
 
 

@@ -53,4 +53,4 @@ def assembled(lens: str, shared: Tensor, local: LocalState) -> Camera:
     batch = R.shape[:-2]
     K = intrinsic_matrix(shared[:, None, :2], shared[:, None, 2:4])
     model = make_lens(lens, shared[:, None, 4 : 4 + COEFFICIENTS[lens]])  # type: ignore[arg-type, index]
-    return Camera._unchecked(K.expand(*batch, 3, 3), R, t, None if model is None else model.expand(*batch), None)
+    return Camera.unchecked(K.expand(*batch, 3, 3), R, t, None if model is None else model.expand(*batch), None)

@@ -381,8 +381,8 @@ def _result(
     R, t = (shaped(z) for z in solution.local)
     if lens is not None:
         lens = type(lens)(shaped(solution.shared[:, 4 : 4 + lens.coefficients.shape[-1]]))  # type: ignore
-    camera = Camera._unchecked(shaped(cameras.K[:, 0]), R[..., 0, :, :], t[..., 0, :], lens, size).without_pose()
-    posed = Camera._unchecked(
+    camera = Camera.unchecked(shaped(cameras.K[:, 0]), R[..., 0, :, :], t[..., 0, :], lens, size).without_pose()
+    posed = Camera.unchecked(
         camera.K.unsqueeze(-3).expand(*batch, len(data.views), 3, 3),
         R,
         t,

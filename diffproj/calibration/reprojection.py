@@ -15,7 +15,6 @@ board's extent along x and y: the bows are what the board's centre stands off it
 """
 
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Literal
 
 import torch
@@ -23,6 +22,7 @@ from torch import Tensor
 
 from diffproj.calibration.lens_derivatives import brown_conrady, fisheye, pinhole
 from diffproj.calibration.solver import LocalState
+from diffproj.geometry.cayley import turned
 from diffproj.lens.brown_conrady import BrownConrady
 from diffproj.lens.kannala_brandt import KannalaBrandt
 
@@ -80,26 +80,9 @@ def bow_shape(points: Tensor) -> Tensor:
 
 
 def moved(local: LocalState, step: Tensor) -> LocalState:
-    """Poses `(R, t)` moved by `R <- exp(omega) R`, `t <- t + tau`, to second order in the step.
-
-    Cayley's transform stands for the exponential: it is a rotation for every omega, agrees with the exponential in its
-    first and second derivative at 0, and costs a quarter of it.
-    """
+    """Poses `(R, t)` moved by `R <- exp(omega) R`, `t <- t + tau`, to second order in the step `(*, 6)`."""
     R, t = local
-    half = step[..., :3] / 2
-    V = (half @ _cross_generators(half.dtype, half.device)).unflatten(-1, (3, 3))
-    turn = (V + V @ V) * (2 / (1 + half.square().sum(-1)))[..., None, None]
-    return R + turn @ R, t + step[..., 3:]
-
-
-@cache
-def _cross_generators(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`(3, 9)`: takes a vector to the entries of its cross-product matrix."""
-    with torch.inference_mode(False):  # what is kept must serve those who ask for derivatives, too
-        generators = torch.zeros(3, 9, dtype=dtype, device=device)
-        generators[[0, 1, 2], [7, 2, 3]] = 1.0
-        generators[[0, 1, 2], [5, 6, 1]] = -1.0
-    return generators
+    return turned(R, step[..., :3]), t + step[..., 3:]
 
 
 @dataclass(eq=False)

@@ -94,7 +94,7 @@ def cross_validate(
         located = locate(held_out.hiding(judges), board, fits.camera)
         errors.append(_squared_errors(located, held_out.hiding(~judges)))
     px, world = (_rms([error[i] for error in errors], [error[2] for error in errors]) for i in range(2))
-    own = _squared_errors(fits, Views._unchecked(every.pixels, fits.used, every.names, every.size))
+    own = _squared_errors(fits, Views.unchecked(every.pixels, fits.used, every.names, every.size))
     return CrossValidation(fits, _rms([own[0]], [own[2]]), px, _rms([own[1]], [own[2]]), world)
 
 
@@ -157,7 +157,7 @@ def bootstrap(
 def _repeated(views: Views, count: int) -> Views:
     """The same views for many cameras side by side."""
     pixels = views.pixels.expand(count, *views.pixels.shape)
-    return Views._unchecked(pixels, views.visible.expand(count, *views.visible.shape), views.names, views.size)
+    return Views.unchecked(pixels, views.visible.expand(count, *views.visible.shape), views.names, views.size)
 
 
 def _squared_errors(calibration: Calibration, judged: Views) -> tuple[Tensor, Tensor, Tensor]:

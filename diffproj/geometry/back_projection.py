@@ -26,7 +26,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from diffproj._core import pytree
+from diffproj._core.batched import register_pytree
 from diffproj._core.numerics import (
     broadcast_batches,
     check_same_kind,
@@ -105,7 +105,8 @@ class PlaneMap:
         self.camera, self.is_per_point = camera, plane.is_per_point
 
     @classmethod
-    def _unchecked(cls, matrix: Any, camera: Any, is_per_point: bool) -> "PlaneMap":
+    def unchecked(cls, matrix: Any, camera: Any, is_per_point: bool) -> "PlaneMap":
+        """A map of these parts, without a look at them."""
         plane_map = cls.__new__(cls)
         plane_map.matrix, plane_map.camera, plane_map.is_per_point = matrix, camera, is_per_point
         return plane_map
@@ -287,4 +288,4 @@ def _plane_matrix(camera: Camera, plane: Plane) -> Tensor:
     return M * factor[..., None, None]
 
 
-pytree.register(PlaneMap, children=("matrix", "camera"), static=("is_per_point",))
+register_pytree(PlaneMap, children=("matrix", "camera"), constants=("is_per_point",))

@@ -12,39 +12,34 @@ A world point reaches its pixel in three steps, and a pixel goes back by the sam
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from diffproj._core import pytree
+from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
     broadcast_batches,
     check_same_kind,
     check_tensor,
-    converted,
     dot,
     entries,
     in_blocks,
-    index_batch,
     linear,
     readable,
     transform,
 )
-from diffproj.geometry import interop
-from diffproj.geometry.interop import ArrayLike
+from diffproj.geometry.exchange import Exchange
+from diffproj.geometry.grid import checked_size, inside
 from diffproj.geometry.intrinsics import check_intrinsics, check_warp, pixel_to_normalized, warped
-from diffproj.lens.brown_conrady import BrownConrady
-from diffproj.lens.kannala_brandt import KannalaBrandt
 from diffproj.lens.protocol import Lens
 
 ROTATION_TOLERANCE = 1e-5
 """How far `R^T R` may be from the identity, entry by entry, where a user hands a camera in."""
 
 
-class Camera:
+class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distortion",), constants=("size",)):
     """A calibrated camera, or a batch of them with batch shape `*B`; the parts broadcast to it.
 
     The camera is immutable in spirit: methods return new cameras that share tensors, and gradients flow to whatever
@@ -105,7 +100,7 @@ class Camera:
         if readable(K, R, t):
             check_intrinsics(K)
             _check_pose(R, t)
-        self._assign(K, R, t, distortion, _checked_size(size))
+        self._assign(K, R, t, distortion, checked_size(size))
 
     def _assign(self, K: Tensor, R: Tensor, t: Tensor, distortion: Lens | None, size: tuple[int, int] | None) -> None:
         check_same_kind(K=K, R=R, t=t, distortion=distortion)
@@ -123,7 +118,7 @@ class Camera:
         self.size = size
 
     @classmethod
-    def _unchecked(cls, K: Any, R: Any, t: Any, distortion: Any, size: tuple[int, int] | None) -> "Camera":
+    def unchecked(cls, K: Any, R: Any, t: Any, distortion: Any, size: tuple[int, int] | None) -> "Camera":
         """Build without looking at anything: for parts that come from a camera, or from inside a transformation."""
         camera = cls.__new__(cls)
         camera.K, camera.R, camera.t, camera.distortion, camera.size = K, R, t, distortion, size
@@ -133,40 +128,6 @@ class Camera:
         camera = type(self).__new__(type(self))
         camera._assign(**({name: getattr(self, name) for name in self.__slots__} | changes))
         return camera
-
-    # ------------------------------------------------------------------------------------------------- as a tensor
-
-    @property
-    def batch_shape(self) -> torch.Size:
-        """The batch shape `*B`."""
-        return self.K.shape[:-2]
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """The floating-point type of all parts."""
-        return self.K.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """The device of all parts."""
-        return self.K.device
-
-    def to(self, *args: Any, **kwargs: Any) -> "Camera":
-        """The camera in another dtype or on another device; takes what `torch.Tensor.to` takes."""
-        K, R, t = (converted(part, *args, **kwargs) for part in (self.K, self.R, self.t))
-        distortion = None if self.distortion is None else self.distortion.to(*args, **kwargs)
-        return self._unchecked(K, R, t, distortion, self.size)
-
-    def detach(self) -> "Camera":
-        """The same camera cut off from the graph."""
-        distortion = None if self.distortion is None else self.distortion.detach()
-        return self._unchecked(self.K.detach(), self.R.detach(), self.t.detach(), distortion, self.size)
-
-    def __getitem__(self, index: Any) -> "Camera":
-        """Cameras picked from the batch, as one indexes a tensor of shape `*B`."""
-        distortion = None if self.distortion is None else self.distortion[index]
-        K, R, t = index_batch(self.K, index, 2), index_batch(self.R, index, 2), index_batch(self.t, index, 1)
-        return self._unchecked(K, R, t, distortion, self.size)
 
     def __repr__(self) -> str:
         lens = "pinhole" if self.distortion is None else type(self.distortion).__name__
@@ -210,7 +171,7 @@ class Camera:
             raise ValueError(
                 "resized: want a camera with a size, got size=None; give Camera(..., size=(width, height))"
             )
-        width, height = _checked_size(size) or (0, 0)
+        width, height = checked_size(size) or (0, 0)
         scale = (width / self.size[0], height / self.size[1])
         factors = self.K.new_tensor([[scale[0]], [scale[1]], [1.0]])
         shift = self.K.new_tensor([[0, 0, (scale[0] - 1) / 2], [0, 0, (scale[1] - 1) / 2], [0, 0, 0]])
@@ -219,7 +180,7 @@ class Camera:
     def cropped(self, left: float, top: float, width: int, height: int) -> "Camera":
         """The camera of the crop whose first pixel was pixel `(left, top)`: the principal point moves along."""
         shift = self.K.new_tensor([[0, 0, left], [0, 0, top], [0, 0, 0]])
-        return self._with(K=self.K - shift, size=_checked_size((width, height)))
+        return self._with(K=self.K - shift, size=checked_size((width, height)))
 
     def warped(self, matrix: Float[Tensor, "*#batch 3 3"], size: tuple[int, int] | None = None) -> "Camera":
         """The camera of the same image warped, as a geometric augmentation does: pixels `p` go to `matrix p`.
@@ -259,9 +220,27 @@ class Camera:
             ahead = self.K.new_tensor([(side - 1) / 2 for side in self.size])
         K, turn = warped(self.K, matrix, ahead)
         R, t = (turn.unsqueeze(-1) * self.R.unsqueeze(-3)).sum(-2), dot(turn, self.t.unsqueeze(-2))
-        return self._with(K=K, R=R, t=t, size=_checked_size(size) or self.size)
+        return self._with(K=K, R=R, t=t, size=checked_size(size) or self.size)
 
     # ------------------------------------------------------------------------------------------- points and pixels
+
+    def in_image(self, pixels: Float[Tensor, "*shape 2"]) -> Bool[Tensor, "*shape"]:
+        """Whether pixels lie on the image: from -0.5 to `width - 0.5` and `height - 0.5`; false where not finite.
+
+        Args:
+            pixels: `(*, 2)` in px.
+
+        Raises:
+            ValueError: the camera does not know its size.
+
+        Example:
+            >>> camera = Camera(torch.eye(3), size=(640, 480))
+            >>> camera.in_image(torch.tensor([[0.0, 0.0], [639.4, 479.4], [639.6, 0.0]])).tolist()
+            [True, True, False]
+        """
+        if self.size is None:
+            raise ValueError("in_image: want a camera with a size, got None; give Camera(..., size=(width, height))")
+        return inside(check_tensor("pixels", pixels, 2), self.size)
 
     def project(
         self, points: Float[Tensor, "*#batch n 3"]
@@ -356,76 +335,6 @@ class Camera:
         lens = [leaf for leaf in tree_leaves(self.distortion) if isinstance(leaf, Tensor)]
         return [self.K, self.R, self.t, *lens]
 
-    # ----------------------------------------------------------------------------------------------- other libraries
-
-    @classmethod
-    def from_opencv(
-        cls,
-        K: ArrayLike,
-        dist: ArrayLike | None = None,
-        rvec: ArrayLike | None = None,
-        tvec: ArrayLike | None = None,
-        size: tuple[int, int] | None = None,
-        fisheye: bool = False,
-    ) -> "Camera":
-        """A camera from what OpenCV's calibration returns.
-
-        Args:
-            K: camera matrix `(*B, 3, 3)`. Arrays become float64 tensors; a tensor keeps its dtype, device and graph.
-            dist: 4, 5, 8, 12 or 14 coefficients in OpenCV's order (fisheye: 4), as `(*B, k)` or as OpenCV's row or
-                column; `None` or an empty array for a pinhole.
-            rvec: rotation vector world to camera `(*B, 3)` in radians, or OpenCV's `(3, 1)` column.
-            tvec: translation world to camera `(*B, 3)` in world units, or OpenCV's `(3, 1)` column.
-            size: image size `(width, height)` in pixels.
-            fisheye: whether `dist` belongs to OpenCV's fisheye model.
-
-        Raises:
-            ValueError: wrong shapes or values, as the constructor says.
-
-        Example:
-            >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
-            >>> Camera.from_opencv(K, [-0.2, 0.1, 0, 0, 0], np.zeros(3), [0, 0, 800], size=(640, 480))
-            Camera(batch_shape=(), BrownConrady, size=(640, 480), torch.float64, cpu)
-        """
-        K, coefficients, R, t = interop.tensors_from_opencv(K, dist, rvec, tvec)
-        lens = KannalaBrandt if fisheye else BrownConrady
-        return cls(K, R, t, None if coefficients is None else lens(coefficients), size)
-
-    def to_opencv(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """`(K, dist, rvec, tvec)` as float64 arrays for OpenCV's functions, batch axes in front.
-
-        `dist` is empty for a pinhole. Whether the coefficients are the fisheye model's is for the caller to remember.
-
-        Raises:
-            ValueError: the camera has skew or a turned image, which OpenCV would ignore, or another library's lens.
-        """
-        if self.distortion is not None and not isinstance(self.distortion, BrownConrady | KannalaBrandt):
-            raise ValueError(f"distortion: want a lens that OpenCV has, got {type(self.distortion).__name__}")
-        coefficients = None if self.distortion is None else self.distortion.coefficients
-        return interop.arrays_for_opencv(self.K, coefficients, self.R, self.t)
-
-    @classmethod
-    def from_kornia(cls, pinhole: PinholeCamera) -> "Camera":
-        """A camera of batch shape `(B,)` from Kornia's `PinholeCamera`, whose conventions are the same.
-
-        Raises:
-            ValueError: the cameras of the batch have images of different sizes, or values are not a camera's.
-        """
-        K, R, t, size = interop.tensors_from_kornia(pinhole)
-        return cls(K, R, t, size=size)
-
-    def to_kornia(self) -> PinholeCamera:
-        """Kornia's `PinholeCamera` of batch size `B`; a single camera becomes a batch of one.
-
-        Raises:
-            ValueError: what `PinholeCamera` cannot hold: a lens, no size, or more than one batch axis.
-        """
-        if self.distortion is not None:
-            raise ValueError("distortion: want None, for PinholeCamera holds no lens; undistort first")
-        if self.size is None:
-            raise ValueError("size: want (width, height), got None, and PinholeCamera needs it")
-        return interop.pinhole_from_tensors(self.K, self.R, self.t, self.size)
-
 
 def as_camera(camera: Camera | PinholeCamera) -> Camera:
     """A `Camera` as it is, Kornia's `PinholeCamera` converted.
@@ -449,14 +358,6 @@ def _pinhole(direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
     return [torch.where(valid, component, 0.0) * inverse_depth for component in (x, y)], valid
 
 
-def _checked_size(size: Any) -> tuple[int, int] | None:
-    if size is None:
-        return None
-    if len(size) != 2 or any(int(side) != side or side < 1 for side in size):
-        raise ValueError(f"size: want (width, height) in whole pixels, got {size}")
-    return int(size[0]), int(size[1])
-
-
 def _check_pose(R: Tensor, t: Tensor) -> None:
     if not bool(t.isfinite().all()):
         raise ValueError("t: want finite values, got NaN or infinity")
@@ -466,6 +367,3 @@ def _check_pose(R: Tensor, t: Tensor) -> None:
             "R: want rotation matrices (orthonormal to 1e-5, determinant +1), got others; "
             "kornia's axis_angle_to_rotation_matrix makes them from rotation vectors"
         )
-
-
-pytree.register(Camera, children=("K", "R", "t", "distortion"), static=("size",))

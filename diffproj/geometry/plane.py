@@ -14,21 +14,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core import pytree
+from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
     broadcast_batches,
     check_same_kind,
     check_tensor,
-    converted,
     dot,
-    index_batch,
     readable,
 )
 
 Numbers = Sequence[float] | float
 
 
-class Plane:
+class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_point", "adopts")):
     """A plane `n . X = d`, or a batch of planes with batch shape `*B`.
 
     The plane is immutable in spirit and a PyTree, as `Camera` is.
@@ -80,7 +78,8 @@ class Plane:
         self.is_per_point, self.adopts = False, adopts
 
     @classmethod
-    def _unchecked(cls, normal: Any, offset: Any, is_per_point: bool = False, adopts: bool = False) -> "Plane":
+    def unchecked(cls, normal: Any, offset: Any, is_per_point: bool = False, adopts: bool = False) -> "Plane":
+        """A plane of these parts, without a look at them."""
         plane = cls.__new__(cls)
         plane.normal, plane.offset, plane.is_per_point, plane.adopts = normal, offset, is_per_point, adopts
         return plane
@@ -155,33 +154,14 @@ class Plane:
         normal = _smallest_eigenvector(scatter)
         sign = normal.detach().gather(-1, normal.detach().abs().argmax(dim=-1, keepdim=True)).sign()
         normal = normal * sign
-        return cls._unchecked(normal, dot(normal, centroid))
+        return cls.unchecked(normal, dot(normal, centroid))
 
     # ------------------------------------------------------------------------------------------------- as a tensor
 
-    @property
-    def batch_shape(self) -> torch.Size:
-        """The batch shape `*B`; `(*B, N)` for planes per point."""
-        return self.offset.shape
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """The floating-point type."""
-        return self.normal.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """The device."""
-        return self.normal.device
-
     def to(self, *args: Any, **kwargs: Any) -> "Plane":
-        """The plane in another dtype or on another device; takes what `torch.Tensor.to` takes."""
-        normal, offset = (converted(part, *args, **kwargs) for part in (self.normal, self.offset))
-        return self._unchecked(normal, offset, self.is_per_point)
-
-    def detach(self) -> "Plane":
-        """The same plane cut off from the graph."""
-        return self._unchecked(self.normal.detach(), self.offset.detach(), self.is_per_point, self.adopts)
+        """The plane in another dtype or on another device, which it then has for itself; see `Batched.to`."""
+        plane = super().to(*args, **kwargs)
+        return self.unchecked(plane.normal, plane.offset, self.is_per_point)
 
     def like(self, tensor: Tensor) -> "Plane":
         """The plane ready to meet `tensor`: one made of Python numbers takes on its dtype and device."""
@@ -195,9 +175,7 @@ class Plane:
         """
         if self.is_per_point:
             raise IndexError("plane: want a batch of planes to index, got planes per point; index normal and offset")
-        return self._unchecked(
-            index_batch(self.normal, index, 1), index_batch(self.offset, index, 0), False, self.adopts
-        )
+        return super().__getitem__(index)
 
     def __repr__(self) -> str:
         if self.batch_shape or not readable(self.normal):
@@ -211,6 +189,21 @@ class Plane:
         """The normal scaled to length 1."""
         return self.normal / self.normal.norm(dim=-1, keepdim=True)
 
+    def tangents(self) -> Float[Tensor, "*batch 3 2"]:
+        """Two unit vectors of the plane at right angles to each other and to the normal, as columns `(*B, 3, 2)`.
+
+        The first is at right angles to the axis of the world that the normal is furthest from. It jumps where two axes
+        are equally far: for directions that everybody shares, see `plane_axes`.
+
+        Example:
+            >>> Plane.z(0.0).tangents().T.tolist()
+            [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
+        """
+        furthest = torch.nn.functional.one_hot(self.normal.abs().argmin(dim=-1), 3).to(self.normal)
+        first = torch.nn.functional.normalize(torch.linalg.cross(self.normal, furthest), dim=-1)
+        second = torch.nn.functional.normalize(torch.linalg.cross(self.normal, first), dim=-1)
+        return torch.stack([first, second], dim=-1)
+
     def parallel(self, distance: Float[Tensor, "*#batch"] | float) -> "Plane":
         """The parallel plane at a signed distance along the normal, in world units.
 
@@ -220,7 +213,7 @@ class Plane:
         """
         offset = self.offset + distance * self.normal.norm(dim=-1)
         normal = self.normal.expand(*offset.shape, 3)
-        return self._unchecked(normal, offset, self.is_per_point, self.adopts and not isinstance(distance, Tensor))
+        return self.unchecked(normal, offset, self.is_per_point, self.adopts and not isinstance(distance, Tensor))
 
     def distance(self, points: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*#batch n"]:
         """Signed orthogonal distances of points `(*B, N, 3)`, positive on the normal's side, in world units."""
@@ -276,6 +269,3 @@ def _smallest_eigenvector(scatter: Tensor) -> Tensor:
         step = torch.linalg.solve(torch.cat([top, bottom], dim=-2), residual)
         normal, value = normal - step[..., :3], value - step[..., 3]
     return normal / normal.norm(dim=-1, keepdim=True)
-
-
-pytree.register(Plane, children=("normal", "offset"), static=("is_per_point", "adopts"))

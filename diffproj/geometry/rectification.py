@@ -21,6 +21,7 @@ from torch.nn.functional import grid_sample
 from diffproj._core.numerics import check_tensor
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.grid import inside, pixel_grid
 from diffproj.geometry.plane import Plane
 
 LookUp = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -97,7 +98,7 @@ def rectify(
     low = camera.K.new_tensor([extent[0], extent[1]])
 
     def look_up(offset: Tensor) -> tuple[Tensor, Tensor]:
-        s, t = ((_grid(rows, columns, camera.K) + offset) * resolution + low).reshape(-1, 2).unbind(-1)
+        s, t = ((pixel_grid(rows, columns, camera.K) + offset) * resolution + low).reshape(-1, 2).unbind(-1)
         points = (
             origin.unsqueeze(-2) + s.unsqueeze(-1) * along_s.unsqueeze(-2) + t.unsqueeze(-1) * along_t.unsqueeze(-2)
         )
@@ -152,7 +153,7 @@ def render(
     unit = camera.K.new_tensor([(extent[2] - extent[0]) / columns, (extent[3] - extent[1]) / rows])
 
     def look_up(offset: Tensor) -> tuple[Tensor, Tensor]:
-        pixels = (_grid(height, width, camera.K) + offset - 0.5).reshape(-1, 2)
+        pixels = (pixel_grid(height, width, camera.K) + offset - 0.5).reshape(-1, 2)
         points, valid = back_project(pixels, camera, plane)
         off = points - origin.unsqueeze(-2)
         st = torch.stack([(off * along_s.unsqueeze(-2)).sum(-1), (off * along_t.unsqueeze(-2)).sum(-1)], dim=-1)
@@ -181,13 +182,13 @@ def _samples(look_up: LookUp, shape: tuple[int, int], size: tuple[int, int], lik
     """How many pixels of the source nine tenths of the target's pixels are wide at most."""
     with torch.no_grad():
         places, valid = look_up(like.new_tensor([0.5, 0.5]))
-        inside = (valid & _inside(places, size)).unflatten(-1, shape)
+        shown = (valid & inside(places, size)).unflatten(-1, shape)
         places = places.unflatten(-2, shape)
         widest = 1.0
         for axis in (-1, -2):
             step = places.diff(dim=axis - 1).norm(dim=-1)
-            count = inside.shape[axis] - 1
-            step = step[inside.narrow(axis, 0, count) & inside.narrow(axis, 1, count)]
+            count = shown.shape[axis] - 1
+            step = step[shown.narrow(axis, 0, count) & shown.narrow(axis, 1, count)]
             if len(step):
                 widest = max(widest, float(step[:: 1 + len(step) // 100_000].quantile(0.9)))
     return min(MOST_SAMPLES, math.ceil(widest - 0.25))
@@ -197,7 +198,7 @@ def _sampled(
     source: Tensor, places: Tensor, valid: Tensor, shape: tuple[int, int], size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
     """Bilinear samples `(*B, C, rows, columns)` of a source of that size, and where there are any."""
-    seen = valid & _inside(places, size)
+    seen = valid & inside(places, size)
     last = places.new_tensor([max(size[0] - 1, 1), max(size[1] - 1, 1)])
     grid = torch.where(seen.unsqueeze(-1), places, 0.0) * 2 / last - 1
     batch = torch.broadcast_shapes(source.shape[:-3], grid.shape[:-2])
@@ -207,21 +208,6 @@ def _sampled(
     sampled = sampled.reshape(*batch, *sampled.shape[1:])
     seen = seen.expand(*batch, seen.shape[-1]).unflatten(-1, shape)
     return torch.where(seen.unsqueeze(-3), sampled, 0.0), seen
-
-
-def _inside(places: Tensor, size: tuple[int, int]) -> Tensor:
-    last = places.new_tensor(size) - 0.5
-    return ((places >= -0.5) & (places <= last)).all(-1)
-
-
-def _grid(rows: int, columns: int, like: Tensor) -> Tensor:
-    """`(column, row)` of every pixel, `(rows, columns, 2)`."""
-    row, column = torch.meshgrid(
-        torch.arange(rows, dtype=like.dtype, device=like.device),
-        torch.arange(columns, dtype=like.dtype, device=like.device),
-        indexing="ij",
-    )
-    return torch.stack([column, row], dim=-1)
 
 
 def _shape(extent: Sequence[float], resolution: float) -> tuple[int, int]:

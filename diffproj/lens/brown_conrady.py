@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj._core import pytree
 from diffproj._core.numerics import in_blocks
 from diffproj.lens import brown_domain
 from diffproj.lens.brown_equations import COUNTS, Terms, bend, radial
@@ -23,7 +22,7 @@ from diffproj.lens.compiling import derivative_wanted
 from diffproj.lens.table import inverse_table
 
 
-class BrownConrady(CoefficientLens):
+class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
     """Radial, tangential, rational, thin-prism and tilt distortion, in OpenCV's order of coefficients.
 
     `k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]`, without unit but for the tilt angles, which are in
@@ -151,6 +150,3 @@ class BrownConrady(CoefficientLens):
         table = inverse_table(lambda r: r * radial(terms, r * r), end, brown_domain.sway(terms, end))
         reach, noise = brown_domain.reach(terms, domain), brown_domain.cancellation(terms, end)
         return reach, noise, table.rho_max, table.ratio
-
-
-pytree.register(BrownConrady, children=("coefficients",))

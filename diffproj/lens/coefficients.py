@@ -8,13 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, converted, index_batch, readable
-from diffproj.lens.plan import AXES, Model, Plan, domain_of, plan_of, register_model
+from diffproj._core.batched import Batched, Rearrange
+from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, readable
+from diffproj.lens.plan import AXES, Plan, Recipe, domain_of, plan_of, register_recipe
 
 L = TypeVar("L", bound="CoefficientLens")
 
 
-class CoefficientLens(ABC):
+class CoefficientLens(Batched, ABC):
     """A lens that its coefficients `(*B, k)` describe; see `diffproj.lens.Lens` for what a lens is.
 
     A subclass says which counts of coefficients it knows (`counts`), and works out its plan.
@@ -22,7 +23,7 @@ class CoefficientLens(ABC):
 
     counts: tuple[int, ...]
     coefficients: Tensor
-    _model: str  # the key of the class among the models of `plan`
+    _key: str  # of the class, among the recipes of `plan`
 
     def __init__(self, coefficients: Float[Tensor, "*lens k"]):
         coefficients = check_tensor("coefficients", coefficients, "k")
@@ -40,66 +41,33 @@ class CoefficientLens(ABC):
         self._origin: tuple[CoefficientLens, Callable[[Tensor, int], Tensor]] | None = None
 
     @classmethod
-    def _unchecked(cls: type[L], coefficients: Any) -> L:
+    def unchecked(cls: type[L], coefficients: Any) -> L:
+        """A lens of these coefficients, without a look at them."""
         lens = cls.__new__(cls)
         lens._assign(coefficients)
         return lens
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self)._unchecked, (self.coefficients,)
+        return type(self).unchecked, (self.coefficients,)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(coefficients {tuple(self.coefficients.shape)}, {self.dtype}, {self.device})"
 
-    @property
-    def batch_shape(self) -> torch.Size:
-        """The batch axes `*B`."""
-        return self.coefficients.shape[:-1]
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """The type of the coefficients."""
-        return self.coefficients.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Where the coefficients are."""
-        return self.coefficients.device
-
     def to(self: L, *args: Any, **kwargs: Any) -> L:
-        """The lens in another dtype or on another device: arguments as `torch.Tensor.to`."""
-        return type(self)(converted(self.coefficients, *args, **kwargs))
+        """The lens in another dtype or on another device; see `Batched.to`. It works its plan out anew."""
+        return type(self)(super().to(*args, **kwargs).coefficients)
 
-    def detach(self: L) -> L:
-        """The lens cut from the graph of its coefficients."""
-        return self._rearranged(self.coefficients.detach(), lambda part, _: part)
-
-    def expand(self: L, *batch_shape: int) -> L:
-        """The lens with its batch axes broadcast to `batch_shape`, without copying."""
-
-        def stretch(part: Tensor, axes: int) -> Tensor:
-            return part.expand((*batch_shape, *part.shape[part.ndim - axes :]))
-
-        return self._rearranged(stretch(self.coefficients, 1), stretch)
-
-    def __getitem__(self: L, index: Any) -> L:
-        """Lenses of the batch, chosen by indexing its batch axes."""
-
-        def choose(part: Tensor, axes: int) -> Tensor:
-            return index_batch(part, index, axes)
-
-        return self._rearranged(choose(self.coefficients, 1), choose)
-
-    def _rearranged(self: L, coefficients: Tensor, rearrange: Callable[[Tensor, int], Tensor]) -> L:
+    def _rearranged(self: L, rearrange: Rearrange, part: Callable[[Any], Any]) -> L:  # noqa: ARG002
         """The same coefficients in another arrangement: the plan is this lens's, rearranged the same way."""
-        lens = self._unchecked(coefficients)
+        lens = self.unchecked(rearrange(self.coefficients, 1))
         lens._origin = self, rearrange
         return lens
 
     # ----------------------------------------------------------------------------------------------------- the plan
 
-    def __init_subclass__(cls) -> None:
-        cls._model = register_model(cls, Model(cls._find_domain, cls._tabulate))
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls._key = register_recipe(cls, Recipe(cls._find_domain, cls._tabulate))
 
     @staticmethod
     @abstractmethod
@@ -114,7 +82,7 @@ class CoefficientLens(ABC):
     def _domain(self) -> Tensor:
         """The domain, all that the way forward needs; remembered for as long as nobody writes to the coefficients."""
         if not readable(self.coefficients):
-            return domain_of(self._model, self.coefficients)
+            return domain_of(self._key, self.coefficients)
         if self._origin is not None:
             origin, rearrange = self._origin
             return rearrange(origin._domain(), 0)
@@ -123,14 +91,14 @@ class CoefficientLens(ABC):
     def _plan(self) -> Plan:
         """The whole plan, which the way back needs, remembered likewise."""
         if not readable(self.coefficients):
-            return plan_of(self._model, self.coefficients, self._domain())
+            return plan_of(self._key, self.coefficients, self._domain())
         if self._origin is not None:
             origin, rearrange = self._origin
             return Plan(*(rearrange(part, axes) for part, axes in zip(origin._plan(), AXES, strict=True)))
         version, domain, plan = self._remembered()
         if plan is None:
             with torch.inference_mode(False), torch.no_grad():
-                plan = plan_of(self._model, self.coefficients, domain)
+                plan = plan_of(self._key, self.coefficients, domain)
             self._known = version, domain, plan
         return plan
 
@@ -139,7 +107,7 @@ class CoefficientLens(ABC):
         known = self._known
         if known is None or known[0] != version:
             with torch.inference_mode(False), torch.no_grad():
-                known = self._known = version, domain_of(self._model, self.coefficients), None
+                known = self._known = version, domain_of(self._key, self.coefficients), None
         return known
 
     def _usable(self, domain: Tensor) -> Tensor:

@@ -21,7 +21,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj._core import pytree
 from diffproj._core.numerics import in_blocks, precise, readable
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.compiling import coordinates, derivative_wanted, with_batch_in_front
@@ -41,7 +40,7 @@ TOLERANCE = 16
 """How many roundings of the equation a solution may be off by."""
 
 
-class KannalaBrandt(CoefficientLens):
+class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
     """The equidistant fisheye with four coefficients, in the order of OpenCV's fisheye module.
 
     Directions are in the camera frame (x right, y down, z forward), distorted points on the normalised plane. The lens
@@ -152,9 +151,6 @@ class KannalaBrandt(CoefficientLens):
         growth = _profile([column.abs() for column in columns], squares) / _profile(columns, squares)
         noise = growth.amax(-1).clamp(1, 64)
         return rise(end.unsqueeze(-1)).squeeze(-1), noise, table.rho_max, table.ratio
-
-
-pytree.register(KannalaBrandt, children=("coefficients",))
 
 
 def _angles(like: Tensor) -> Tensor:

@@ -38,7 +38,7 @@ AXES = (0, 0, 0, 1, 1)
 """How many axes each part has behind those of the batch."""
 
 
-class Model(NamedTuple):
+class Recipe(NamedTuple):
     """How a kind of lens works out its plan, from coefficients in float64.
 
     Attributes:
@@ -53,13 +53,13 @@ class Model(NamedTuple):
 RECENT = 16
 """Results that are remembered."""
 
-_models: dict[str, Model] = {}
+_recipes: dict[str, Recipe] = {}
 _recent: list[tuple[str, tuple[Tensor, ...], tuple[Tensor, ...]]] = []
 _lock = threading.Lock()
-"""Held while entries are added to `_models` or `_recent`, and never while a plan is worked out."""
+"""Held while entries are added to `_recipes` or `_recent`, and never while a plan is worked out."""
 
 
-def register_model(kind: type, model: Model) -> str:
+def register_recipe(kind: type, recipe: Recipe) -> str:
     """Say how the plans of a class of lenses are worked out.
 
     Returns:
@@ -69,10 +69,10 @@ def register_model(kind: type, model: Model) -> str:
     full = key = f"{kind.__module__}.{kind.__qualname__}"
     with _lock:
         number = 1
-        while key in _models:
+        while key in _recipes:
             number += 1
             key = f"{full} {number}"
-        _models[key] = model
+        _recipes[key] = recipe
     return key
 
 
@@ -90,7 +90,7 @@ def plan_of(key: str, coefficients: Tensor, domain: Tensor) -> Plan:
 
 
 def _rounded(key: str, coefficients: Tensor) -> Tensor:
-    exact = _models[key].domain(precise(coefficients))
+    exact = _recipes[key].domain(precise(coefficients))
     domain = exact.to(coefficients.dtype)
     domain = torch.where(domain.to(exact.dtype) > exact, torch.nextafter(domain, torch.zeros_like(domain)), domain)
     limits = torch.finfo(coefficients.dtype)
@@ -100,7 +100,7 @@ def _rounded(key: str, coefficients: Tensor) -> Tensor:
 
 
 def _worked_out(coefficients: Tensor, domain: Tensor, key: str) -> tuple[Tensor, ...]:
-    parts = _models[key].rest(precise(coefficients), precise(domain))
+    parts = _recipes[key].rest(precise(coefficients), precise(domain))
     return tuple(part.to(coefficients.dtype) for part in parts)
 
 

@@ -18,8 +18,8 @@ class Lens(Protocol):
 
     **A lens of your own** needs no base class. Give it these attributes and methods and a camera accepts it. Tensors
     of the lens carry its batch axes in front (`coefficients (*B, k)`), which broadcast against those of the points. To
-    be carried by `vmap`, `torch.func` and `torch.compile` it must be known to `torch.utils._pytree` as well;
-    `diffproj._core.pytree.register` is how the lenses of this package do it.
+    be carried by `vmap`, `torch.func` and `torch.compile` along with its camera, the class must be registered with
+    `dp.register_lens`.
 
     Example:
         >>> import diffproj as dp

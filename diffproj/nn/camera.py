@@ -119,7 +119,7 @@ class LearnableCamera(GeometryModule):
         lens = None
         if self._lens is not None:
             lens = self._lens(self.coefficients_0 + learned(self, "distortion")).expand(*self.batch_shape)
-        return Camera._unchecked(K, R, t, lens, self.size)
+        return Camera.unchecked(K, R, t, lens, self.size)
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""

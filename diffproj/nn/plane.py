@@ -60,4 +60,4 @@ class LearnablePlane(GeometryModule):
         turned = self.unit_0 + (self.tangents * learned(self, "tilt").unsqueeze(-2)).sum(-1)
         normal = turned * (self.length_0 / torch.linalg.vector_norm(turned, dim=-1)).unsqueeze(-1)
         distance = self.distance_0 + self.scale * learned(self, "shift").squeeze(-1)
-        return Plane._unchecked(normal, self.length_0 * distance)
+        return Plane.unchecked(normal, self.length_0 * distance)

@@ -82,11 +82,11 @@ class PlaneProjector(GeometryModule):
             return PlaneMap(self._camera(), self._plane())
         lens = self._lens
         if lens is not None and (torch.compiler.is_compiling() or lens.coefficients is not self._frozen_coefficients):
-            lens = type(lens)._unchecked(self._frozen_coefficients)
+            lens = type(lens).unchecked(self._frozen_coefficients)
             if readable(self._frozen_coefficients):  # kept, for it remembers what it works out about itself
                 self._lens = lens
-        camera = Camera._unchecked(self._frozen_K, self._frozen_R, self._frozen_t, lens, self._camera.size)
-        return PlaneMap._unchecked(self._matrix, camera, False)
+        camera = Camera.unchecked(self._frozen_K, self._frozen_R, self._frozen_t, lens, self._camera.size)
+        return PlaneMap.unchecked(self._matrix, camera, False)
 
     def forward(
         self,
@@ -129,7 +129,7 @@ class PlaneProjector(GeometryModule):
             self._frozen_K, self._frozen_R, self._frozen_t = camera.K.clone(), camera.R.clone(), camera.t.clone()
             if isinstance(camera.distortion, CoefficientLens):
                 self._frozen_coefficients = camera.distortion.coefficients.clone()
-                self._lens = type(camera.distortion)._unchecked(self._frozen_coefficients)
+                self._lens = type(camera.distortion).unchecked(self._frozen_coefficients)
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""

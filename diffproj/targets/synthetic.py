@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Float, UInt8
 from kornia.filters import gaussian_blur2d
 from kornia.geometry.camera import PinholeCamera
-from kornia.geometry.grid import create_meshgrid
 from torch import Tensor
 
 from diffproj._core.numerics import transform
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.euler import rotation_from_euler
+from diffproj.geometry.grid import pixel_grid
 from diffproj.geometry.intrinsics import pixel_to_normalized
 from diffproj.geometry.plane import Plane
 from diffproj.geometry.rectification import render
@@ -154,8 +154,7 @@ def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px:
     generator = torch.Generator().manual_seed(seed)
     pixels = pixels + noise_px * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
     if camera.size is not None:
-        last = torch.tensor(camera.size, dtype=pixels.dtype) - 0.5
-        visible = visible & ((pixels >= -0.5) & (pixels <= last)).all(dim=-1)
+        visible = visible & camera.in_image(pixels)
     return Views(pixels, visible, size=camera.size)
 
 
@@ -238,7 +237,7 @@ def _texels(camera: Camera, board: Chessboard) -> int:
 def _falloff(camera: Camera) -> Float[Tensor, "h w"]:
     """The fourth power of the cosine of the angle under which light meets the sensor, `1 / (1 + r^2)^2`."""
     width, height = camera.size or (0, 0)
-    pixels = create_meshgrid(height, width, normalized_coordinates=False, dtype=camera.dtype).reshape(-1, 2)
+    pixels = pixel_grid(height, width, camera.K).reshape(-1, 2)
     xy = transform(pixel_to_normalized(camera.K), pixels - camera.K[:2, 2])
     return (1 + xy.square().sum(-1)).reshape(height, width) ** -2
 

@@ -8,14 +8,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj._core import pytree
-from diffproj._core.numerics import broadcast_batches, check_tensor, converted, lifted, readable
+from diffproj._core.batched import Batched
+from diffproj._core.numerics import broadcast_batches, check_tensor, readable
+from diffproj.geometry.grid import checked_size
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 """What tensors are made of here; nested lists become float64."""
 
 
-class Views:
+class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "size")):
     """The pixels of a board's corners in V photographs, with a mask that says which corners were seen.
 
     Immutable in spirit: every method returns new views, and the caller's tensors are never written. Gradients flow
@@ -70,14 +71,14 @@ class Views:
         points = check_tensor("pixels", _as_tensor("pixels", pixels), "V", "N", 2)
         mask = _check_visible(visible, points)
         self.names = _check_names(names, points.shape[-3])
-        self.size = _check_size(size)
+        self.size = checked_size(size)
         batch = broadcast_batches(pixels=points.shape[:-3], visible=mask.shape[:-2])
         points, mask = points.expand(*batch, *points.shape[-3:]), mask.expand(*batch, *mask.shape[-2:])
         _check_finite(points, mask, self.names)
         self.pixels, self.visible = _masked(points, mask), mask.clone()
 
     @classmethod
-    def _unchecked(
+    def unchecked(
         cls, pixels: Any, visible: Any, names: tuple[str, ...] = (), size: tuple[int, int] | None = None
     ) -> "Views":
         """Build without looking at anything: for parts that come from views, or from inside a transformation."""
@@ -99,21 +100,6 @@ class Views:
     def __len__(self) -> int:
         """The number of views, V."""
         return self.pixels.shape[-3]
-
-    @property
-    def batch_shape(self) -> torch.Size:
-        """`*B`: the cameras side by side; empty for one camera."""
-        return self.pixels.shape[:-3]
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """The type of the pixels."""
-        return self.pixels.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Where the pixels lie."""
-        return self.pixels.device
 
     # ------------------------------------------------------------------------------------------------ what it gives
 
@@ -137,7 +123,7 @@ class Views:
         chosen = _positions(index, len(self))
         where = torch.tensor(chosen, dtype=torch.long, device=self.device)
         pixels, visible = self.pixels.index_select(-3, where), self.visible.index_select(-2, where)
-        return self._unchecked(pixels, visible, tuple(self.names[i] for i in chosen), self.size)
+        return self.unchecked(pixels, visible, tuple(self.names[i] for i in chosen), self.size)
 
     def hiding(self, mask: ArrayLike) -> "Views":
         """Hide corners as if they had not been seen; their pixels become 0.
@@ -167,25 +153,7 @@ class Views:
         except RuntimeError:
             want = tuple(self.visible.shape)
             raise ValueError(f"mask: want shape ({want[-1]},) or {want}, got {tuple(hidden.shape)}") from None
-        return self._unchecked(_masked(self.pixels, visible), visible, self.names, self.size)
-
-    def to(self, *args: Any, **kwargs: Any) -> "Views":
-        """Move to a dtype or a device, with the arguments of `torch.Tensor.to`; half precision becomes float32.
-
-        Raises:
-            TypeError: the dtype is not of floating-point type.
-
-        Example:
-            >>> Views(torch.rand(5, 54, 2)).to(torch.float64).dtype
-            torch.float64
-        """
-        pixels = converted(self.pixels, *args, **kwargs)
-        if not pixels.is_floating_point():
-            raise TypeError(f"dtype: want a floating-point one, got {pixels.dtype}")
-        return self._unchecked(lifted(pixels), converted(self.visible, pixels.device), self.names, self.size)
-
-
-pytree.register(Views, children=("pixels", "visible"), static=("names", "size"))
+        return self.unchecked(_masked(self.pixels, visible), visible, self.names, self.size)
 
 
 # ------------------------------------------------------------------------------------------------------ the checks
@@ -231,21 +199,6 @@ def _check_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:
     if len(names) != count:
         raise ValueError(f"names: want {count}, one for each view, got {len(names)}")
     return tuple(names)
-
-
-def _check_size(size: Any) -> tuple[int, int] | None:
-    if size is None:
-        return None
-    try:
-        width, height = (int(extent) for extent in size)
-        whole = (width, height) == tuple(size)
-    except (TypeError, ValueError):
-        whole, width, height = False, 0, 0
-    if not whole:
-        raise TypeError(f"size: want (width, height) in whole px, got {size!r}")
-    if width < 1 or height < 1:
-        raise ValueError(f"size: want a positive width and height, got {size!r}")
-    return width, height
 
 
 def _check_finite(pixels: Tensor, visible: Tensor, names: tuple[str, ...]) -> None:

@@ -254,7 +254,7 @@ def test_a_hopeless_camera_disturbs_no_neighbour(hopeless: str) -> None:
         shifts = 20 * torch.randn(8, 3, dtype=D)
         pixels[1] = level.at(level.R.expand(8, 3, 3), level.t + shifts).project(BOARD.points)[0]
         pixels[1] += 0.2 * torch.randn_like(pixels[1])
-    broken = dp.Views._unchecked(pixels, visible, views.names, views.size)
+    broken = dp.Views.unchecked(pixels, visible, views.names, views.size)
     mixed = dp.calibrate(broken, BOARD, throw=False)
     want = {"nan": dp.Status.DIVERGED, "empty": dp.Status.DEGENERATE, "parallel": dp.Status.DEGENERATE}[hopeless]
     assert mixed.status.tolist() == [0, want, 0, 0]

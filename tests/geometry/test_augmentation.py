@@ -130,7 +130,7 @@ def test_gradients_are_finite_differences(camera: dp.Camera, pixels: torch.Tenso
     H = torch.eye(3, dtype=D) + 1e-4 * torch.rand(2, 3, 3, dtype=D)
 
     def points(H: torch.Tensor, K: torch.Tensor, R: torch.Tensor) -> torch.Tensor:
-        warped = dp.Camera._unchecked(K, R, camera.t, None, None).warped(H)
+        warped = dp.Camera.unchecked(K, R, camera.t, None, None).warped(H)
         return dp.back_project(pixels[:5], warped, dp.Plane.z(0.0))[0]
 
     inputs = [part.clone().requires_grad_() for part in (H, camera.K, camera.R)]

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffproj._core import pytree
+import diffproj as dp
 from diffproj.lens.brown_conrady import BrownConrady
 from diffproj.lens.kannala_brandt import KannalaBrandt
 from diffproj.lens.protocol import Lens
@@ -519,10 +519,6 @@ def test_lens_from_outside() -> None:
         def __init__(self, scale: Tensor):
             self.scale = scale
 
-        @classmethod
-        def _unchecked(cls, scale: Any) -> "Stereographic":
-            return cls(scale)
-
         batch_shape = property(lambda self: self.scale.shape)
         dtype = property(lambda self: self.scale.dtype)
         device = property(lambda self: self.scale.device)
@@ -553,7 +549,7 @@ def test_lens_from_outside() -> None:
         def __getitem__(self, index: Any) -> "Stereographic":
             return Stereographic(self.scale[index])
 
-    pytree.register(Stereographic, children=("scale",))
+    dp.register_lens(Stereographic, tensors=("scale",))
     lens = Stereographic(tensor([1.0, 0.7]))
     assert isinstance(lens, Lens)
     direction = cone(2.5, 50)

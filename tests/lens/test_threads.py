@@ -28,7 +28,7 @@ def lenses(count: int) -> list[torch.Tensor]:
 
 def test_the_memory_of_compiled_lenses() -> None:
     coefficients = lenses(RECENT + 8)  # more than are remembered, so that entries come and go
-    key = BrownConrady._model
+    key = BrownConrady._key
     domains = [_domain(c, key) for c in coefficients]
     want = [_rest(c, d, key) for c, d in zip(coefficients, domains, strict=True)]
 
@@ -73,4 +73,4 @@ def test_lenses_of_one_name_keep_apart() -> None:
     narrow, wide = make(0.25), make(0.5)
     coefficients = torch.zeros(4, dtype=torch.float64)
     assert [float(kind(coefficients).domain) for kind in (narrow, wide, narrow)] == [0.25, 0.5, 0.25]
-    assert [float(_domain(coefficients, kind._model)) for kind in (narrow, wide, narrow)] == [0.25, 0.5, 0.25]
+    assert [float(_domain(coefficients, kind._key)) for kind in (narrow, wide, narrow)] == [0.25, 0.5, 0.25]

@@ -51,7 +51,7 @@ def redone(
     if lens is not None:
         lens = type(lens)(lens.coefficients + step[4:s])  # type: ignore[attr-defined, call-arg]
     R = axis_angle_to_rotation_matrix(step[None, s : s + 3])[0] @ camera.R
-    points, valid = dp.back_project(pixels, dp.Camera._unchecked(K, R, camera.t + step[s + 3 :], lens, None), plane)
+    points, valid = dp.back_project(pixels, dp.Camera.unchecked(K, R, camera.t + step[s + 3 :], lens, None), plane)
     assert valid.all()
     return points
 

@@ -1,0 +1,268 @@
+"""`Batched`: the base of everything that is made of tensors with batch axes in front, such as cameras and planes.
+
+A subclass names its tensors, with how many axes each has behind those of the batch, the parts that are batched
+themselves, and its constants; it says how to build one without checks (`unchecked`). In return it can be converted,
+moved, detached, indexed, expanded and stacked, all in one way, and is a PyTree: `vmap`, `torch.func`, `torch.compile`
+and `torch.export` carry it. Inside such a transformation the tensors are tracers, placeholders or plain `object()`s,
+whose values nobody can read: this is why a PyTree is rebuilt by `unchecked`.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch
+import torch.utils._pytree as torch_pytree
+from torch import Tensor
+
+from diffproj._core.numerics import converted, lifted
+
+T = TypeVar("T")
+B = TypeVar("B", bound="Batched")
+Rearrange = Callable[[Tensor, int], Tensor]
+"""Takes a tensor and how many axes it has behind those of the batch to the same in another arrangement."""
+
+
+class Batched:
+    """Tensors that share batch axes `*B`, parts with the same batch axes, and constants."""
+
+    __slots__ = ()
+
+    _tensors: ClassVar[dict[str, int]]
+    """The tensors, the leading one first, and how many axes each has behind those of the batch."""
+    _parts: ClassVar[tuple[str, ...]]
+    """What has batch axes of its own, or is `None`."""
+    _constants: ClassVar[tuple[str, ...]]
+
+    def __init_subclass__(
+        cls,
+        tensors: dict[str, int] | None = None,
+        parts: Sequence[str] = (),
+        constants: Sequence[str] = (),
+        **options: Any,
+    ) -> None:
+        super().__init_subclass__(**options)
+        if tensors is None:  # a base of others
+            return
+        cls._tensors, cls._parts, cls._constants = tensors, tuple(parts), tuple(constants)
+        register_pytree(cls, children=(*tensors, *parts), constants=constants)
+
+    @classmethod
+    def unchecked(cls: type[B], *args: Any, **fields: Any) -> B:
+        """Build without a look at what is given: for parts of other instances, or from inside a transformation."""
+        raise NotImplementedError
+
+    # ------------------------------------------------------------------------------------------------- as a tensor
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """The batch shape `*B`."""
+        name, behind = next(iter(self._tensors.items()))
+        shape = getattr(self, name).shape
+        return shape[: len(shape) - behind]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The floating-point type."""
+        return getattr(self, next(iter(self._tensors))).dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        return getattr(self, next(iter(self._tensors))).device
+
+    def to(self: B, *args: Any, **kwargs: Any) -> B:
+        """The same in another dtype or on another device: arguments as `torch.Tensor.to`; half becomes float32.
+
+        Raises:
+            TypeError: the dtype is not of floating-point type.
+        """
+
+        def convert(tensor: Tensor, _: int) -> Tensor:
+            if not tensor.is_floating_point():  # a mask moves, and stays a mask
+                return converted(tensor, self._rehearsed(*args, **kwargs).device)
+            return lifted(converted(tensor, *args, **kwargs))
+
+        wanted = self._rehearsed(*args, **kwargs)
+        if not wanted.is_floating_point():
+            raise TypeError(f"dtype: want a floating-point one, got {wanted.dtype}")
+        return self._rearranged(convert, lambda part: part.to(*args, **kwargs))
+
+    def _rehearsed(self, *args: Any, **kwargs: Any) -> Tensor:
+        """An empty tensor of this dtype and device, converted: shows what the arguments of `to` ask for."""
+        return torch.empty(0, dtype=self.dtype, device=self.device).to(*args, **kwargs)
+
+    def detach(self: B) -> B:
+        """The same cut off from the graph."""
+        return self._rearranged(lambda tensor, _: tensor.detach(), lambda part: part.detach())
+
+    def expand(self: B, *batch_shape: int) -> B:
+        """The same with its batch axes broadcast to `batch_shape`, as `torch.Tensor.expand`: nothing is copied."""
+
+        def stretch(tensor: Tensor, behind: int) -> Tensor:
+            return tensor.expand((*batch_shape, *tensor.shape[tensor.ndim - behind :]))
+
+        return self._rearranged(stretch, lambda part: part.expand(*batch_shape))
+
+    def __getitem__(self: B, index: Any) -> B:
+        """Some of the batch, chosen as one indexes a tensor of shape `*B`.
+
+        Raises:
+            TypeError: the index is not one that tensors take.
+            IndexError: there is no such element.
+        """
+        check_index(index)
+        return self._rearranged(lambda tensor, behind: index_batch(tensor, index, behind), lambda part: part[index])
+
+    @classmethod
+    def stack(cls: type[B], items: Sequence[B], dim: int = 0) -> B:
+        """Join several along a new batch axis; their batch shapes broadcast, their constants must agree.
+
+        Args:
+            items: at least one.
+            dim: where the new axis stands among the batch axes.
+
+        Raises:
+            TypeError: others than this class among them, or different dtypes or kinds of parts.
+            ValueError: none, different constants, or batch shapes that do not broadcast.
+        """
+        items = list(items)
+        if not items or not all(isinstance(item, cls) for item in items):
+            got = ", ".join(sorted({type(item).__name__ for item in items})) or "none"
+            raise (TypeError if items else ValueError)(f"items: want at least one {cls.__name__}, got {got}")
+        if len({item.dtype for item in items}) > 1:
+            raise TypeError(f"items: want one dtype, got {sorted({str(item.dtype) for item in items})}; .to() converts")
+        try:
+            batch = torch.broadcast_shapes(*(item.batch_shape for item in items))
+        except RuntimeError:
+            got = ", ".join(str(tuple(item.batch_shape)) for item in items)
+            raise ValueError(f"items: batch shapes do not broadcast: {got}") from None
+        items = [item.expand(*batch) for item in items]
+        dim = dim % (len(batch) + 1)
+        fields = {name: torch.stack([getattr(item, name) for item in items], dim) for name in cls._tensors}
+        fields |= {name: _stacked(name, [getattr(item, name) for item in items], dim) for name in cls._parts}
+        return cls.unchecked(**fields, **{name: cls._agreed(name, items) for name in cls._constants})
+
+    @classmethod
+    def _agreed(cls: type[B], name: str, items: Sequence[B]) -> Any:
+        """The constant that all have.
+
+        Raises:
+            ValueError: they differ.
+        """
+        first, *others = (getattr(item, name) for item in items)
+        if any(other != first for other in others):
+            raise ValueError(f"items: want the same {name}, got {[first, *others]}")
+        return first
+
+    def __len__(self) -> int:
+        """The length of the first batch axis.
+
+        Raises:
+            TypeError: there is none.
+        """
+        if not self.batch_shape:
+            raise TypeError(f"len() of a single {type(self).__name__}, which has no batch axes")
+        return self.batch_shape[0]
+
+    def __bool__(self) -> bool:
+        """True, as of any object: what has a length is not false for being short."""
+        return True
+
+    def _rearranged(self: B, rearrange: Rearrange, part: Callable[[Any], Any]) -> B:
+        """The same with each tensor and each part rearranged."""
+        fields: dict[str, Any] = {
+            name: rearrange(getattr(self, name), behind) for name, behind in self._tensors.items()
+        }
+        for name in self._parts:
+            value = getattr(self, name)
+            fields[name] = None if value is None else part(value)
+        return self.unchecked(**fields, **{name: getattr(self, name) for name in self._constants})
+
+
+def _stacked(name: str, parts: list[Any], dim: int) -> Any:
+    kinds = {type(part) for part in parts}
+    if len(kinds) > 1:
+        raise TypeError(f"items: want one kind of {name}, got {', '.join(sorted(kind.__name__ for kind in kinds))}")
+    if parts[0] is None:
+        return None
+    leaves = [torch_pytree.tree_flatten(part) for part in parts]
+    if any(len(flat) != len(leaves[0][0]) or structure != leaves[0][1] for flat, structure in leaves):
+        raise ValueError(f"items: want {name}s that are alike, got different ones")
+    if any(a.shape != b.shape for flat, _ in leaves for a, b in zip(flat, leaves[0][0], strict=True)):
+        raise ValueError(f"items: want {name}s of one size, got different ones")
+    stacked = [torch.stack(tensors, dim) for tensors in zip(*(flat for flat, _ in leaves), strict=True)]
+    return torch_pytree.tree_unflatten(stacked, leaves[0][1])
+
+
+# -------------------------------------------------------------------------------------------------------- indexing
+
+
+INDEX = (int, slice, list, Tensor, np.ndarray, np.integer)
+
+
+def check_index(index: Any) -> None:
+    """Check that an index is one that tensors take.
+
+    Raises:
+        TypeError: it is not. (PyTorch itself would read any object with a length, number by number.)
+    """
+    for part in index if isinstance(index, tuple) else (index,):
+        if not (part is None or part is Ellipsis or isinstance(part, INDEX)):
+            raise TypeError(f"index: want numbers, slices, lists or masks, got {type(part).__name__}")
+
+
+def index_batch(tensor: Tensor, index: Any, behind: int) -> Tensor:
+    """Index the batch axes of a tensor and keep the `behind` axes behind them whole, also with an ellipsis."""
+    index = index if isinstance(index, tuple) else (index,)
+    if not any(part is Ellipsis for part in index):
+        index = (*index, Ellipsis)
+    return tensor[(*index, *(slice(None),) * behind)]
+
+
+# ---------------------------------------------------------------------------------------------------------- PyTrees
+
+
+def register_pytree(
+    cls: type[T],
+    *,
+    children: Sequence[str],
+    constants: Sequence[str] = (),
+    build: Callable[..., T] | None = None,
+) -> type[T]:
+    """Make a class a PyTree.
+
+    Args:
+        cls: the class.
+        children: names of its tensors, and of what holds tensors. One that is `None` is left out of the leaves,
+            because `vmap` refuses `None` as a leaf.
+        constants: names of what stays as it is; must be comparable.
+        build: makes an instance of children and constants by name, without a look at values; `cls.unchecked` if left
+            out.
+    """
+    make: Callable[..., T] = build or cls.unchecked  # type: ignore[attr-defined]
+
+    def flatten(instance: T) -> tuple[list[Any], Any]:
+        present = tuple(name for name in children if getattr(instance, name) is not None)
+        kept = tuple(getattr(instance, name) for name in constants)
+        return [getattr(instance, name) for name in present], (present, kept)
+
+    def flatten_with_keys(instance: T) -> tuple[list[tuple[Any, Any]], Any]:
+        leaves, context = flatten(instance)
+        return [(torch_pytree.GetAttrKey(k), v) for k, v in zip(context[0], leaves, strict=True)], context
+
+    def unflatten(leaves: Iterable[Any], context: Any) -> T:
+        present, kept = context
+        fields = dict.fromkeys(children)
+        fields.update(zip(present, leaves, strict=True))
+        fields.update(zip(constants, kept, strict=True))
+        return make(**fields)
+
+    torch_pytree.register_pytree_node(
+        cls,
+        flatten,
+        unflatten,
+        serialized_type_name=f"{cls.__module__}.{cls.__qualname__}",
+        flatten_with_keys_fn=flatten_with_keys,
+    )
+    return cls

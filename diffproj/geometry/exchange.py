@@ -1,0 +1,97 @@
+"""What other libraries give and take of a camera: the part of `Camera` that is about OpenCV and Kornia."""
+
+from typing import TypeVar
+
+import numpy as np
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from diffproj.geometry import interop
+from diffproj.geometry.interop import ArrayLike
+from diffproj.lens.brown_conrady import BrownConrady
+from diffproj.lens.coefficients import CoefficientLens
+from diffproj.lens.kannala_brandt import KannalaBrandt
+from diffproj.lens.protocol import Lens
+
+C = TypeVar("C", bound="Exchange")
+
+
+class Exchange:
+    """From and to OpenCV's arrays and Kornia's `PinholeCamera`, whose conventions are those of `Camera`."""
+
+    __slots__ = ()
+
+    K: Tensor
+    R: Tensor
+    t: Tensor
+    distortion: Lens | None
+    size: tuple[int, int] | None
+
+    @classmethod
+    def from_opencv(
+        cls: type[C],
+        K: ArrayLike,
+        dist: ArrayLike | None = None,
+        rvec: ArrayLike | None = None,
+        tvec: ArrayLike | None = None,
+        size: tuple[int, int] | None = None,
+        fisheye: bool = False,
+    ) -> C:
+        """A camera from what OpenCV's calibration returns.
+
+        Args:
+            K: camera matrix `(*B, 3, 3)`. Arrays become float64 tensors; a tensor keeps its dtype, device and graph.
+            dist: 4, 5, 8, 12 or 14 coefficients in OpenCV's order (fisheye: 4), as `(*B, k)` or as OpenCV's row or
+                column; `None` or an empty array for a pinhole.
+            rvec: rotation vector world to camera `(*B, 3)` in radians, or OpenCV's `(3, 1)` column.
+            tvec: translation world to camera `(*B, 3)` in world units, or OpenCV's `(3, 1)` column.
+            size: image size `(width, height)` in pixels.
+            fisheye: whether `dist` belongs to OpenCV's fisheye model.
+
+        Raises:
+            ValueError: wrong shapes or values, as the constructor says.
+
+        Example:
+            >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+            >>> import diffproj as dp
+            >>> dp.Camera.from_opencv(K, [-0.2, 0.1, 0, 0, 0], np.zeros(3), [0, 0, 800], size=(640, 480))
+            Camera(batch_shape=(), BrownConrady, size=(640, 480), torch.float64, cpu)
+        """
+        K, coefficients, R, t = interop.tensors_from_opencv(K, dist, rvec, tvec)
+        lens = KannalaBrandt if fisheye else BrownConrady
+        return cls(K, R, t, None if coefficients is None else lens(coefficients), size)  # type: ignore[call-arg]
+
+    def to_opencv(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """`(K, dist, rvec, tvec)` as float64 arrays for OpenCV's functions, batch axes in front.
+
+        `dist` is empty for a pinhole. Whether the coefficients are the fisheye model's is for the caller to remember.
+
+        Raises:
+            ValueError: the camera has skew or a turned image, which OpenCV would ignore, or another library's lens.
+        """
+        if self.distortion is not None and not isinstance(self.distortion, CoefficientLens):
+            raise ValueError(f"distortion: want a lens that OpenCV has, got {type(self.distortion).__name__}")
+        coefficients = None if self.distortion is None else self.distortion.coefficients
+        return interop.arrays_for_opencv(self.K, coefficients, self.R, self.t)
+
+    @classmethod
+    def from_kornia(cls: type[C], pinhole: PinholeCamera) -> C:
+        """A camera of batch shape `(B,)` from Kornia's `PinholeCamera`, whose conventions are the same.
+
+        Raises:
+            ValueError: the cameras of the batch have images of different sizes, or values are not a camera's.
+        """
+        K, R, t, size = interop.tensors_from_kornia(pinhole)
+        return cls(K, R, t, size=size)  # type: ignore[call-arg]
+
+    def to_kornia(self) -> PinholeCamera:
+        """Kornia's `PinholeCamera` of batch size `B`; a single camera becomes a batch of one.
+
+        Raises:
+            ValueError: what `PinholeCamera` cannot hold: a lens, no size, or more than one batch axis.
+        """
+        if self.distortion is not None:
+            raise ValueError("distortion: want None, for PinholeCamera holds no lens; undistort first")
+        if self.size is None:
+            raise ValueError("size: want (width, height), got None, and PinholeCamera needs it")
+        return interop.pinhole_from_tensors(self.K, self.R, self.t, self.size)
