@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from diffproj.calibration.reprojection import COEFFICIENTS, Reprojection, make_lens
+from diffproj.calibration.reprojection import Reprojection
 from diffproj.calibration.solver import LocalState
 from diffproj.geometry.back_projection import back_project
-from diffproj.geometry.camera import Camera
-from diffproj.geometry.intrinsics import intrinsic_matrix
 from diffproj.geometry.plane import Plane
 
 
@@ -27,7 +25,7 @@ class BoardError(Reprojection):
     def linearise(self, shared: Tensor, local: LocalState) -> Tensor:
         """The panel in world units; not finite where a corner that counts cannot be put back on the board."""
         R, _ = local
-        cameras = assembled(self.lens, shared, local)
+        cameras = self.parameters.unpack(shared, local)
         landed, valid = back_project(self.pixels, cameras, Plane.z(0.0))
         landed = torch.where(valid.unsqueeze(-1), landed, self.points)
         panel = self.linearise_at(R @ landed.mT, shared, local)
@@ -45,12 +43,3 @@ class BoardError(Reprojection):
         if self._unused is not None:
             image.masked_fill_(self._unused[:, :, None, None], 0.0)
         return image
-
-
-def assembled(lens: str, shared: Tensor, local: LocalState) -> Camera:
-    """Cameras `(P, V)` of shared parameters `(P, s)` and poses, without a look at the values."""
-    R, t = local
-    batch = R.shape[:-2]
-    K = intrinsic_matrix(shared[:, None, :2], shared[:, None, 2:4])
-    model = make_lens(lens, shared[:, None, 4 : 4 + COEFFICIENTS[lens]])  # type: ignore[arg-type, index]
-    return Camera.unchecked(K.expand(*batch, 3, 3), R, t, None if model is None else model.expand(*batch), None)

@@ -16,18 +16,19 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj.calibration import closed_form, start
-from diffproj.calibration.board_error import assembled
+from diffproj.calibration.constraints import Priors, free_basis, held_at, make_prior
 from diffproj.calibration.covariance import Covariance, reshaped
-from diffproj.calibration.data import Data, PlanarTarget
+from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, Progress, Task, fit
 from diffproj.calibration.implicit import differentiated
 from diffproj.calibration.losses import Loss
-from diffproj.calibration.parametrisation import Priors, free_basis, held_at, make_prior
-from diffproj.calibration.reprojection import COEFFICIENTS, LensModel, shared_names
+from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import Calibration, CalibrationError, Objective
 from diffproj.calibration.solver import Prior, Solution, Status, chosen
 from diffproj.calibration.verdict import verdicts
 from diffproj.geometry.camera import Camera, as_camera
+from diffproj.lens.models import LensModel, model_named
+from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
 REJECT = 5.0
@@ -36,7 +37,7 @@ REJECT = 5.0
 
 def calibrate(
     views: Views,
-    board: PlanarTarget,
+    board: Target,
     distortion: LensModel = "brown5",
     *,
     objective: Objective = "image",
@@ -95,8 +96,7 @@ def calibrate(
         >>> print(f"{calibration.rms:.3f}", [round(f) for f in calibration.camera.K.diagonal()[:2].tolist()])
         0.177 [533, 533]
     """
-    if distortion not in get_args(LensModel):
-        raise ValueError(f"distortion: want one of {', '.join(get_args(LensModel))}, got {distortion!r}")
+    model = model_named(distortion)
     data = Data(views, board, weights)
     if views.size is None:
         raise ValueError("views: want the photographs' size, got None; give Views(..., size=(width, height))")
@@ -106,9 +106,9 @@ def calibrate(
     # The start is a guess from the corners; what is held, or known, is not.
     reference = shared.clone()
     reference[:, :2], reference[:, 4:] = torch.nan, 0.0
-    if COEFFICIENTS[distortion] > 5:
+    if model.count > 5:
         # The rational terms nearly cancel each other: from far off they lead into side valleys.
-        late = shared_names(distortion, bow=False)[9:]
+        late = model.coefficient_names[5:]
         early = replace(options, fixed=(*fixed, *late), objective="image", reject_outliers=False)
         early = replace(early, loss=None if objective == "plane" else loss)  # its scale is in world units
         near, _ = _fitted(data, early, distortion, shared, local, reference, **steps)
@@ -120,7 +120,7 @@ def calibrate(
 def refine(
     camera: Camera | PinholeCamera,
     views: Views,
-    board: PlanarTarget,
+    board: Target,
     *,
     objective: Objective = "image",
     bow: bool = False,
@@ -189,7 +189,7 @@ def refine(
 
 def locate(
     views: Views,
-    board: PlanarTarget,
+    board: Target,
     camera: Camera | PinholeCamera | Calibration,
     *,
     weights: Tensor | None = None,
@@ -344,15 +344,15 @@ def _fitted(
 
     `reference (P, s)` is what fixed parameters keep and priors without a mean are about; NaN where nothing is known.
     """
-    names = shared_names(model, options.bow)
-    prior = make_prior(options.priors, reference, names, data.batch)
-    shared = held_at(reference, shared, names, options.fixed)
+    parameters = Parametrisation(model, options.bow)
+    prior = make_prior(options.priors, reference, parameters, data.batch)
+    shared = held_at(reference, shared, parameters, options.fixed)
     task = data.task(
         model,
         bow=options.bow,
         loss=options.loss,
         prior=None if prior is None else Prior(prior.mean.detach(), prior.precision.detach()),
-        basis=free_basis(shared, names, options.fixed, options.tied_focal),
+        basis=free_basis(shared, parameters, options.fixed, options.tied_focal),
     )
     if options.objective == "plane":
         # From a rough start a pixel may miss the board; the image objective bears that.
@@ -371,7 +371,7 @@ def _result(
 ) -> Calibration:
     """The calibration with the batch shape of the views."""
     task, solution, batch = found.task, found.solution, data.batch
-    cameras = assembled(task.lens, solution.shared, solution.local)  # type: ignore[arg-type]
+    cameras = task.parameters.unpack(solution.shared, solution.local)
     status, causes = verdicts(found, data.views.names, data.board)
 
     def shaped(tensor: Tensor) -> Tensor:

@@ -1,25 +1,15 @@
 """What calibration is given, checked: views, board and weights."""
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from diffproj._core.numerics import precise
 from diffproj.calibration.fit import Task
-from diffproj.calibration.reprojection import LensModel
+from diffproj.lens.models import LensModel
+from diffproj.targets.target import Target
 from diffproj.targets.views import Views
-
-
-@runtime_checkable
-class PlanarTarget(Protocol):
-    """What is calibrated against: anything with points, such as `Chessboard`."""
-
-    @property
-    def points(self) -> Float[Tensor, "n 3"]:
-        """World points `(N, 3)` on the plane z = 0, in the order of the views' corners."""
-        ...
 
 
 class Data:
@@ -39,12 +29,12 @@ class Data:
         ValueError: views, board and weights do not fit together, or the board is of no use.
     """
 
-    def __init__(self, views: Views, board: PlanarTarget, weights: Tensor | None) -> None:
+    def __init__(self, views: Views, board: Target, weights: Tensor | None) -> None:
         if not isinstance(views, Views):
             raise TypeError(f"views: want dp.Views, got {type(views).__name__}; dp.Views(pixels, size=...) makes them")
         if len(views) == 0:
             raise ValueError("views: want at least one, got none")
-        if not isinstance(board, PlanarTarget):
+        if not isinstance(board, Target):
             raise TypeError(f"board: want dp.Chessboard or anything with .points (N, 3), got {type(board).__name__}")
         self.views, self.board, self.batch = views, board, views.batch_shape
         self.given_points = precise(board.points.to(views.device))

@@ -16,9 +16,11 @@ from diffproj.calibration import covariance as covariances
 from diffproj.calibration.board_error import BoardError
 from diffproj.calibration.covariance import Covariance, Scores
 from diffproj.calibration.losses import Loss
-from diffproj.calibration.reprojection import POSE, LensModel, Reprojection, shared_names
+from diffproj.calibration.parametrisation import POSE, Parametrisation
+from diffproj.calibration.reprojection import Reprojection
 from diffproj.calibration.result import Objective
 from diffproj.calibration.solver import Equations, Prior, Solution, chosen, solve
+from diffproj.lens.models import LensModel
 
 BLOCK_CORNERS = 24_000
 """Corners solved at once on a CPU, those of some thirty cameras of 13 views: enough to hide the cost of calls, and few
@@ -60,9 +62,14 @@ class Task:
     basis: Tensor | None = None
 
     @property
+    def parameters(self) -> Parametrisation:
+        """Which they are, and in which order."""
+        return Parametrisation(self.lens, self.bow)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Of the shared parameters."""
-        return shared_names(self.lens, self.bow)
+        return self.parameters.names
 
     @property
     def problem(self) -> Reprojection:

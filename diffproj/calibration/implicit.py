@@ -11,10 +11,10 @@ theta to rounding. H has the arrow shape of the normal equations and is reduced 
 import torch
 from torch import Tensor
 
-from diffproj.calibration.board_error import assembled
+from diffproj.calibration.bow import bowed
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, Task
-from diffproj.calibration.reprojection import POSE, bow_shape, moved
+from diffproj.calibration.parametrisation import POSE, moved
 from diffproj.calibration.solver import Prior
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.plane import Plane
@@ -71,11 +71,10 @@ def _costs(
     """The cost of each view `(P, V)`, a graph on shared `(P, V, s)`, pose step, pixels, points and weights."""
     flat = shared.flatten(0, 1)
     local = tuple(z.unsqueeze(1) for z in moved(found.solution.local, step))
-    cameras = assembled(task.lens, flat, tuple(z.flatten(0, 2).unsqueeze(1) for z in local))
+    cameras = task.parameters.unpack(flat, tuple(z.flatten(0, 2).unsqueeze(1) for z in local))
     points = data.given_points.expand(len(flat), 1, -1, 3)
     if task.bow:
-        z = (flat[:, None, -2:, None] * bow_shape(data.given_points)).sum(2)
-        points = points + torch.nn.functional.pad(z.unsqueeze(-1), (2, 0))
+        points = bowed(data.given_points, flat[:, None, -2:])
     seen = torch.where(task.used.unsqueeze(-1), pixels, 0.0).flatten(0, 1).unsqueeze(1)
     if task.objective == "plane":
         landed, valid = back_project(seen, cameras, Plane.z(0.0))

@@ -12,8 +12,11 @@ equations are those of `diffproj.lens`, which the tests hold these to.
 import torch
 from torch import Tensor
 
+from diffproj.lens.brown_conrady import BrownConrady
+from diffproj.lens.kannala_brandt import KannalaBrandt
 
-def pinhole(X_cam: Tensor, by_point: Tensor) -> Tensor:
+
+def pinhole(coefficients: Tensor, X_cam: Tensor, by_coefficient: Tensor, by_point: Tensor) -> Tensor:  # noqa: ARG001
     """No lens: `(x, y) / z`."""
     inverse_depth = X_cam[:, :, 2].reciprocal()
     xy = X_cam[:, :, :2] * inverse_depth.unsqueeze(2)
@@ -149,3 +152,7 @@ def _tilt(tau_x: Tensor, tau_y: Tensor, xy: Tensor, by_xy: Tensor, rows: Tensor)
     rows[:, :, 13, 0] = -X * fall * inverse
     rows[:, :, 13, 1] = (-sin_y * y - sin_x * cos_y * x - Y * fall) * inverse
     return torch.stack([X, Y], dim=2), onward(by_xy)
+
+
+DERIVATIVES = {None: pinhole, BrownConrady: brown_conrady, KannalaBrandt: fisheye}
+"""The function for each class of lenses."""

@@ -1,115 +1,140 @@
-"""The shared parameters by name: which are fixed, tied or known beforehand.
+"""The parameters of a calibration as a vector: their names and order, and the way from a camera to it and back.
 
-Names are those of the summary (`f_x f_y c_x c_y k1 k2 p1 p2 k3 ... bow_x bow_y`) or of groups: `focal`,
-`principal_point`, `distortion`, `bow`.
+The views of a camera share
+
+    f_x f_y c_x c_y | coefficients of the lens | bow_x bow_y
+
+in pixels, without unit, and in world units. Each view has a pose of its own, `(R, t)`, which moves by six numbers, in
+radians about the camera's axes and in world units:
+
+    omega (3) | tau (3)        R <- exp(omega) R, t <- t + tau
+
+Whoever fits, names, prints, stores or differentiates parameters takes the order from here.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from diffproj.calibration.solver import Prior
+from diffproj.geometry.camera import Camera
+from diffproj.geometry.cayley import turned
+from diffproj.geometry.intrinsics import focal_and_center, intrinsic_matrix
+from diffproj.lens.models import MODELS, LensModel, coefficients_of, model_of
 
-Priors = Mapping[str, Any]
-"""By name or group: a standard deviation about the starting value, or a tuple `(mean, standard deviation)`; numbers or
-tensors that broadcast to `(*B, size of the group)`."""
+POSE = 6
+"""Coordinates of a pose: omega and tau."""
+INTRINSICS = ("f_x", "f_y", "c_x", "c_y")
+BOW = ("bow_x", "bow_y")
+
+Pose = tuple[Tensor, ...]
+"""Rotations `(*, 3, 3)` and translations `(*, 3)`, world to camera."""
 
 
-def positions(option: str, name: str, names: Sequence[str]) -> list[int]:
-    """Where a parameter or a group of them stands.
+@dataclass(frozen=True)
+class Parametrisation:
+    """Which parameters the views of a camera share.
 
-    Raises:
-        ValueError: no such name.
+    Attributes:
+        lens: the lens model.
+        bow: whether the board's bow is among them.
+
+    Example:
+        >>> import diffproj as dp
+        >>> camera = dp.calibrate(dp.example_views("left"), dp.Chessboard(), "brown4").camera
+        >>> parameters = Parametrisation.of(camera)
+        >>> parameters.names
+        ('f_x', 'f_y', 'c_x', 'c_y', 'k1', 'k2', 'p1', 'p2')
+        >>> shared = parameters.pack(camera)
+        >>> torch.equal(parameters.unpack(shared, (camera.R, camera.t)).K, camera.K)
+        True
     """
-    groups = {
-        "focal": ["f_x", "f_y"],
-        "principal_point": ["c_x", "c_y"],
-        "distortion": [n for n in names[4:] if not n.startswith("bow")],
-        "bow": [n for n in names if n.startswith("bow")],
-    }
-    members = groups.get(name, [name])
-    if not members or not set(members) <= set(names):
-        offered = [group for group, inside in groups.items() if inside]
-        raise ValueError(f"{option}: want names from {', '.join([*offered, *names])}, got {name!r}")
-    return [names.index(member) for member in members]
+
+    lens: LensModel
+    bow: bool = False
+
+    @classmethod
+    def of(cls, camera: Camera, bow: bool = False) -> "Parametrisation":
+        """That of a camera.
+
+        Raises:
+            TypeError: its lens is of another package.
+        """
+        return cls(model_of(camera.distortion).name, bow)
+
+    @property
+    def coefficient_names(self) -> tuple[str, ...]:
+        """The names of the lens's coefficients."""
+        return MODELS[self.lens].coefficient_names
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the s shared parameters in their order."""
+        return (*INTRINSICS, *self.coefficient_names, *(BOW if self.bow else ()))
+
+    @property
+    def size(self) -> int:
+        """s, how many there are."""
+        return self.lens_end + 2 * self.bow
+
+    @property
+    def lens_end(self) -> int:
+        """How many there are without the bow."""
+        return len(INTRINSICS) + MODELS[self.lens].count
+
+    def pack(self, camera: Camera, bow: Float[Tensor, "*batch 2"] | None = None) -> Float[Tensor, "*batch s"]:
+        """The shared parameters `(*B, s)` of a camera without skew; no bow counts as a flat board.
+
+        Raises:
+            TypeError: its lens is of another package.
+        """
+        intrinsics = focal_and_center(camera.K)
+        coefficients = coefficients_of(camera.distortion, intrinsics)
+        parts = [intrinsics, coefficients.expand(*camera.batch_shape, coefficients.shape[-1])]
+        if self.bow:
+            parts.append(intrinsics.new_zeros(*camera.batch_shape, 2) if bow is None else bow.to(intrinsics))
+        return torch.cat(parts, dim=-1)
+
+    def unpack(self, shared: Float[Tensor, "*batch s"], pose: Pose) -> Camera:
+        """The camera at poses, without a look at the values.
+
+        Args:
+            shared: `(*B, s)`.
+            pose: with batch axes `(*B, *V)`, those of `shared` in front.
+        """
+        R, t = pose
+        batch = R.shape[:-2]
+        shared = shared.reshape(*shared.shape[:-1], *(1,) * (R.ndim - 1 - shared.ndim), shared.shape[-1])
+        K = intrinsic_matrix(shared[..., :2], shared[..., 2:4])
+        lens = MODELS[self.lens].lens(shared[..., len(INTRINSICS) : self.lens_end])
+        return Camera.unchecked(K.expand(*batch, 3, 3), R, t, None if lens is None else lens.expand(*batch), None)
+
+    def positions(self, option: str, name: str) -> list[int]:
+        """Where a parameter stands, or a group: `focal`, `principal_point`, `distortion`, `bow`.
+
+        Args:
+            option: which asks, for the message.
+            name: of a parameter or a group.
+
+        Raises:
+            ValueError: no such name.
+        """
+        groups: dict[str, Sequence[str]] = {
+            "focal": INTRINSICS[:2],
+            "principal_point": INTRINSICS[2:],
+            "distortion": self.coefficient_names,
+            "bow": BOW if self.bow else (),
+        }
+        members = groups.get(name, [name])
+        if not members or not set(members) <= set(self.names):
+            offered = [group for group, inside in groups.items() if inside]
+            raise ValueError(f"{option}: want names from {', '.join([*offered, *self.names])}, got {name!r}")
+        return [self.names.index(member) for member in members]
 
 
-def free_basis(shared: Tensor, names: Sequence[str], fixed: Sequence[str], tied_focal: bool) -> Tensor | None:
-    """The directions `(P, s, q)` in which the shared parameters may move; `None` where all may.
-
-    Args:
-        shared: the start `(P, s)`.
-        names: of the s parameters.
-        fixed: names or groups that keep their starting values.
-        tied_focal: `f_x : f_y` keeps the start's ratio.
-
-    Raises:
-        ValueError: an unknown name, or one focal length fixed while they are tied.
-    """
-    held = {position for name in fixed for position in positions("fixed", name, names)}
-    if tied_focal and len(held & {0, 1}) == 1:
-        raise ValueError("fixed: want both focal lengths or none while tied_focal=True, got one of them")
-    tied = tied_focal and not held & {0, 1}
-    if not held and not tied:
-        return None
-    identity = torch.eye(len(names), dtype=shared.dtype, device=shared.device)
-    columns = [i for i in range(len(names)) if i not in held and not (tied and i == 1)]
-    basis = identity[:, columns].expand(len(shared), -1, -1).clone()
-    if tied:
-        basis[:, 1, 0] = shared[:, 1] / shared[:, 0]
-    return basis
-
-
-def held_at(reference: Tensor, shared: Tensor, names: Sequence[str], fixed: Sequence[str]) -> Tensor:
-    """The start `(P, s)` with fixed parameters at the values that they keep.
-
-    Raises:
-        ValueError: nothing is known of what is to be fixed.
-    """
-    held = sorted({position for name in fixed for position in positions("fixed", name, names)})
-    if not held:
-        return shared
-    if bool(reference[:, held].isnan().any()):
-        raise ValueError("fixed: want what is known beforehand; a focal length is for refine, whose camera has one")
-    return shared.index_copy(1, torch.tensor(held, device=shared.device), reference[:, held])
-
-
-def make_prior(priors: Priors | None, shared: Tensor, names: Sequence[str], batch: Sequence[int]) -> Prior | None:
-    """The prior on the shared parameters; gradients flow to tensors among its values.
-
-    Raises:
-        ValueError: an unknown name, a shape that does not fit, or a deviation that is not positive.
-    """
-    if not priors:
-        return None
-    mean = shared.detach().clone()
-    precision = torch.zeros_like(mean)
-    for name, value in priors.items():
-        where = positions("priors", name, names)
-        pair = value if isinstance(value, tuple) else (None, value)
-        if len(pair) != 2:
-            raise ValueError(f"priors: want a deviation or (mean, deviation) for {name!r}, got {value!r}")
-        if pair[0] is not None:
-            mean = _written(mean, where, pair[0], name, batch)
-        deviation = _written(torch.ones_like(mean), where, pair[1], name, batch)
-        if not bool((deviation > 0).all()):
-            raise ValueError(f"priors: want a positive standard deviation for {name!r}, got {pair[1]}")
-        if not bool(mean.detach()[:, where].isfinite().all()):
-            raise ValueError(f"priors: want (mean, deviation) with a finite mean for {name!r}, got {value!r}")
-        chosen = torch.zeros_like(mean)
-        chosen[:, where] = 1.0
-        precision = precision * (1 - chosen) + chosen / deviation.square()
-    return Prior(torch.where(precision > 0, mean, 0.0), torch.diag_embed(precision))
-
-
-def _written(into: Tensor, where: list[int], value: Any, name: str, batch: Sequence[int]) -> Tensor:
-    """A copy with `value`, which broadcasts to `(*B, len(where))`, at some columns."""
-    tensor = value if isinstance(value, Tensor) else torch.as_tensor(value)
-    try:
-        tensor = tensor.to(into).expand(*batch, len(where)).reshape(-1, len(where))
-    except RuntimeError:
-        want = (*batch, len(where))
-        raise ValueError(f"priors: want {name!r} to broadcast to {want}, got {tuple(tensor.shape)}") from None
-    return into.index_copy(1, torch.tensor(where, device=into.device), tensor)
+def moved(pose: Pose, step: Float[Tensor, "*batch 6"]) -> Pose:
+    """Poses `(R, t)` moved by `(omega, tau)`, to second order in the step."""
+    R, t = pose
+    return turned(R, step[..., :3]), t + step[..., 3:]

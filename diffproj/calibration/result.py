@@ -9,12 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffproj.calibration.bow import bowed
 from diffproj.calibration.covariance import Covariance
-from diffproj.calibration.reprojection import COEFFICIENT_NAMES, bow_shape
+from diffproj.calibration.parametrisation import BOW, Parametrisation
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
-from diffproj.lens.brown_conrady import BrownConrady
-from diffproj.lens.kannala_brandt import KannalaBrandt
 from diffproj.targets.views import Views
 
 Objective = Literal["image", "plane"]
@@ -82,11 +81,19 @@ class Calibration:
     @property
     def board_points(self) -> Float[Tensor, "*batch n 3"]:
         """The board's corners `(*B, N, 3)` in world units with its bow, where one was fitted."""
-        points = self.points.expand(*self.views.batch_shape, -1, -1)
         if self.bow is None:
-            return points
-        z = (self.bow.unsqueeze(-1) * bow_shape(self.points)).sum(-2)
-        return points + torch.nn.functional.pad(z.unsqueeze(-1), (2, 0))
+            return self.points.expand(*self.views.batch_shape, -1, -1)
+        return bowed(self.points, self.bow)
+
+    @property
+    def parameters(self) -> Parametrisation:
+        """The names and the order of the shared parameters."""
+        return Parametrisation.of(self.camera, self.bow is not None)
+
+    @property
+    def shared(self) -> Float[Tensor, "*batch s"]:
+        """The shared parameters `(*B, s)`, in the order of `parameters.names`."""
+        return self.parameters.pack(self.camera, self.bow)
 
     @property
     def residuals(self) -> Float[Tensor, "*batch v n 2"]:
@@ -165,24 +172,19 @@ class Calibration:
         if self.views.batch_shape:
             raise ValueError(f"summary: want one camera, got batch shape {tuple(self.views.batch_shape)}; see message")
         deviations = self.covariance.deviations if self._covariance is not None else {}
-        K = self.camera.K
+        values = dict(zip(self.parameters.names, self.shared.tolist(), strict=True))
 
-        def line(title: str, names: tuple[str, ...], values: list[float], form: str, unit: str) -> str:
-            pairs = zip(names, values, strict=True)
-            texts = (f"{value:{form}}{_spread(deviations.get(name), form)}" for name, value in pairs)
+        def line(title: str, names: tuple[str, ...], form: str, unit: str) -> str:
+            texts = (f"{values[name]:{form}}{_spread(deviations.get(name), form)}" for name in names)
             return f"{title:<16}{'  '.join(texts)}{unit}"
 
         lines = [
-            line("focal lengths", ("f_x", "f_y"), K.diagonal()[:2].tolist(), "10.3f", " px"),
-            line("principal point", ("c_x", "c_y"), K[:2, 2].tolist(), "10.3f", " px"),
+            line("focal lengths", ("f_x", "f_y"), "10.3f", " px"),
+            line("principal point", ("c_x", "c_y"), "10.3f", " px"),
+            *(line(f"lens {name}", (name,), "10.5f", "") for name in self.parameters.coefficient_names),
         ]
-        lens = self.camera.distortion
-        if isinstance(lens, BrownConrady | KannalaBrandt):
-            names = ("k1", "k2", "k3", "k4") if isinstance(lens, KannalaBrandt) else COEFFICIENT_NAMES
-            for name, value in zip(names, lens.coefficients.tolist(), strict=False):
-                lines.append(line(f"lens {name}", (name,), [value], "10.5f", ""))
         if self.bow is not None:
-            lines.append(line("bow along x, y", ("bow_x", "bow_y"), self.bow.tolist(), "10.4f", " world units"))
+            lines.append(line("bow along x, y", BOW, "10.4f", " world units"))
         lines.append(f"{'RMS':<16}{self.rms.item():10.4f} px over {int(self.used.sum())} corners")
         width = max(map(len, self.views.names), default=0)
         seen, used = self.views.visible.sum(-1).tolist(), self.used.sum(-1).tolist()

@@ -6,17 +6,17 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration import closed_form
-from diffproj.calibration.board_error import assembled
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import ordinary
-from diffproj.calibration.reprojection import COEFFICIENTS, LensModel, lens_model
+from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.geometry.camera import Camera
-from diffproj.geometry.intrinsics import check_no_skew, focal_and_center
+from diffproj.geometry.intrinsics import check_no_skew
+from diffproj.lens.models import MODELS, LensModel
 
 
 def from_camera(camera: Camera, data: Data, bow: bool) -> tuple[Tensor, tuple[Tensor, Tensor], LensModel]:
     """Shared parameters and poses to start from."""
-    model = lens_model(camera.distortion)
+    parameters = Parametrisation.of(camera, bow)
     if None not in (camera.size, data.views.size) and camera.size != data.views.size:
         raise ValueError(
             f"camera: want the size of the photographs, {data.views.size}, got {camera.size}; see resized()"
@@ -28,27 +28,26 @@ def from_camera(camera: Camera, data: Data, bow: bool) -> tuple[Tensor, tuple[Te
     try:
         if posed:
             camera = camera.at(camera.R.expand(*data.batch, len(data.views), 3, 3), camera.t)
-        K = intrinsics.K.expand(*data.batch, 3, 3).reshape(-1, 3, 3)
-        parts = [focal_and_center(K)]
-        if intrinsics.distortion is not None:
-            coefficients: Tensor = intrinsics.distortion.coefficients  # type: ignore[attr-defined]
-            parts.append(coefficients.expand(*data.batch, -1).reshape(len(K), -1))
+        shared = parameters.pack(intrinsics).expand(*data.batch, -1).reshape(-1, parameters.size)
     except (RuntimeError, ValueError):
         shape = tuple(camera.batch_shape)
         raise ValueError(
             f"camera: want a batch shape that broadcasts to {tuple(data.batch)} or is {(*data.batch, len(data.views))} "
             f"with the poses to start from, got {shape}"
         ) from None
-    shared = torch.cat([*parts, K.new_zeros(len(K), 2 * bow)], dim=-1)
     if posed:
-        return shared, (camera.R.reshape(-1, len(data.views), 3, 3), camera.t.reshape(-1, len(data.views), 3)), model
-    upright = torch.eye(3, dtype=K.dtype, device=K.device).expand(*data.used.shape[:2], 3, 3)
-    views = assembled(model, shared, (upright, torch.zeros_like(upright[..., 0])))
+        return (
+            shared,
+            (camera.R.reshape(-1, len(data.views), 3, 3), camera.t.reshape(-1, len(data.views), 3)),
+            parameters.lens,
+        )
+    upright = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(*data.used.shape[:2], 3, 3)
+    views = parameters.unpack(shared, (upright, torch.zeros_like(upright[..., 0])))
     direction, valid = views.directions(data.pixels)
     ahead = valid & (direction[..., 2] > 0.25 * direction.norm(dim=-1))
     xy = direction[..., :2] / torch.where(ahead, direction[..., 2], 1.0).unsqueeze(-1)
     H = closed_form.homographies(data.points, xy, data.used & ahead)
-    return shared, closed_form.poses(H, data.points), model
+    return shared, closed_form.poses(H, data.points), parameters.lens
 
 
 def from_nothing(
@@ -57,7 +56,7 @@ def from_nothing(
     """Shared parameters and poses to start from, with nothing known but the size of the image."""
     with torch.inference_mode():
         middle = data.pixels.new_tensor([(size[0] - 1) / 2, (size[1] - 1) / 2]).expand(len(data.pixels), 2)
-        rest = middle.new_zeros(len(middle), COEFFICIENTS[model] + 2 * bow)
+        rest = middle.new_zeros(len(middle), MODELS[model].count + 2 * bow)
         if model == "fisheye":
             found = _fisheye(data, middle, rest, float(max(size)), bow)
         else:

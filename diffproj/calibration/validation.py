@@ -13,11 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from diffproj.calibration.calibrate import calibrate, locate
-from diffproj.calibration.data import PlanarTarget
-from diffproj.calibration.reprojection import LensModel
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.plane import Plane
+from diffproj.lens.models import LensModel
+from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
 
@@ -52,7 +52,7 @@ class CrossValidation:
 
 
 def cross_validate(
-    views: Views, board: PlanarTarget, distortion: LensModel = "brown5", folds: int = 5, **options: Any
+    views: Views, board: Target, distortion: LensModel = "brown5", folds: int = 5, **options: Any
 ) -> CrossValidation:
     """Refit without each of k parts of the views, and measure on the part that was left out.
 
@@ -100,7 +100,7 @@ def cross_validate(
 
 def bootstrap(
     views: Views,
-    board: PlanarTarget,
+    board: Target,
     distortion: LensModel = "brown5",
     draws: int = 200,
     seed: int = 0,
@@ -147,11 +147,7 @@ def bootstrap(
     kept = found.converged
     if int(kept.sum()) < max(2, draws // 2):
         raise CalibrationError(f"bootstrap: {int(kept.sum())} of {draws} draws determine the camera; add views", found)
-    K, lens = found.camera.K[kept], found.camera.distortion
-    values = [K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]]
-    values += [] if lens is None else list(lens.coefficients[kept].unbind(-1))  # type: ignore[attr-defined]
-    values += [] if found.bow is None else list(found.bow[kept].unbind(-1))
-    return {name: value.std() for name, value in zip(found.covariance.names, values, strict=True)}
+    return dict(zip(found.parameters.names, found.shared[kept].std(0).unbind(), strict=True))
 
 
 def _repeated(views: Views, count: int) -> Views:

@@ -9,13 +9,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from diffproj.calibration.calibrate import calibrate
-from diffproj.calibration.reprojection import LensModel
 from diffproj.calibration.result import Calibration
 from diffproj.cli.inputs import Commands, board_size, camera_file, find_corners, photographs, square_side
 from diffproj.cli.terminal import RESULTS, aligned, progress_bars, result, rounded
 from diffproj.files.save import save_camera
-from diffproj.lens.brown_conrady import BrownConrady
-from diffproj.lens.kannala_brandt import KannalaBrandt
+from diffproj.lens.models import LensModel
 from diffproj.targets.chessboard import Chessboard
 
 DESCRIPTION = """\
@@ -168,11 +166,7 @@ def _views_table(calibration: Calibration) -> Table:
 
 
 def _parameters_table(calibration: Calibration) -> Table:
-    camera, bow = calibration.camera, calibration.bow
-    values = [*camera.K.diagonal()[:2].tolist(), *camera.K[:2, 2].tolist()]
-    if isinstance(camera.distortion, BrownConrady | KannalaBrandt):
-        values += camera.distortion.coefficients.tolist()
-    values += [] if bow is None else bow.tolist()
+    values = calibration.shared.tolist()
     known = calibration.covariance.deviations
     pairs = [rounded(value, float(deviation)) for value, deviation in zip(values, known.values(), strict=True)]
     table = Table(title="Camera", title_justify="left")

@@ -9,10 +9,10 @@ from rich.table import Table
 
 from diffproj import figures
 from diffproj._core.atomic import write_whole
-from diffproj.calibration.reprojection import LensModel
 from diffproj.cli.inputs import Commands, board_size, find_corners, photographs, square_side
 from diffproj.cli.terminal import RESULTS, progress_bars, result
 from diffproj.files.save import save_camera
+from diffproj.lens.models import LensModel
 from diffproj.paper.experiment import Experiment, choose, default_split, parse_split, run_experiment
 from diffproj.paper.setup import paper_setup
 from diffproj.targets import synthetic

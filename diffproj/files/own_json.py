@@ -13,17 +13,13 @@ from torch import Tensor
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera
-from diffproj.lens.brown_conrady import BrownConrady
-from diffproj.lens.kannala_brandt import KannalaBrandt
+from diffproj.lens.models import KINDS, coefficients_of
 from diffproj.targets.views import Views
 
 JSON_FORMAT = "diffproj camera"
 
 
 JSON_VERSION = 1
-
-
-_LENSES = {"BrownConrady": BrownConrady, "KannalaBrandt": KannalaBrandt}
 
 
 def dumps(item: Camera | Calibration) -> str:
@@ -88,8 +84,10 @@ def read_calibration(path: Path) -> Calibration:
 def _document(item: Camera | Calibration) -> dict[str, Any]:
     camera = item.camera if isinstance(item, Calibration) else item
     lens = camera.distortion
-    if not (lens is None or (isinstance(lens, BrownConrady | KannalaBrandt) and type(lens).__name__ in _LENSES)):
-        raise ValueError(f"distortion: want one of {', '.join(_LENSES)}, got {type(lens).__name__}")
+    try:
+        coefficients = coefficients_of(lens, camera.t)
+    except TypeError:
+        raise ValueError(f"distortion: want one of {', '.join(KINDS)}, got {type(lens).__name__}") from None
     document: dict[str, Any] = {
         "format": JSON_FORMAT,
         "version": JSON_VERSION,
@@ -99,9 +97,7 @@ def _document(item: Camera | Calibration) -> dict[str, Any]:
             "K": camera.K.tolist(),
             "R": camera.R.tolist(),
             "t": camera.t.tolist(),
-            "lens": None
-            if lens is None
-            else {"model": type(lens).__name__, "coefficients": lens.coefficients.tolist()},
+            "lens": None if lens is None else {"model": type(lens).__name__, "coefficients": coefficients.tolist()},
         },
     }
     if isinstance(item, Calibration):
@@ -191,7 +187,7 @@ def _camera(path: Path, fields: dict[str, Any]) -> Camera:
         dtype = {"float32": torch.float32, "float64": torch.float64}[fields["dtype"]]
         K, R, t = (_tensor(fields[key], dtype) for key in ("K", "R", "t"))
         lens = fields["lens"]
-        distortion = lens and _LENSES[lens["model"]](_tensor(lens["coefficients"], dtype))
+        distortion = lens and KINDS[lens["model"]](_tensor(lens["coefficients"], dtype))
         return Camera(K, R, t, distortion, _size(fields["size"]))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: the camera in this file is damaged ({error})") from error

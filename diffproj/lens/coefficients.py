@@ -69,6 +69,19 @@ class CoefficientLens(Batched, ABC):
         super().__init_subclass__(**options)
         cls._key = register_recipe(cls, Recipe(cls._find_domain, cls._tabulate))
 
+    @property
+    @abstractmethod
+    def domain(self) -> Tensor:
+        """How far the lens reaches `(*B,)`; see `Lens`."""
+
+    @abstractmethod
+    def project_direction(self, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Directions to distorted points; see `Lens`."""
+
+    @abstractmethod
+    def unproject(self, xy_distorted: Tensor) -> tuple[Tensor, Tensor]:
+        """Distorted points to directions; see `Lens`."""
+
     @staticmethod
     @abstractmethod
     def _find_domain(coefficients: Tensor) -> Tensor:

@@ -31,11 +31,13 @@ class Model:
         name: what users call it.
         kind: the class of its lenses, `None` for a pinhole.
         coefficient_names: in the order of the class.
+        perspective: whether it sees only what is in front of the camera, at z > 0.
     """
 
     name: LensModel
     kind: type[CoefficientLens] | None
     coefficient_names: tuple[str, ...]
+    perspective: bool = True
 
     @property
     def count(self) -> int:
@@ -52,7 +54,7 @@ _BROWN_CONRADY = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s
 _MODELS = (
     Model("none", None, ()),
     *(Model(f"brown{count}", BrownConrady, _BROWN_CONRADY[:count]) for count in BrownConrady.counts),  # type: ignore[arg-type]
-    Model("fisheye", KannalaBrandt, ("k1", "k2", "k3", "k4")),
+    Model("fisheye", KannalaBrandt, ("k1", "k2", "k3", "k4"), perspective=False),
 )
 MODELS: dict[LensModel, Model] = {model.name: model for model in _MODELS}
 KINDS: dict[str, type[CoefficientLens]] = {model.kind.__name__: model.kind for model in _MODELS if model.kind}
@@ -70,7 +72,7 @@ def model_named(name: object) -> Model:
     return MODELS[name]  # type: ignore[index]
 
 
-def model_of(lens: Lens | None) -> Model:
+def model_of(lens: object) -> Model:
     """The model of a camera's lens.
 
     Raises:

@@ -24,13 +24,11 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.numerics import check_tensor, precise
-from diffproj.calibration.board_error import assembled
 from diffproj.calibration.covariance import finite
-from diffproj.calibration.reprojection import COEFFICIENTS, lens_model, moved
+from diffproj.calibration.parametrisation import Parametrisation, moved
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
-from diffproj.geometry.intrinsics import focal_and_center
 from diffproj.geometry.plane import Plane
 
 SIGNIFICANT = 3.0
@@ -308,21 +306,16 @@ def view_number(calibration: Calibration, view: int | str) -> int:
 def _projection_derivatives(points: Tensor, camera: Camera, known: Tensor | None) -> tuple[Tensor, Tensor]:
     """Derivatives of the pixels by theta `(*B, N, 2, s + 6)` (bow excluded: 0) and by the point `(*B, N, 2, 3)`."""
     batch = points.shape[:-2]
-    model = lens_model(camera.distortion)
-    K = camera.K.expand(*batch, 3, 3).reshape(-1, 3, 3)
-    parts = [focal_and_center(K)]
-    if camera.distortion is not None:
-        coefficients: Tensor = camera.distortion.coefficients  # type: ignore[attr-defined]
-        parts.append(coefficients.expand(*batch, coefficients.shape[-1]).reshape(len(K), -1))
-    shared = torch.cat(parts, dim=-1)
+    parameters = Parametrisation.of(camera)
+    s = parameters.size
+    shared = parameters.pack(camera).expand(*batch, s).reshape(-1, s)
     R, t = camera.R.expand(*batch, 3, 3).reshape(-1, 1, 3, 3), camera.t.expand(*batch, 3).reshape(-1, 1, 3)
-    flat = points.reshape(len(K), 1, -1, 3)
-    s = 4 + COEFFICIENTS[model]
+    flat = points.reshape(len(shared), 1, -1, 3)
     bow = 0 if known is None else known.shape[-1] - s - 6
 
     def project(step: Tensor) -> Tensor:
-        pose = moved((R, t), step[s : s + 6].expand(len(K), 1, 6))
-        return assembled(model, shared + step[:s], pose).project(flat + step[s + 6 :])[0].squeeze(1)
+        pose = moved((R, t), step[s : s + 6].expand(len(shared), 1, 6))
+        return parameters.unpack(shared + step[:s], pose).project(flat + step[s + 6 :])[0].squeeze(1)
 
     zero = torch.zeros(s + 9, dtype=points.dtype, device=points.device)
     directions = torch.eye(s + 9, dtype=points.dtype, device=points.device)

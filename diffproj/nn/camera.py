@@ -18,8 +18,9 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from diffproj.geometry.camera import Camera, as_camera
-from diffproj.lens.brown_conrady import BrownConrady
-from diffproj.lens.kannala_brandt import KannalaBrandt
+from diffproj.geometry.cayley import turned
+from diffproj.lens.coefficients import CoefficientLens
+from diffproj.lens.models import coefficients_of
 from diffproj.nn.partial import PARTS, GeometryModule, Learn, learned, learned_parts, own
 
 _PARAMETERS = {
@@ -72,13 +73,13 @@ class LearnableCamera(GeometryModule):
         super().__init__()
         camera = as_camera(camera).detach()
         lens = camera.distortion
-        if lens is not None and not isinstance(lens, BrownConrady | KannalaBrandt):
+        if lens is not None and not isinstance(lens, CoefficientLens):
             raise TypeError(f"camera: want a lens of diffproj, got {type(lens).__name__}")
         available = [part for part in PARTS if lens is not None or part != "distortion"]
         chosen = learned_parts(available if learn is None else learn, available)
         self.learn, self.size, self.batch_shape = tuple(chosen), camera.size, camera.batch_shape
         self._lens = None if lens is None else type(lens)
-        coefficients = camera.K[..., 0, :0] if lens is None else lens.expand(*self.batch_shape).coefficients
+        coefficients = coefficients_of(lens, camera.t).expand(*self.batch_shape, -1)
         tied = _tied_axes(camera.K, coefficients, tied_intrinsics)
         K, coefficients = (_first_along(tied, part) for part in (camera.K, coefficients))
         focal = K[..., 0, :2]
@@ -110,11 +111,7 @@ class LearnableCamera(GeometryModule):
         shift = (self.K_0[..., :2] * learned(self, "principal_point").unsqueeze(-2)).sum(-1, keepdim=True)
         K = self.K_0 * scale.unsqueeze(-2) + nn.functional.pad(shift, (2, 0))
         K = K.expand(*self.batch_shape, 3, 3)
-        # Crosswise and elementwise: under autocast a matrix product would round the pose to 8 bits.
-        half = learned(self, "rotation").unsqueeze(-1) / 2
-        across = torch.linalg.cross(half, self.R_0, dim=-2)
-        across = across + torch.linalg.cross(half, across, dim=-2)
-        R = self.R_0 + across * (2 / (1 + half.square().sum(-2, keepdim=True)))
+        R = turned(self.R_0, learned(self, "rotation"))
         t = self.t_0 + self.reach * learned(self, "translation")
         lens = None
         if self._lens is not None:

@@ -7,9 +7,9 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor, nn
 
 from diffproj._core.numerics import precise
+from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera, as_camera
-from diffproj.geometry.intrinsics import focal_and_center
 
 
 class CalibrationPrior(nn.Module):
@@ -63,9 +63,7 @@ class CalibrationPrior(nn.Module):
         return (off * (self.precision * off.unsqueeze(-2)).sum(-1)).sum(-1) / 2
 
     def _vector(self, camera: Camera) -> Tensor:
-        parts = [focal_and_center(precise(camera.K))]
-        if camera.distortion is not None:
-            parts.append(precise(camera.distortion.coefficients))  # type: ignore[attr-defined]
+        parts = [precise(Parametrisation.of(camera).pack(camera))]
         if self.posed:
             turned = (precise(camera.R).unsqueeze(-3) * self.R_0.unsqueeze(-2)).sum(-1).mT  # R R_0^T
             omega = rotation_matrix_to_axis_angle(turned.reshape(-1, 3, 3)).reshape(*turned.shape[:-2], 3)

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj.calibration.calibrate import calibrate, locate
-from diffproj.calibration.reprojection import LensModel
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.plane import Plane
+from diffproj.lens.models import LensModel
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.views import Views
 

@@ -1,7 +1,5 @@
 """What a camera leaves over of the views of a target: on the image, or on the plane."""
 
-from typing import Protocol, runtime_checkable
-
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
@@ -10,21 +8,12 @@ from torch import Tensor
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
+from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
 
-@runtime_checkable
-class HasPoints(Protocol):
-    """Anything with world points, such as `Chessboard`."""
-
-    @property
-    def points(self) -> Float[Tensor, "n 3"]:
-        """World points `(N, 3)`."""
-        ...
-
-
 def image_residuals(
-    camera: Camera | PinholeCamera, views: Views, board: HasPoints
+    camera: Camera | PinholeCamera, views: Views, board: Target
 ) -> tuple[Float[Tensor, "*batch v n 2"], Bool[Tensor, "*batch v n"]]:
     """Projected minus seen corners in pixels, with gradients to camera, corners and board points.
 
@@ -50,7 +39,7 @@ def image_residuals(
 
 
 def plane_residuals(
-    camera: Camera | PinholeCamera, views: Views, board: HasPoints
+    camera: Camera | PinholeCamera, views: Views, board: Target
 ) -> tuple[Float[Tensor, "*batch v n 3"], Bool[Tensor, "*batch v n"]]:
     """Corners put back on the board's plane z = 0, minus where the board has them, in world units.
 
@@ -85,5 +74,5 @@ def _posed(camera: Camera | PinholeCamera, views: Views) -> Camera:
     return camera
 
 
-def _points(board: HasPoints, camera: Camera) -> Tensor:
+def _points(board: Target, camera: Camera) -> Tensor:
     return board.points.to(camera.K)

@@ -10,7 +10,7 @@ import torch
 
 import diffproj as dp
 from diffproj import synthetic
-from diffproj.calibration.reprojection import LensModel
+from diffproj.lens.models import LensModel
 
 D = torch.float64
 FLAGS = {

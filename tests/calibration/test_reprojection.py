@@ -5,17 +5,11 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 import diffproj as dp
-from diffproj.calibration.board_error import BoardError, assembled
-from diffproj.calibration.reprojection import (
-    COEFFICIENTS,
-    LensModel,
-    Reprojection,
-    bow_shape,
-    lens_model,
-    make_lens,
-    moved,
-    shared_names,
-)
+from diffproj.calibration.board_error import BoardError
+from diffproj.calibration.bow import bow_shape
+from diffproj.calibration.parametrisation import Parametrisation, moved
+from diffproj.calibration.reprojection import Reprojection
+from diffproj.lens.models import MODELS, LensModel, model_of
 
 D = torch.float64
 P, V = 2, 3
@@ -25,7 +19,7 @@ def situation(lens: LensModel, bow: bool) -> tuple[dp.Chessboard, torch.Tensor, 
     """Shared parameters, board and poses at random; every coefficient differs from 0."""
     board = dp.Chessboard(columns=5, rows=4, square=40.0)
     intrinsics = torch.tensor([500.0, 510, 320, 240], dtype=D) + torch.randn(P, 4, dtype=D)
-    coefficients = 0.02 * torch.randn(P, COEFFICIENTS[lens], dtype=D) + 0.01
+    coefficients = 0.02 * torch.randn(P, MODELS[lens].count, dtype=D) + 0.01
     shared = torch.cat([intrinsics, coefficients, 3 * torch.randn(P, 2 * bow, dtype=D)], dim=-1)
     R = axis_angle_to_rotation_matrix(0.3 * torch.randn(P * V, 3, dtype=D)).reshape(P, V, 3, 3)
     t = 20 * torch.randn(P, V, 3, dtype=D) + torch.tensor([-80.0, -60, 500], dtype=D)
@@ -42,7 +36,7 @@ def residual(
     local: tuple[torch.Tensor, ...],
 ) -> torch.Tensor:
     """`(P, V, 2, N)` through the public camera and the public back-projection."""
-    cameras = assembled(lens, shared, local)
+    cameras = Parametrisation(lens, bow).unpack(shared, local)
     points = board.points.expand(P, 1, -1, 3)
     if bow:
         z = (shared[:, None, -2:, None] * bow_shape(board.points)).sum(2)
@@ -56,21 +50,21 @@ def residual(
     return (projected - pixels).mT
 
 
-LONG = [pytest.param(name, marks=pytest.mark.slow) if name in ("brown8", "brown12") else name for name in COEFFICIENTS]
+LONG = [pytest.param(name, marks=pytest.mark.slow) if name in ("brown8", "brown12") else name for name in MODELS]
 
 
 @pytest.mark.parametrize("lens", LONG)
 @pytest.mark.parametrize(("kind", "bow"), [(Reprojection, False), (Reprojection, True), (BoardError, False)])
 def test_jacobians_are_autograds(kind: type[Reprojection], lens: LensModel, bow: bool) -> None:
     board, shared, local = situation(lens, bow)
-    cameras = assembled(lens, shared, local)
+    cameras = Parametrisation(lens, bow).unpack(shared, local)
     pixels = cameras.project(board.points)[0] + torch.randn(P, V, len(board), 2, dtype=D)
     problem = kind(board.points, pixels, torch.ones(pixels.shape[:-1], dtype=torch.bool), lens, bow)
     panel = problem.linearise(shared, local).clone()
     torch.testing.assert_close(
         panel[:, :, -1], residual(kind, board, pixels, lens, bow, shared, local), rtol=0, atol=1e-10
     )
-    s = len(shared_names(lens, bow))
+    s = Parametrisation(lens, bow).size
     # Each direction at once, for every camera and view: a step along it moves all of them.
     zero = torch.zeros(P, V, 6, dtype=D)
     for row in range(s + 6):
@@ -118,7 +112,7 @@ def test_fisheye_on_the_axis_and_sideways() -> None:
     assert panel.isfinite().all()
 
     def project(tau: torch.Tensor) -> torch.Tensor:
-        return assembled("fisheye", shared, (R, t + tau)).project(points)[0].mT
+        return Parametrisation("fisheye").unpack(shared, (R, t + tau)).project(points)[0].mT
 
     want = torch.func.jacfwd(project)(torch.zeros(1, 1, 3, dtype=D))[0, 0, :, :, 0, 0].permute(2, 0, 1)
     torch.testing.assert_close(panel[0, 0, -4:-1], want, rtol=1e-12, atol=1e-12)
@@ -138,7 +132,24 @@ def test_moved_is_the_exponential_to_second_order() -> None:
 
 
 def test_lens_models_by_name() -> None:
-    for name, count in COEFFICIENTS.items():
-        assert lens_model(make_lens(name, torch.zeros(count, dtype=D))) == name
+    for name, model in MODELS.items():
+        assert model_of(model.lens(torch.zeros(model.count, dtype=D))) is model
+        assert model.name == name
     with pytest.raises(TypeError, match="camera: want a pinhole"):
-        lens_model("brown5")
+        model_of("brown5")
+
+
+@pytest.mark.parametrize("bow", [False, True])
+@pytest.mark.parametrize("lens", MODELS)
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_parameters_go_into_a_vector_and_back(lens: LensModel, bow: bool, batch: tuple[int, ...]) -> None:
+    parameters = Parametrisation(lens, bow)
+    shared = torch.randn(*batch, parameters.size, dtype=D)
+    R, t = torch.eye(3, dtype=D).expand(*batch, 4, 3, 3), torch.randn(*batch, 4, 3, dtype=D)
+    camera = parameters.unpack(shared, (R, t))
+    assert camera.batch_shape == (*batch, 4)
+    assert torch.equal(camera.t, t)
+    again = parameters.pack(camera[..., 0], shared[..., -2:] if bow else None)
+    assert torch.equal(again, shared)
+    assert len(parameters.names) == parameters.size
+    assert Parametrisation.of(camera, bow) == parameters
