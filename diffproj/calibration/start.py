@@ -8,7 +8,7 @@ from torch import Tensor
 from diffproj.calibration import closed_form
 from diffproj.calibration.board_error import assembled
 from diffproj.calibration.data import Data
-from diffproj.calibration.fit import ordinary
+from diffproj.calibration.fit import normal_tensors
 from diffproj.calibration.reprojection import COEFFICIENTS, LensModel, lens_model
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.intrinsics import check_no_skew, focal_and_center
@@ -62,7 +62,7 @@ def from_nothing(
             found = _fisheye(data, middle, rest, float(max(size)), bow)
         else:
             found = _perspective(data, middle, rest, size, tied, model != "none")
-    return ordinary(found)
+    return normal_tensors(found)
 
 
 def _perspective(
