@@ -27,7 +27,7 @@ BISECTIONS = 24
 MIN_STEP_FRACTION = 1e-9
 """Fraction of the Newton step below which the line search stops: rounding prevents any decrease."""
 TOLERANCE = {torch.float32: 1.0, torch.float64: 2.0}
-"""Residual of a solution, in units of the equations' rounding error."""
+"""Largest residual of a solution, in units of the equations' rounding error."""
 TILT_FACTOR = 0.5
 """Factor of this tolerance for lenses with tilt, which amplifies errors."""
 FINAL_TOLERANCE = 4

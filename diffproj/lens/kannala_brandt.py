@@ -38,7 +38,7 @@ MAX_STEPS = 60
 GRID_ANGLES = 512
 """Angles of the coarse grid on which the end of the domain is searched."""
 TOLERANCE = 16
-"""Residual of a solution, in units of the equation's rounding error."""
+"""Largest residual of a solution, in units of the equation's rounding error."""
 
 
 class KannalaBrandt(CoefficientLens):
