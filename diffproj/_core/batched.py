@@ -15,7 +15,7 @@ import torch
 import torch.utils._pytree as torch_pytree
 from torch import Tensor
 
-from diffproj._core.numerics import converted, lifted
+from diffproj._core.numerics import at_least_float32, converted
 
 T = TypeVar("T")
 B = TypeVar("B", bound="Batched")
@@ -81,7 +81,7 @@ class Batched:
         def convert(tensor: Tensor, _: int) -> Tensor:
             if not tensor.is_floating_point():  # a mask moves, and stays a mask
                 return converted(tensor, self._rehearsed(*args, **kwargs).device)
-            return lifted(converted(tensor, *args, **kwargs))
+            return at_least_float32(converted(tensor, *args, **kwargs))
 
         wanted = self._rehearsed(*args, **kwargs)
         if not wanted.is_floating_point():

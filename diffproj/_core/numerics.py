@@ -7,7 +7,7 @@ Three rules live here because they are easy to break one call at a time:
   off by a pixel or more. `linear` multiplies and adds elementwise instead, which no such switch reaches, and which is
   faster for matrices this small.
 * **Values are read only where somebody can read them.** Inside `torch.compile`, `vmap` or on the meta device a tensor
-  has a shape but no values; `readable` tells, and checks on values are skipped there.
+  has a shape but no values; `has_values` tells, and checks on values are skipped there.
 * **Work in blocks changes no result.** `in_blocks` cuts long inputs only when no derivative of any kind is asked.
 """
 
@@ -38,7 +38,7 @@ class Kind(Protocol):
 # ----------------------------------------------------------------------------------------------- argument checks
 
 
-def lifted(tensor: Tensor) -> Tensor:
+def at_least_float32(tensor: Tensor) -> Tensor:
     """Half and bfloat16 as float32, everything else as it is: bfloat16 has steps of 2 px at 500 px."""
     return tensor.float() if tensor.dtype in (torch.float16, torch.bfloat16) else tensor
 
@@ -70,7 +70,7 @@ def check_tensor(name: str, value: object, *shape: int | str) -> Tensor:
     if not fits:
         want = ", ".join(["*B", *map(str, shape)])
         raise ValueError(f"{name}: want shape ({want}), got {tuple(value.shape)}")
-    return lifted(value)
+    return at_least_float32(value)
 
 
 def check_same_kind(**tensors: Kind | None) -> None:
@@ -105,7 +105,7 @@ def broadcast_batches(**shapes: Sequence[int]) -> torch.Size:
         raise ValueError(f"batch shapes do not broadcast: {listed}") from None
 
 
-def readable(*tensors: Tensor) -> bool:
+def has_values(*tensors: Tensor) -> bool:
     """Whether the values of these tensors can be read here: not while compiling, exporting or under `vmap`."""
     tracing = torch.compiler.is_compiling() or in_functional_transform()
     return not (tracing or any(tensor.is_meta for tensor in tensors))
@@ -172,7 +172,7 @@ def transform(matrix: Tensor, vectors: Tensor) -> Tensor:
     return torch.stack(linear(entries(matrix), vectors.unbind(-1)), dim=-1)
 
 
-def precise(tensor: Tensor) -> Tensor:
+def in_float64(tensor: Tensor) -> Tensor:
     """The tensor in float64 where its device has that type, for sums that are built once and used a million times."""
     return tensor if tensor.device.type == "mps" else tensor.double()
 

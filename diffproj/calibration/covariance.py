@@ -1,22 +1,22 @@
-"""The covariance of a calibration: of intrinsics, lens and every pose together, kept in blocks.
+"""The joint covariance of a calibration, of intrinsics, lens and all poses, stored in blocks.
 
-Let the normal equations at the minimum have the blocks `U, E_v, W_v` (see `solver.py`), and let the scores, the
-gradients of the residuals' cost, have covariances `M`. By first order of the minimiser
+Let `U, E_v, W_v` be the blocks of the normal equations at the minimum (see `solver.py`), and `M` the covariance of the
+scores, the gradients of the residuals' cost. To first order, the errors of the parameters are
 
     dx   = -S^-1 sum u_v              u_v = g_v - F_v h_v     F_v = E_v W_v^-1     S = U - sum E_v W_v^-1 E_v^T
     dz_v = -W_v^-1 h_v - F_v^T dx
 
-so that only a few small blocks for each view are needed for any entry of the whole covariance, which for a thousand
-views would have 36 million. Two forms:
+so that a few small blocks per view give any entry of the full covariance, which for a thousand views would have 36
+million. Two forms:
 
-* least squares with equal weights: `M = sigma^2` times the normal equations themselves, sigma^2 the residual variance
-  `sum |e|^2 / (2 n - parameters)`;
-* with weights, a robust loss or the plane objective: the sandwich form, M from the residuals themselves (White 1980),
-  and the second derivative of the loss in the normal equations (Huber 1981).
+* least squares with equal weights: M is `sigma^2` times the normal matrix, with the residual variance
+  `sigma^2 = sum |e|^2 / (2 n - parameters)`;
+* with weights, a robust loss or the plane objective: the sandwich (robust) covariance, with M estimated from the
+  residuals (White 1980) and the second derivative of the loss in the normal matrix (Huber 1981).
 
-A prior counts as a measurement whose variance is what it says.
+A prior counts as a measurement with the prior's covariance.
 
-A parameter that the corners do not determine has an infinite variance, and covariance 0 with all others.
+A parameter that the corners do not determine has infinite variance, and covariance 0 with all others.
 """
 
 from collections.abc import Sequence
@@ -29,20 +29,20 @@ from torch import Tensor
 from diffproj.calibration.solver import Equations
 
 SINGULAR = 2e-15
-"""Eigenvalue of the reduced equations, relative to the unreduced ones, at and below which it is rounding."""
+"""Eigenvalue of S, scaled by the diagonal of U, at and below which it is rounding error."""
 
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariance of shared parameters and poses, for batch shape `*B`.
+    """Joint covariance of shared parameters and poses, for batch shape `*B`.
 
     A pose is perturbed by `R <- exp(omega) R`, `t <- t + tau`: its six coordinates are omega in radians (about the
     camera's axes) and tau in world units.
 
     Attributes:
-        names: of the s shared parameters: `f_x f_y c_x c_y`, the lens's, the bow's.
+        names: of the s shared parameters: `f_x f_y c_x c_y`, then those of the lens and of the bow.
         shared: their covariance `(*B, s, s)`; rows of fixed parameters are 0.
-        undetermined: which of them the corners do not determine `(*B, s)`.
+        undetermined: which shared parameters the corners do not determine `(*B, s)`.
         undetermined_views: which poses they do not determine `(*B, V)`.
     """
 
@@ -50,7 +50,7 @@ class Covariance:
     shared: Float[Tensor, "*batch s s"]
     undetermined: Bool[Tensor, "*batch s"]
     undetermined_views: Bool[Tensor, "*batch v"]
-    _follow: Tensor  # F_v^T in shared coordinates (*B, V, 6, s): how the pose follows the shared parameters
+    _follow: Tensor  # F_v^T (*B, V, 6, s): minus the derivative of the pose by the shared parameters
     _mixed: Tensor  # Cov(W_v^-1 h_v, dx), (*B, V, 6, s)
     _alone: Tensor  # Cov(W_v^-1 h_v), (*B, V, 6, 6)
 
@@ -61,10 +61,10 @@ class Covariance:
         return dict(zip(self.names, spread.unbind(-1), strict=True))
 
     def between(self, view: int, other: int) -> Float[Tensor, "*batch 6 6"]:
-        """The covariance of two poses, or of one."""
+        """The cross-covariance of the poses of two views; the covariance of the pose where they are the same."""
         F, G = self._follow[..., view, :, :], self._follow[..., other, :, :]
         Q, P = self._mixed[..., view, :, :], self._mixed[..., other, :, :]
-        blocks = F @ finite(self.shared) @ G.mT - Q @ G.mT - F @ P.mT
+        blocks = F @ zero_where_infinite(self.shared) @ G.mT - Q @ G.mT - F @ P.mT
         same = view % self._alone.shape[-3] == other % self._alone.shape[-3]
         if same:
             blocks = blocks + self._alone[..., view, :, :]
@@ -73,8 +73,8 @@ class Covariance:
         return torch.where(unknown, infinite if same else torch.zeros_like(blocks), blocks)
 
     def cross(self, view: int) -> Float[Tensor, "*batch 6 s"]:
-        """The covariance of a pose (rows) with the shared parameters (columns)."""
-        cross = self._mixed[..., view, :, :] - self._follow[..., view, :, :] @ finite(self.shared)
+        """The cross-covariance of a pose (rows) and the shared parameters (columns)."""
+        cross = self._mixed[..., view, :, :] - self._follow[..., view, :, :] @ zero_where_infinite(self.shared)
         return torch.where(self.undetermined_views[..., view, None, None], 0.0, cross)
 
     def view(self, view: int) -> Float[Tensor, "*batch sp sp"]:
@@ -83,9 +83,9 @@ class Covariance:
         return torch.cat([torch.cat([self.shared, cross.mT], dim=-1), torch.cat([cross, pose], dim=-1)], dim=-2)
 
     def following(self, known: "Covariance") -> "Covariance":
-        """The covariance of these poses and of shared parameters that another calibration, `known`, found.
+        """The covariance of these poses together with shared parameters from another calibration, `known`.
 
-        The noise of both is independent; a bow of the other's board is left behind.
+        The noise of both is assumed independent; the bow of the other calibration's board is dropped.
         """
         s = self.shared.shape[-1]
         shared, undetermined = known.shared[..., :s, :s], known.undetermined[..., :s]
@@ -94,31 +94,31 @@ class Covariance:
         return replace(self, shared=shared, undetermined=undetermined)
 
     def full(self) -> Float[Tensor, "*batch all all"]:
-        """The whole covariance `(*B, s + 6 V, s + 6 V)`: shared parameters, then the poses in order.
+        """The full covariance `(*B, s + 6 V, s + 6 V)`: shared parameters, then the poses in order.
 
-        Infinite variances stand on the diagonal only. Its size grows with the square of the number of views.
+        Infinite variances are on the diagonal only. Memory is quadratic in the number of views.
         """
         V = self._alone.shape[-3]
         F, Q = self._follow.flatten(-3, -2), self._mixed.flatten(-3, -2)
         known = self.undetermined_views.repeat_interleave(6, dim=-1).logical_not().to(F.dtype)
-        poses = F @ finite(self.shared) @ F.mT - Q @ F.mT - F @ Q.mT
+        poses = F @ zero_where_infinite(self.shared) @ F.mT - Q @ F.mT - F @ Q.mT
         poses = poses + torch.stack(
             [torch.nn.functional.pad(self._alone[..., v, :, :], (6 * v, 6 * (V - 1 - v))) for v in range(V)], dim=-3
         ).flatten(-3, -2)
-        cross = (Q - F @ finite(self.shared)) * known.unsqueeze(-1)
+        cross = (Q - F @ zero_where_infinite(self.shared)) * known.unsqueeze(-1)
         poses = poses * known.unsqueeze(-1) * known.unsqueeze(-2)
         poses = poses + torch.diag_embed(torch.where(known > 0, 0.0, torch.inf))
         return torch.cat([torch.cat([self.shared, cross.mT], dim=-1), torch.cat([cross, poses], dim=-1)], dim=-2)
 
 
-def finite(covariance: Tensor) -> Tensor:
+def zero_where_infinite(covariance: Tensor) -> Tensor:
     """The same with 0 where it is infinite."""
     return torch.where(covariance.isinf(), 0.0, covariance)
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """The covariance of the scores, view by view: shared with shared `(P, V, s, s)`, with local, local with local."""
+    """Covariance of the scores per view: shared-shared `(P, V, s, s)`, shared-local, local-local."""
 
     U: Tensor
     E: Tensor
@@ -137,12 +137,12 @@ def covariance(
     """The covariance of P calibrations, from their normal equations.
 
     Args:
-        equations: undamped, at the minimum, the prior's precision included in U.
+        equations: undamped, at the minimum, with the prior's precision included in U.
         names: of the s shared parameters.
-        variance: of a residual's component, `(P,)`; not used with `scores`.
-        basis: along which the shared parameters move `(P, s, q)`.
+        variance: of a residual component, `(P,)`; not used with `scores`.
+        basis: of the free directions of the shared parameters `(P, s, q)`; all if left out.
         precision: the prior's `(P, s, s)`.
-        scores: for the sandwich form.
+        scores: covariance of the scores, for the sandwich form.
     """
     U, E, W = equations.U, equations.E, equations.W
     if basis is not None:
@@ -169,7 +169,7 @@ def covariance(
     shared = inverse_S @ middle @ inverse_S
     follow = F.mT
     if basis is not None:
-        # How the poses follow all shared parameters, those held included, for whoever knows an error of theirs.
+        # Sensitivity to all shared parameters, fixed ones included, to propagate their known errors (`following`).
         follow = inverse_W @ equations.E.mT
         shared, mixed = basis @ shared @ basis.mT, mixed @ basis.mT.unsqueeze(1)
         unknown = (basis.abs() @ unknown.to(basis).unsqueeze(-1)).squeeze(-1) > 0
@@ -189,7 +189,7 @@ def reshaped(covariance: Covariance, batch: Sequence[int]) -> Covariance:
 
 
 def _inverse(S: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverse `(P, q, q)` where there is one, and which unknowns have none `(P, q)`; `size` scales the axes."""
+    """The (pseudo-)inverse `(P, q, q)`, and which unknowns are undetermined `(P, q)`; `size` scales the unknowns."""
     sound = S.isfinite().all(-1).all(-1)
     S = torch.where(sound[:, None, None], S, torch.eye(S.shape[-1], dtype=S.dtype, device=S.device))
     scale = torch.where((size > 0) & size.isfinite(), size, 1.0).rsqrt()
@@ -203,12 +203,12 @@ def _inverse(S: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _local_inverse(W: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverses of the poses' blocks `(P, V, 6, 6)`, 0 where there is none, and where that is."""
+    """The inverses of the poses' blocks `(P, V, 6, 6)`, 0 for a singular block, and which blocks are singular."""
     size = W.diagonal(dim1=-2, dim2=-1)
     scale = torch.where((size > 0) & size.isfinite(), size, 1.0).rsqrt()
     scaled = W * scale.unsqueeze(-1) * scale.unsqueeze(-2)
     L, failed = torch.linalg.cholesky_ex(torch.where(scaled.isfinite(), scaled, 0.0))
-    # A pivot is what is left of a unit diagonal: one that is rounding says that the pose is not determined.
+    # With a unit diagonal, a pivot of the size of rounding errors means that the pose is not determined.
     unknown = (failed > 0) | (L.diagonal(dim1=-2, dim2=-1).square() <= 1e-13).any(-1)
     identity = torch.eye(W.shape[-1], dtype=W.dtype, device=W.device)
     L = torch.where(unknown[..., None, None], identity, L)

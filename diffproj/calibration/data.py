@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._core.numerics import precise
+from diffproj._core.numerics import in_float64
 from diffproj.calibration.fit import Task
 from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target
@@ -37,8 +37,8 @@ class Data:
         if not isinstance(board, Target):
             raise TypeError(f"board: want dp.Chessboard or anything with .points (N, 3), got {type(board).__name__}")
         self.views, self.board, self.batch = views, board, views.batch_shape
-        self.given_points = precise(board.points.to(views.device))
-        self.given_pixels = precise(views.pixels)
+        self.given_points = in_float64(board.points.to(views.device))
+        self.given_pixels = in_float64(views.pixels)
         points = self.given_points.detach()
         count = views.pixels.shape[-2]
         if points.shape != (count, 3):
@@ -54,7 +54,7 @@ class Data:
         if weights is not None:
             given = torch.as_tensor(weights).to(views.device)
             try:
-                given = precise(given).expand(visible.shape)
+                given = in_float64(given).expand(visible.shape)
             except RuntimeError:
                 want, got = tuple(visible.shape), tuple(given.shape)
                 raise ValueError(f"weights: want a shape that broadcasts to {want}, got {got}") from None

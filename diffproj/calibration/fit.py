@@ -1,7 +1,7 @@
-"""From a start to a calibration: solve, reject outliers, solve again, and say how it ended.
+"""From initial estimates to a fit: solve, reject outliers, solve again; and the covariance of the result.
 
-Everything here works on P cameras side by side, batch axes flattened. `Task` holds what is to be minimised; `fit` runs
-the solver over it in blocks of cameras.
+Everything here works on a batch of P cameras, with batch axes flattened. `Task` defines the minimisation problem;
+`fit` runs the solver over it in blocks of cameras.
 """
 
 from collections.abc import Callable
@@ -23,31 +23,31 @@ from diffproj.calibration.solver import Equations, Prior, Solution, chosen, solv
 from diffproj.lens.models import LensModel
 
 BLOCK_CORNERS = 24_000
-"""Corners solved at once on a CPU, those of some thirty cameras of 13 views: enough to hide the cost of calls, and few
-enough that a camera that takes long holds up few others."""
-ROUNDS = 10
-"""Of rejecting outliers, at most."""
+"""Corners per block on a CPU, about thirty cameras of 13 views: enough to hide call overhead, and few enough that a
+slowly converging camera delays few others."""
+MAX_REJECTION_ROUNDS = 10
+"""Maximum number of rounds of outlier rejection."""
 NEGLIGIBLE_PX = 1e-11
-"""Residuals of this size are rounding of pixel coordinates."""
+"""Size of residuals, in pixels, that is rounding error of pixel coordinates."""
 
 Progress = Callable[[int, int], Any]
-"""Called with how many steps were done and how many there are at most."""
+"""Called with the number of steps done and their maximum."""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is minimised, for P cameras of V views with N corners.
+    """A minimisation problem: P cameras of V views with N corners.
 
     Attributes:
         points: the board's points `(N, 3)`.
         pixels: `(P, V, N, 2)`.
-        used: `(P, V, N)`.
+        used: which corners count `(P, V, N)`.
         lens, bow: the model.
-        objective: on the image or on the board.
-        weights: `(P, V, N)`, or `None` for 1 everywhere.
+        objective: residuals on the image or on the board.
+        weights: of the corners `(P, V, N)`, or `None` for 1.
         loss: a robust loss, or `None` for least squares.
         prior: on the shared parameters.
-        basis: along which they move.
+        basis: of the shared parameters' free directions `(P, s, q)`, or `None` for all.
     """
 
     points: Tensor
@@ -68,7 +68,7 @@ class Task:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the shared parameters."""
+        """Names of the shared parameters."""
         return self.parameters.names
 
     @property
@@ -78,7 +78,7 @@ class Task:
         return kind(self.points, self.pixels, self.used, self.lens, self.bow)
 
     def part(self, where: slice) -> "Task":
-        """Some of the cameras."""
+        """The task for a slice of the cameras."""
         cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}
         cut |= {name: None if (whole := getattr(self, name)) is None else whole[where] for name in ("weights", "basis")}
         prior = None if self.prior is None else Prior(*(part[where] for part in self.prior))
@@ -87,10 +87,10 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Where P cameras ended.
+    """The fit of P cameras.
 
     Attributes:
-        task: what was minimised, with the corners that were used in the end.
+        task: the problem, with the corners used in the last round.
         solution: the solver's.
         rejected: outliers `(P, V, N)`.
     """
@@ -100,7 +100,7 @@ class Fit:
     rejected: Tensor
 
     def residual_variance(self) -> Tensor:
-        """`sum |e|^2 / (2 n - parameters)` of the least-squares problem, `(P,)`; NaN where nothing is left over."""
+        """`sum |e|^2 / (2 n - parameters)` of least squares, `(P,)`; NaN without positive degrees of freedom."""
         cost = self.solution.cost
         if self.task.prior is not None:
             off = self.solution.shared.detach() - self.task.prior.mean
@@ -109,7 +109,7 @@ class Fit:
         return torch.where(spare > 0, 2 * cost / spare, torch.nan)
 
     def pixel_sigma(self) -> Tensor:
-        """The noise of a corner's coordinate in pixels, as the residuals on the image tell it `(P,)`."""
+        """Standard deviation of a corner coordinate in pixels, estimated from the reprojection errors, `(P,)`."""
         if self.task.objective == "image" and self.task.loss is None and self.task.weights is None:
             return self.residual_variance().detach().sqrt()
         task, local = self.task, tuple(z.detach() for z in self.solution.local)
@@ -120,13 +120,13 @@ class Fit:
         return torch.where(spare > 0, image.square().sum((1, 2, 3)) / spare, torch.nan).sqrt()
 
     def degrees_of_freedom(self) -> Tensor:
-        """Residuals less parameters `(P,)`."""
+        """Number of residual components minus number of free parameters, `(P,)`."""
         used = self.task.used
         shared = self.task.names if self.task.basis is None else range(self.task.basis.shape[-1])
         return 2 * used.sum((-2, -1)) - len(shared) - POSE * used.any(-1).sum(-1)
 
     def plain_covariance(self) -> Covariance:
-        """As if all corners weighed the same."""
+        """The covariance for least squares with equal weights."""
         prior = self.task.prior
         return covariances.covariance(
             self.solution.equations,
@@ -137,21 +137,21 @@ class Fit:
         )
 
     def covariance(self) -> Covariance:
-        """The form that fits the task: see `diffproj.calibration.covariance`."""
+        """The covariance, in the sandwich form where the task needs it: see `diffproj.calibration.covariance`."""
         task = self.task
         if task.weights is None and task.loss is None and task.objective == "image":
             return self.plain_covariance()
         shared, local = self.solution.shared.detach(), tuple(z.detach() for z in self.solution.local)
         panel = task.problem.linearise(shared, local)
         rows, residual = panel[:, :, :-1], panel[:, :, -1]
-        score = (rows * residual.unsqueeze(2)).sum(3)  # (P, V, s + 6, N): of each corner, without its weight
+        score = (rows * residual.unsqueeze(2)).sum(3)  # (P, V, s + 6, N): per corner, unweighted
         squared = residual.square().sum(2)
         weight = torch.ones_like(squared) if task.weights is None else task.weights
         slope, bend = _derivatives(task.loss, squared)
         flat = rows.flatten(-2)
         both = (weight * slope).unsqueeze(2)
         H = (flat * both.repeat(1, 1, 1, 2)) @ flat.mT + (score * (2 * weight * bend).unsqueeze(2)) @ score.mT
-        kept = self._kept_by_fitting(weight, slope, bend, squared)[:, None, None, None]
+        kept = self._finite_sample_factor(weight, slope, bend, squared)[:, None, None, None]
         M = (score * both.square()) @ score.mT / kept
         s = len(task.names)
         U = H[..., :s, :s].sum(1)
@@ -170,15 +170,16 @@ class Fit:
             scores=Scores(M[..., :s, :s], M[..., :s, s:], M[..., s:, s:]),
         )
 
-    def _kept_by_fitting(self, weight: Tensor, slope: Tensor, bend: Tensor, squared: Tensor) -> Tensor:
-        """The part of the scores' size that is left after fitting `(P,)`.
+    def _finite_sample_factor(self, weight: Tensor, slope: Tensor, bend: Tensor, squared: Tensor) -> Tensor:
+        """Finite-sample correction of the sandwich covariance: how much fitting shrinks squared scores, `(P,)`.
 
-        A fit takes `h psi(e) / mean A` off a residual of leverage h, with psi the score and A its derivative; to first
-        order in h, the number of parameters over that of residuals, what is left of `psi^2` on the average is
+        Fitting reduces a residual of leverage h by `h psi(e) / mean A`, with psi the score and A its derivative. To
+        first order in the mean leverage h (parameters over residual components), mean `psi^2` is reduced by the factor
 
             1 - h (2 mean(psi A psi) / (mean(psi^2) mean A) - mean(A^2) / (mean A)^2)
 
-        which is 1 - h for least squares, and more where outliers have a bounded score that no fit reduces.
+        which is 1 - h for least squares, and closer to 1 with outliers, whose bounded score hardly changes. The factor
+        is at least 0.1.
         """
         used = self.task.used.to(squared)
         n = used.sum((-2, -1))
@@ -205,13 +206,14 @@ def fit(
     tolerance: float = 3e-14,
     progress: Progress | None = None,
 ) -> Fit:
-    """Minimise; with `reject`, leave out corners whose residual exceeds so many robust deviations, and repeat.
+    """Minimise; with `reject`, leave out corners whose residual exceeds that many robust std, and repeat.
 
-    The robust deviation of a camera is 1.4826 times the median of its residuals' components (Rousseeuw and Leroy 1987).
+    A camera's robust std is 1.4826 times the median absolute residual component (Rousseeuw and Leroy 1987). At most
+    `MAX_REJECTION_ROUNDS` rounds are run.
     """
-    with torch.inference_mode():  # a fifth faster where calls dominate, and nobody asks for derivatives in here
+    with torch.inference_mode():  # a fifth faster where call overhead dominates; derivatives are added afterwards
         found = _fit(task, shared, local, reject, max_iterations, tolerance, progress)
-    return Fit(*ordinary((found.task, found.solution, found.rejected)))
+    return Fit(*normal_tensors((found.task, found.solution, found.rejected)))
 
 
 def _fit(
@@ -227,8 +229,8 @@ def _fit(
     options = {"max_iterations": max_iterations, "tolerance": tolerance}
     blocks = _blocks(task)
 
-    tell = progress or _tell_nobody
-    rounds = 1 if reject is None else 1 + ROUNDS
+    tell = progress or _no_progress
+    rounds = 1 if reject is None else 1 + MAX_REJECTION_ROUNDS
     total = rounds * len(blocks) * max_iterations
 
     def attempt(task: Task, shared: Tensor, local: tuple[Tensor, ...], done: int) -> Solution:
@@ -242,7 +244,7 @@ def _fit(
     iterations = solution.iterations
     if reject is not None:
         for done in range(1, rounds):
-            # Views that fell below four corners keep the pose that they had.
+            # Views left with fewer than four corners are no longer used, and keep their pose.
             inliers = _inliers(replace(task, used=given), solution, reject)
             kept = inliers & (inliers.sum(-1, keepdim=True) >= 4)
             changed = (kept != task.used).any(-1).any(-1)
@@ -250,24 +252,24 @@ def _fit(
                 break
             task = replace(task, used=kept)
             again = attempt(task, solution.shared, solution.local, done)
-            # Who has settled stays as it is, to the bit.
+            # Cameras whose inliers did not change keep their solution to the bit.
             solution = chosen(changed.numpy(force=True), again, solution)
             iterations = iterations + torch.where(changed, again.iterations, 0)
     tell(total, total)
     return Fit(task, solution._replace(iterations=iterations), given & ~inliers)
 
 
-def ordinary(value: Any) -> Any:
-    """A copy of tensors made in inference mode, and of tuples and tasks of such, for those who may want derivatives."""
+def normal_tensors(value: Any) -> Any:
+    """Inference-mode tensors, and tuples and tasks of them, copied to normal tensors, which autograd accepts."""
     if isinstance(value, Tensor):
         return value.clone() if value.is_inference() else value
     if isinstance(value, Task):
-        return replace(value, used=ordinary(value.used))
-    parts = [ordinary(part) for part in value]
+        return replace(value, used=normal_tensors(value.used))
+    parts = [normal_tensors(part) for part in value]
     return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
 
 
-def _tell_nobody(done: int, total: int) -> None:
+def _no_progress(done: int, total: int) -> None:
     pass
 
 
@@ -311,23 +313,23 @@ def _joined(parts: list[Solution]) -> Solution:
 
 
 def _inliers(task: Task, solution: Solution, limit: float) -> Tensor:
-    """Which of the given corners are no outliers `(P, V, N)`, each measured by its own weight."""
+    """Which of the given corners are inliers `(P, V, N)`, by their weighted residuals."""
     residual = task.problem.linearise(solution.shared, solution.local)[:, :, -1]
     if task.weights is not None:
         residual = residual * task.weights.sqrt().unsqueeze(2)
-    # Of exact corners the residuals are rounding, which has outliers of its own.
+    # With exact corners the residuals are rounding errors, none of which may count as an outlier.
     least = 1e-6 if task.objective == "image" else 1e-9 * float(task.points.abs().amax())
     sigma = _robust_sigma(residual, task.used).clamp(min=least)
     return task.used & (residual.square().sum(2) <= (limit * sigma[:, None, None]).square())
 
 
 def _robust_sigma(residual: Tensor, used: Tensor) -> Tensor:
-    """1.4826 times the median of the components of residuals `(P, V, 2, N)`, `(P,)`."""
+    """Robust std `(P,)`: 1.4826 times the median absolute component of residuals `(P, V, 2, N)`."""
     return 1.4826 * torch.where(used.unsqueeze(2), residual.abs(), torch.nan).flatten(1).nanmedian(-1).values
 
 
 def _derivatives(loss: Loss | None, squared: Tensor) -> tuple[Tensor, Tensor]:
-    """First and second derivative of the loss by the squared residual."""
+    """First and second derivative, rho' and rho'', of the loss by the squared residual."""
     if loss is None:
         return torch.ones_like(squared), torch.zeros_like(squared)
     with torch.enable_grad():

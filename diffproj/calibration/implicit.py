@@ -1,11 +1,11 @@
-"""Gradients through the minimum, by the implicit function theorem.
+"""Derivatives of the minimum by the data, from the implicit function theorem.
 
-At a minimum the gradient of the cost by the parameters theta vanishes whatever the data d are, so that
+At the minimum the gradient of the cost by the parameters theta is zero for any data d, so that
 
     d theta / d d = -H^-1 d(gradient) / d d        H = the exact second derivative of the cost
 
-which `theta - H^-1 gradient(theta, d)`, with theta and H cut from the graph, has as its first derivative; its value is
-theta to rounding. H has the arrow shape of the normal equations and is reduced block by block in the same way.
+This is the first derivative of `theta - H^-1 gradient(theta, d)` with theta and H detached from the autograd graph. H
+has the block structure of the normal equations and is solved by the same Schur complement.
 """
 
 import torch
@@ -21,7 +21,7 @@ from diffproj.geometry.plane import Plane
 
 
 def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
-    """The same fit with shared parameters and poses that carry gradients to pixels, points, weights and prior."""
+    """The same fit, with shared parameters and poses differentiable by pixels, points, weights and prior."""
     sources = [data.given_pixels, data.given_points, data.given_weights, *(prior or ())]
     if not any(source is not None and source.requires_grad for source in sources):
         return found
@@ -31,7 +31,7 @@ def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
     pixels = data.given_pixels.reshape(task.pixels.shape)
     weights = None if data.given_weights is None else data.given_weights.reshape(task.used.shape)
     with torch.enable_grad():
-        # Each view has its own copy of the shared parameters, so that one backward pass gives a row of every block.
+        # Each view has its own copy of the shared parameters: one backward pass gives a row of every view's block.
         theta = solution.shared.new_zeros(P, V, s + POSE, requires_grad=True)
         cost = _costs(task, solution.shared.unsqueeze(1) + theta[..., :s], theta[..., s:], pixels, data, weights, found)
         gradient = torch.autograd.grad(cost.sum(), theta, create_graph=True)[0]
@@ -46,13 +46,13 @@ def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
         if task.basis is not None:
             T = task.basis.mT
             U, E, g = T @ U @ task.basis, T.unsqueeze(1) @ E, (T @ g.unsqueeze(-1)).squeeze(-1)
-        # A view that takes no part has W = 0 and h = 0: its pose stays.
-        idle = ~task.used.any(-1)[..., None, None] * torch.eye(POSE, dtype=W.dtype, device=W.device)
-        F = torch.linalg.solve_ex((W + idle).mT, E.mT)[0].mT
+        # An unused view has W = 0 and h = 0: its pose has no gradient.
+        unused = ~task.used.any(-1)[..., None, None] * torch.eye(POSE, dtype=W.dtype, device=W.device)
+        F = torch.linalg.solve_ex((W + unused).mT, E.mT)[0].mT
         S = U - (F @ E.mT).sum(1)
         reduced = g - (F @ h.unsqueeze(-1)).squeeze(-1).sum(1)
         dx = -torch.linalg.solve_ex(S, reduced.unsqueeze(-1))[0]
-        dz = -torch.linalg.solve_ex(W + idle, h.unsqueeze(-1) + E.mT @ dx.unsqueeze(1))[0].squeeze(-1)
+        dz = -torch.linalg.solve_ex(W + unused, h.unsqueeze(-1) + E.mT @ dx.unsqueeze(1))[0].squeeze(-1)
         if task.basis is not None:
             dx = task.basis @ dx
         shared = solution.shared + _gradient_only(dx.squeeze(-1))
@@ -61,14 +61,14 @@ def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
 
 
 def _gradient_only(step: Tensor) -> Tensor:
-    """Zero with the step's derivative: the solver's minimum stays what it is, bit for bit."""
+    """Zero, with the derivative of the step: the solver's minimum keeps its value to the bit."""
     return step - step.detach()
 
 
 def _costs(
     task: Task, shared: Tensor, step: Tensor, pixels: Tensor, data: Data, weights: Tensor | None, found: Fit
 ) -> Tensor:
-    """The cost of each view `(P, V)`, a graph on shared `(P, V, s)`, pose step, pixels, points and weights."""
+    """The cost of each view `(P, V)`, differentiable by shared `(P, V, s)`, pose step, pixels, points and weights."""
     flat = shared.flatten(0, 1)
     local = tuple(z.unsqueeze(1) for z in moved(found.solution.local, step))
     cameras = task.parameters.unpack(flat, tuple(z.flatten(0, 2).unsqueeze(1) for z in local))

@@ -1,12 +1,12 @@
 """Forward lens equations with their derivatives in closed form, written into the rows of a panel.
 
-For the solver's inner loop: points in the camera frame `(P, V, 3, N)`, component by component, with one lens for each
-of P problems. Each function writes the derivatives of the distorted point by the coefficients and by the point in the
-camera frame into tensors that the caller owns, `(P, V, k, 2, N)` and `(P, V, 3, 2, N)`, and returns the distorted
-point `(P, V, 2, N)` on the normalised plane.
+For the solver's inner loop: points in the camera frame are `(P, V, 3, N)`, with one lens for each of P problems. Each
+function writes the derivatives of the distorted point by the coefficients and by the point in the camera frame into
+the caller's tensors, `(P, V, k, 2, N)` and `(P, V, 3, 2, N)`, and returns the distorted point `(P, V, 2, N)` on the
+normalised plane.
 
-No domain is asked: a solver may pass through lenses that fold somewhere, as long as it does not end there. The
-equations are those of `diffproj.lens`, which the tests hold these to.
+The lens's domain is not checked: intermediate lenses of the solver may have a fold within the image. The equations are
+those of `diffproj.lens`; the tests compare the two.
 """
 
 import torch
@@ -28,7 +28,7 @@ def pinhole(coefficients: Tensor, X_cam: Tensor, by_coefficient: Tensor, by_poin
 
 
 def brown_conrady(coefficients: Tensor, X_cam: Tensor, by_coefficient: Tensor, by_point: Tensor) -> Tensor:
-    """Brown-Conrady with 4, 5, 8, 12 or 14 coefficients `(P, k)`; the equations stand in `lens.brown_equations`."""
+    """Brown-Conrady with 4, 5, 8, 12 or 14 coefficients `(P, k)`; for the equations see `lens.brown_equations`."""
     count = coefficients.shape[-1]
     k = [column[:, None, None] for column in coefficients.unbind(-1)]
     inverse_depth = X_cam[:, :, 2].reciprocal()
@@ -93,7 +93,7 @@ def brown_conrady(coefficients: Tensor, X_cam: Tensor, by_coefficient: Tensor, b
 
 
 def fisheye(coefficients: Tensor, X_cam: Tensor, by_coefficient: Tensor, by_point: Tensor) -> Tensor:
-    """Kannala-Brandt with 4 coefficients `(P, 4)`; the equations stand in `lens.kannala_brandt`."""
+    """Kannala-Brandt with 4 coefficients `(P, 4)`; for the equations see `lens.kannala_brandt`."""
     k = [column[:, None, None] for column in coefficients.unbind(-1)]
     xy, z = X_cam[:, :, :2], X_cam[:, :, 2]
     side = torch.hypot(*xy.unbind(2))
@@ -112,7 +112,7 @@ def fisheye(coefficients: Tensor, X_cam: Tensor, by_coefficient: Tensor, by_poin
     for row in range(4):
         power = power * square
         torch.mul(unit, power.unsqueeze(2), out=by_coefficient[:, :, row])
-    # Across the direction from the axis the point moves with theta_d / side, along it with the slope.
+    # Tangential magnification theta_d / side, radial magnification from the slope.
     across = torch.where(apart, theta_d / safe, z.reciprocal())
     along = slope * z / length_squared
     torch.mul(unit, (unit[:, :, 0] * (along - across)).unsqueeze(2), out=by_point[:, :, 0])
@@ -124,7 +124,7 @@ def fisheye(coefficients: Tensor, X_cam: Tensor, by_coefficient: Tensor, by_poin
 
 
 def _polynomial(s: Tensor, columns: list[Tensor]) -> Tensor:
-    """`c_0 + c_1 s + ...` of at least two columns, by Horner's rule."""
+    """`c_0 + c_1 s + ...` for at least two coefficients, by Horner's rule."""
     value = torch.addcmul(columns[-2], columns[-1], s)
     for column in reversed(columns[:-2]):
         value = torch.addcmul(column, value, s)
@@ -132,7 +132,7 @@ def _polynomial(s: Tensor, columns: list[Tensor]) -> Tensor:
 
 
 def _tilt(tau_x: Tensor, tau_y: Tensor, xy: Tensor, by_xy: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """The point on the tilted sensor, and derivatives taken on by the tilt's own Jacobian `(P, V, 2, 2, N)`."""
+    """Apply the tilt to the point, and by the chain rule to its derivatives `by_xy (P, V, 2, 2, N)` and `rows`."""
     x, y = xy.unbind(2)
     cos_x, sin_x, cos_y, sin_y = tau_x.cos(), tau_x.sin(), tau_y.cos(), tau_y.sin()
     inverse = (sin_y * x - cos_y * sin_x * y + cos_x * cos_y).reciprocal()

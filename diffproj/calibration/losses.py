@@ -1,8 +1,8 @@
-"""Robust losses: how much a residual counts, as a function of its squared length.
+"""Robust losses (M-estimators) of the squared residual.
 
 A loss is a function rho of `e2 = |e|^2 (...,)`, in squared units of the residual (px^2 for the image objective), with
-`rho(0) = 0` and `rho'(0) = 1`, so that small residuals count as in least squares; its derivative is the weight that an
-iteratively reweighted solver gives to a residual. All are differentiable twice where `e2` is 0 as well.
+`rho(0) = 0` and `rho'(0) = 1`, so that small residuals count as in least squares. Its derivative is a residual's weight
+in iteratively reweighted least squares. All are twice differentiable at `e2 = 0` too.
 
 Sources: Huber 1964; Triggs, McLauchlan, Hartley and Fitzgibbon 2000, "Bundle adjustment", section 3.
 """
@@ -18,7 +18,7 @@ from torch import Tensor
 
 @runtime_checkable
 class Loss(Protocol):
-    """What the solver asks of a loss; one of your own needs these two methods alone."""
+    """Interface of a robust loss; a custom loss implements these two methods."""
 
     def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`rho(e2)`, in the unit of `squared`."""
@@ -39,7 +39,7 @@ class _Scaled:
 
 
 class Huber(_Scaled):
-    """Quadratic up to `scale`, linear beyond: an outlier pulls, but no harder than one at `scale`.
+    """Quadratic up to `scale`, linear beyond: the influence of an outlier is bounded by that of a residual of `scale`.
 
     Example:
         >>> Huber(1.0).value(torch.tensor([0.25, 9.0]))
@@ -58,7 +58,7 @@ class Huber(_Scaled):
 
 
 class SoftL1(_Scaled):
-    """`2 scale^2 (sqrt(1 + e2 / scale^2) - 1)`: as Huber's, but smooth.
+    """`2 scale^2 (sqrt(1 + e2 / scale^2) - 1)`: similar to Huber's loss, but smooth.
 
     Example:
         >>> SoftL1(1.0).weight(torch.tensor([0.0, 8.0]))
@@ -75,7 +75,7 @@ class SoftL1(_Scaled):
 
 
 class Cauchy(_Scaled):
-    """`scale^2 log(1 + e2 / scale^2)`: far outliers lose all pull. Not convex: it wants a fair start.
+    """`scale^2 log(1 + e2 / scale^2)`: the influence of far outliers tends to 0. Not convex: needs a fair start.
 
     Example:
         >>> Cauchy(1.0).weight(torch.tensor([0.0, 1.0, 99.0]))

@@ -1,32 +1,35 @@
 """Batched Levenberg-Marquardt with a Schur complement, for few shared and many small local unknowns.
 
-The solver knows no cameras. It minimises, for each of P problems side by side, over the shared unknowns x (s numbers)
-and V local blocks z_v (l tangent coordinates each),
+The solver is independent of cameras. For each problem of a batch of P it minimises, over the shared unknowns x (s
+numbers) and V local blocks z_v (l tangent coordinates each),
 
     F(x, z) = 1/2 sum_vn w_vn rho(|e_vn(x, z_v)|^2) + 1/2 (x - m)^T Q (x - m)
 
-where `e_vn` are residuals of k components, `w` weights, `rho` a robust loss and the last term a prior. With A_v, B_v
-the Jacobians of block v's residuals to x and z_v, each residual's row scaled by `sqrt(w rho')` (reweighting),
+where `e_vn` are residuals of k components, `w` weights, `rho` a robust loss (M-estimator) and the last term a prior.
+Let A_v, B_v be the Jacobians of block v's residuals by x and z_v, with each residual's rows scaled by `sqrt(w rho')`
+(iteratively reweighted least squares). The damped normal equations are
 
     U = Q + sum A_v^T A_v     E_v = A_v^T B_v     W_v = B_v^T B_v     g = Q (x - m) + sum A_v^T e_v     h_v = B_v^T e_v
 
     [ U + lambda diag(U)     E_1 ... E_V          ] [ dx   ]     [ g   ]
     [ E_v^T            W_v + lambda diag(W_v)     ] [ dz_v ] = - [ h_v ]
 
-and the local unknowns drop out: with the Cholesky factors `L_v L_v^T = W_v + lambda diag(W_v)`,
+and the local unknowns are eliminated by the Schur complement S: with the Cholesky factors
+`L_v L_v^T = W_v + lambda diag(W_v)`,
 
     Y_v = L_v^-1 E_v^T     y_v = L_v^-1 h_v     S = U + lambda diag(U) - sum Y_v^T Y_v
     S dx = -(g - sum Y_v^T y_v)                 dz_v = -L_v^-T (Y_v dx + y_v)
 
-so that time grows with V, not with its cube. Where x may only move along a basis T (frozen or tied unknowns),
-`dx = T dq` and the same equations hold with `A_v T` in the place of A_v.
+so that run time is linear in V, not cubic. Where x is restricted to a basis T (fixed or tied unknowns), `dx = T dq` and
+the same equations hold with `A_v T` in place of A_v.
 
-Computed per accepted point: the panel `[A_v B_v e_v]^T` and, by one batched product, its Gram matrix, which holds U,
-E_v, W_v, g, h_v and the cost at once. Per trial: L_v, Y_v, S and a new panel. Nothing else.
+Computed per trial: L_v, Y_v, S, the panel `[A_v B_v e_v]^T` at the new point and, by one batched product, its Gram
+matrix, which contains U, E_v, W_v, g, h_v and the cost.
 
-Each problem has its own lambda, acceptance and stopping, and no operation mixes problems: a hopeless neighbour changes
-no bit of a result. The cost never rises: a step is taken that was tried and found no worse, but for the last one, which
-promises less than a part in 10^8 and is not tried. How each ended is a `Status`, never an exception.
+Damping, acceptance and stopping are per problem, and no operation mixes problems: a result is the same to the bit
+whether or not another problem of the batch diverges. A step is accepted if the cost does not increase. The exception is
+the final step: its predicted reduction is below 10^-8 of the cost, and it is applied without evaluating the cost. How a
+problem ended is reported as a `Status`, never as an exception.
 """
 
 from collections.abc import Callable
@@ -40,48 +43,48 @@ from torch import Tensor
 
 from diffproj.calibration.losses import Loss
 
-FIRST_DAMPING = 1e-6
-"""Small, so that a good start is met with Newton's own steps."""
-FIRST_RISE, FIRST_FALL = 2.0, 3.0
-"""By how much a first failure raises the damping, and a first success may lower it."""
-SEARCHING = 10.0
-"""By how much the very first failure raises it, as long as nothing is known of its size."""
+INITIAL_DAMPING = 1e-6
+"""Small, so that from a good start the first steps are nearly Gauss-Newton steps."""
+DAMPING_INCREASE, DAMPING_DECREASE = 2.0, 3.0
+"""Factors of the damping after the first failure, and (at most) after the first success, in a row."""
+FIRST_INCREASE = 10.0
+"""Factor after the very first failure, before any success, while the order of magnitude is unknown."""
 HEAVY_DAMPING = 1e-3
-"""Damping under which a step says nothing of how far the minimum is."""
-LAST_PROMISE = 1e-8
-"""A step that promises to lower the cost by less than this part of it may be the last one."""
-FASTEST = 0.02
-"""By how much promises shrink from step to step at best, as far as is believed: near the end they do so evenly."""
+"""Damping above which the predicted reduction of a step is no measure of the distance from the minimum."""
+FINAL_STEP_REDUCTION = 1e-8
+"""Predicted reduction, relative to the cost, up to which a step may be the final one, applied without evaluation."""
+BEST_CONTRACTION = 0.02
+"""Least ratio of successive predicted reductions assumed in extrapolation; convergence near the minimum is linear."""
 ROUNDING = 1e-12
-"""The part of the cost below which a sum of many squares is rounding."""
-SMALLEST_DAMPING = 1e-15
-LARGEST_DAMPING = 1e14
-"""Where no step lowers the cost even with this, none will."""
+"""Rounding error of the cost, a sum of many squares, relative to it."""
+MIN_DAMPING = 1e-15
+MAX_DAMPING = 1e14
+"""Beyond this damping, a problem without an acceptable step has diverged."""
 LocalState = tuple[Tensor, ...]
-"""Tensors `(P, V, ...)` that say where the local blocks are; only the problem knows what they mean."""
+"""Tensors `(P, V, ...)` with the state of the local blocks, which only the problem interprets."""
 
 
 class Status(IntEnum):
-    """How a problem ended."""
+    """Why the solver stopped."""
 
     CONVERGED = 0
-    """No step promises to lower the cost by more than the tolerance."""
+    """The predicted reduction of the cost is below the tolerance."""
     MAX_ITERATIONS = 1
-    """It was still falling when the iterations ended."""
+    """The maximum number of iterations was reached before convergence."""
     DIVERGED = 2
     """No step lowers the cost although its gradient is not zero, or the residuals are not finite at the start."""
     DEGENERATE = 3
-    """There is a lowest cost, but the data do not determine the unknowns. (Said by the caller, who knows them.)"""
+    """The data do not determine all unknowns. (Set by the caller, not by the solver.)"""
 
 
 @runtime_checkable
 class Problem(Protocol):
-    """What the solver asks of P problems side by side."""
+    """Interface of a batch of P problems."""
 
     def linearise(self, shared: Tensor, local: LocalState) -> Tensor:
-        """The panel `(P, V, s + l + 1, k, N)`: derivatives to x, derivatives to z_v, and the residuals, as rows.
+        """The panel `(P, V, s + l + 1, k, N)`, whose rows are derivatives by x, derivatives by z_v, and residuals.
 
-        Not finite where the residuals have no value; the tensor may be overwritten by the next call.
+        Not finite where a residual is undefined. The tensor may be overwritten by the next call.
         """
         ...
 
@@ -98,9 +101,9 @@ class Prior(NamedTuple):
 
 
 class Equations(NamedTuple):
-    """The undamped normal equations at a point, before any basis: U `(P, s, s)`, E, W, g and h as above.
+    """The undamped normal equations at a point, in all shared unknowns: U `(P, s, s)`, E, W, g and h as above.
 
-    `c (P, V)` is what each block adds to the cost, with the weights and without rho.
+    `c (P, V)` is each block's reweighted sum of squares, `1/2 sum_n w rho' |e_vn|^2`.
     """
 
     U: Tensor
@@ -111,7 +114,7 @@ class Equations(NamedTuple):
     c: Tensor
 
     def along(self, basis: Tensor | None) -> "Equations":
-        """The same equations for shared unknowns that move along a basis `(P, s, q)`."""
+        """The same equations for shared unknowns restricted to a basis `(P, s, q)`."""
         if basis is None:
             return self
         T = basis.mT
@@ -119,15 +122,15 @@ class Equations(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Where the problems ended; tensors have P in front.
+    """The solutions of P problems.
 
     Attributes:
         shared: x `(P, s)`.
         local: the local blocks.
-        cost: F `(P,)`, as it was before the last step, which was not tried.
+        cost: F `(P,)` at the last accepted point, before the final step.
         status: `Status` codes `(P,)`.
-        iterations: steps tried `(P,)`.
-        equations: the normal equations at the same place, with the last weights.
+        iterations: steps evaluated `(P,)`.
+        equations: the normal equations, with their robust weights, at that same point.
     """
 
     shared: Float[Tensor, "p s"]
@@ -138,7 +141,7 @@ class Solution(NamedTuple):
     equations: Equations
 
 
-@np.errstate(all="ignore")  # infinite and undefined promises are looked at, not warned of
+@np.errstate(all="ignore")  # infinite and NaN reductions are handled without warnings
 def solve(
     problem: Problem,
     shared: Float[Tensor, "p s"],
@@ -158,110 +161,115 @@ def solve(
 
     Args:
         problem: residuals, Jacobians and retraction.
-        shared: the start, x `(P, s)`; s may be 0.
-        local: the start of the local blocks.
+        shared: initial x `(P, s)`; s may be 0.
+        local: initial local blocks.
         local_size: l.
-        weights: `(P, V, N)`, not negative; 1 everywhere if left out.
+        weights: of the residuals `(P, V, N)`, not negative; 1 if left out.
         loss: a robust loss; least squares if left out.
         prior: on the shared unknowns.
-        basis: the directions in which x may move; all if left out.
-        max_iterations: steps to try at most.
-        tolerance: a problem has converged when the step after the next, as its steps shrink, will lower the cost by no
-            more than this part.
+        basis: spans the directions in which x may move; all if left out.
+        max_iterations: maximum number of steps.
+        tolerance: of convergence: the relative reduction of the cost that the step after the current one would bring,
+            extrapolated from the ratio of the last two predicted reductions.
         negligible: a cost, in the cost's unit, that counts as zero.
         progress: called after each step with its number, from 1, and the costs `(P,)`.
 
     Returns:
-        The solution; see `Status` for how a problem may end.
+        The solution, with a `Status` for each problem.
     """
     terms = _Terms(problem, local_size, weights, loss, prior)
     cost, equations = terms.at(shared, local)
-    pace = _Pace(_array(cost))
+    control = _DampingControl(_array(cost))
     for iteration in range(1, max_iterations + 1):
         along = equations.along(basis)
-        q, dz, promise = damped_step(along, torch.from_numpy(pace.damping).to(cost))
+        q, dz, reduction = damped_step(along, torch.from_numpy(control.damping).to(cost))
         dx = q if basis is None else _times(basis, q)
         trial = shared + dx, problem.retract(local, dz)
-        promised = _array(promise)
-        # A heavily damped step promises little anywhere: then it is the gradient that has to be negligible.
-        heavy = pace.damping > HEAVY_DAMPING
-        prospect = np.where(heavy, _array(_alone(along)), promised) if heavy.any() else promised
-        done = pace.settle(prospect, tolerance, negligible)
+        predicted = _array(reduction)
+        # Heavy damping makes every predicted reduction small: convergence is then judged by the gradient.
+        heavy = control.damping > HEAVY_DAMPING
+        expected = np.where(heavy, _array(_decoupled_reduction(along)), predicted) if heavy.any() else predicted
+        done = control.stop(expected, tolerance, negligible)
         if done.any():
-            # The last step promises hardly anything and brings the unknowns nearer still: it is not tried.
-            last = done & (promised <= LAST_PROMISE * pace.cost)
+            # The final step still improves the unknowns, but its reduction is negligible: apply without evaluating it.
+            last = done & (predicted <= FINAL_STEP_REDUCTION * control.cost)
             shared, local = chosen(last, trial, (shared, local))
-        if not pace.active.any():
+        if not control.active.any():
             break
         trial_cost, trial_equations = terms.at(*trial)
-        better = pace.learn(_array(trial_cost), promised)
+        better = control.accept(_array(trial_cost), predicted)
         state, new = (shared, local, cost, equations), (*trial, trial_cost, trial_equations)
         shared, local, cost, equations = chosen(better, new, state)
         if progress is not None:
             progress(iteration, cost)
-    ends = pace.status.astype(np.int64), pace.iterations
+    ends = control.status.astype(np.int64), control.iterations
     status, iterations = (torch.from_numpy(end).to(cost.device) for end in ends)
     return Solution(shared, local, cost, status, iterations, equations)
 
 
-class _Pace:
-    """Damping, acceptance and stopping of each problem: a few numbers for each, kept where Python reaches them fast."""
+class _DampingControl:
+    """Damping, acceptance and stopping per problem, in NumPy, which is faster than PyTorch for a few numbers."""
 
     def __init__(self, cost: np.ndarray) -> None:
         self.cost = cost
-        self.damping = np.full_like(cost, FIRST_DAMPING)
-        self.rise, self.fall = np.full_like(cost, SEARCHING), np.full_like(cost, FIRST_FALL)
+        self.damping = np.full_like(cost, INITIAL_DAMPING)
+        self.increase, self.decrease = np.full_like(cost, FIRST_INCREASE), np.full_like(cost, DAMPING_DECREASE)
         self.active = np.isfinite(cost)
         self.status = np.where(self.active, Status.MAX_ITERATIONS, Status.DIVERGED)
         self.iterations = np.zeros(cost.shape, dtype=np.int64)
-        self.before = np.full_like(cost, np.inf)
+        self.previous = np.full_like(cost, np.inf)
         self.failed = np.zeros(cost.shape, dtype=bool)
 
-    def settle(self, prospect: np.ndarray, tolerance: float, negligible: float) -> np.ndarray:
-        """Stop those that have nothing left to gain, which are returned, and those that are stuck."""
-        # The step at hand is taken at the end: what counts is what the one after it would bring, as promises shrink.
-        after = prospect * np.clip(prospect / self.before, FASTEST, 1)
-        self.before = np.where(self.active, prospect, self.before)
-        small = (after <= tolerance * self.cost) & (prospect <= LAST_PROMISE * self.cost)
-        # Where a promise is rounding of the cost, whether a trial is better is chance: a failure ends it.
-        exhausted = (self.failed & (prospect <= ROUNDING * self.cost)) | (prospect <= 1e-3 * ROUNDING * self.cost)
-        done = self.active & (small | exhausted | (self.cost <= negligible))
-        stuck = self.active & ~done & (self.damping > LARGEST_DAMPING)
+    def stop(self, expected: np.ndarray, tolerance: float, negligible: float) -> np.ndarray:
+        """Stop problems that have converged, which are returned, and those whose damping exceeds its maximum."""
+        # The current step will still be applied: the criterion is the reduction of the step after it, extrapolated.
+        after = expected * np.clip(expected / self.previous, BEST_CONTRACTION, 1)
+        self.previous = np.where(self.active, expected, self.previous)
+        converged = (after <= tolerance * self.cost) & (expected <= FINAL_STEP_REDUCTION * self.cost)
+        # Where the reduction is below the cost's rounding error, acceptance is random: the first failure ends it.
+        exhausted = (self.failed & (expected <= ROUNDING * self.cost)) | (expected <= 1e-3 * ROUNDING * self.cost)
+        done = self.active & (converged | exhausted | (self.cost <= negligible))
+        stuck = self.active & ~done & (self.damping > MAX_DAMPING)
         self.status[done], self.status[stuck] = Status.CONVERGED, Status.DIVERGED
         self.active &= ~(done | stuck)
         self.iterations += self.active
         return done
 
-    def learn(self, cost: np.ndarray, promise: np.ndarray) -> np.ndarray:
-        """Which of the active problems accept the trial; their damping follows from how true the promise was.
+    def accept(self, cost: np.ndarray, reduction: np.ndarray) -> np.ndarray:
+        """Accept trials that do not increase the cost, and update the damping from the gain ratio (Nielsen 1999).
 
-        After Nielsen 1999: a step that went as the quadratic model said lowers the damping, a poor one keeps or raises
-        it. Successes and failures in a row gather pace; in a bent valley, where they alternate, both are small.
+        The gain ratio is the actual over the predicted reduction: near 1 the damping decreases, well below it stays or
+        increases. Successes or failures in a row enlarge the changes; where they alternate, as in a curved valley, the
+        changes stay small.
         """
-        better = self.active & (cost <= self.cost) & np.isfinite(promise)  # false where the trial is NaN
+        better = self.active & (cost <= self.cost) & np.isfinite(reduction)  # false where the trial is NaN
         worse = self.failed = self.active & ~better
-        model = 1 - (2 * (self.cost - cost) / promise - 1) ** 3
-        factor = np.where(better, np.maximum(np.minimum(model, 2), 1 / self.fall), np.where(worse, self.rise, 1))
-        self.damping = np.maximum(self.damping * factor, SMALLEST_DAMPING)
-        self.rise = np.where(better, FIRST_RISE, np.where(worse, 2 * self.rise, self.rise))
-        self.fall = np.where(better, np.minimum(3 * self.fall, 1e6), np.where(worse, FIRST_FALL, self.fall))
+        model = 1 - (2 * (self.cost - cost) / reduction - 1) ** 3
+        factor = np.where(
+            better, np.maximum(np.minimum(model, 2), 1 / self.decrease), np.where(worse, self.increase, 1)
+        )
+        self.damping = np.maximum(self.damping * factor, MIN_DAMPING)
+        self.increase = np.where(better, DAMPING_INCREASE, np.where(worse, 2 * self.increase, self.increase))
+        self.decrease = np.where(
+            better, np.minimum(3 * self.decrease, 1e6), np.where(worse, DAMPING_DECREASE, self.decrease)
+        )
         self.cost = np.where(better, cost, self.cost)
         return better
 
 
 def damped_step(equations: Equations, damping: Float[Tensor, " p"]) -> tuple[Tensor, Tensor, Tensor]:
-    """One step of the block equations.
+    """Solve the damped normal equations by the Schur complement.
 
     Args:
         equations: along the basis.
         damping: lambda `(P,)`.
 
     Returns:
-        `(dx, dz, promise)`: the step `(P, q)` and `(P, V, l)`, and by how much the quadratic model falls along it
-        `(P,)`. Zero, zero and infinite where the matrices are not positive definite.
+        `(dx, dz, reduction)`: the step, `(P, q)` and `(P, V, l)`, and the cost reduction predicted by the quadratic
+        model, `(P,)`. Zero, zero and infinite where the matrices are not positive definite.
     """
     U, E, W, g, h, _ = equations
-    D, D_local = (_positive(M.diagonal(dim1=-2, dim2=-1)) for M in (U, W))
+    D, D_local = (_damping_scale(M.diagonal(dim1=-2, dim2=-1)) for M in (U, W))
     lam = damping.unsqueeze(-1)
     L, local_failed = torch.linalg.cholesky_ex(_with_diagonal(W, lam.unsqueeze(-1) * D_local))
     Y = torch.linalg.solve_triangular(L, torch.cat([E.mT, h.unsqueeze(-1)], dim=-1), upper=False)
@@ -274,24 +282,24 @@ def damped_step(equations: Equations, damping: Float[Tensor, " p"]) -> tuple[Ten
     dz = -torch.linalg.solve_triangular(L.mT, Y @ dx.unsqueeze(1) + y, upper=True).squeeze(-1)
     dx = dx.squeeze(-1)
     descent = -(g * dx).sum(-1) - (h * dz).sum((-2, -1))
-    promise = (descent + damping * ((D * dx.square()).sum(-1) + (D_local * dz.square()).sum((-2, -1)))) / 2
-    sound = (failed == 0) & (local_failed == 0).all(-1) & promise.isfinite()
+    reduction = (descent + damping * ((D * dx.square()).sum(-1) + (D_local * dz.square()).sum((-2, -1)))) / 2
+    sound = (failed == 0) & (local_failed == 0).all(-1) & reduction.isfinite()
     return (
         torch.where(sound.unsqueeze(-1), dx, 0.0),
         torch.where(sound[:, None, None], dz, 0.0),
-        torch.where(sound, promise, torch.inf),
+        torch.where(sound, reduction, torch.inf),
     )
 
 
-def _alone(equations: Equations) -> Tensor:
-    """By how much the model would fall if every unknown moved alone, a size of the gradient that no damping shrinks."""
+def _decoupled_reduction(equations: Equations) -> Tensor:
+    """Reduction predicted if each unknown moved alone, `(P,)`: a norm of the gradient that no damping reduces."""
     U, _, W, g, h, _ = equations
-    D, D_local = (_positive(M.diagonal(dim1=-2, dim2=-1)) for M in (U, W))
+    D, D_local = (_damping_scale(M.diagonal(dim1=-2, dim2=-1)) for M in (U, W))
     return ((g.square() / D).sum(-1) + (h.square() / D_local).sum((-2, -1))) / 2
 
 
 class _Terms:
-    """The cost and its normal equations at a point."""
+    """Evaluates the cost and the normal equations at a point."""
 
     def __init__(
         self, problem: Problem, local_size: int, weights: Tensor | None, loss: Loss | None, prior: Prior | None
@@ -328,8 +336,8 @@ def _with_diagonal(matrix: Tensor, addition: Tensor) -> Tensor:
     return sum_
 
 
-def _positive(diagonal: Tensor) -> Tensor:
-    """What damping scales with; 1 for an unknown that nothing depends on, whose step is then 0."""
+def _damping_scale(diagonal: Tensor) -> Tensor:
+    """The diagonal that scales the damping; 1 for an unknown without effect on the residuals, whose step is then 0."""
     return torch.where(diagonal > 0, diagonal, 1.0)
 
 
@@ -342,7 +350,7 @@ def _array(values: Tensor) -> np.ndarray:
 
 
 def chosen(mask: np.ndarray, new: Any, old: Any) -> Any:
-    """Problem by problem, `new` where the mask is true; for a tensor or a tuple of such."""
+    """Per problem, `new` where the mask is true, else `old`; for tensors and tuples of tensors."""
     if mask.all():
         return new
     if not mask.any():

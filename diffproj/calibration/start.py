@@ -7,7 +7,7 @@ from torch import Tensor
 
 from diffproj.calibration import closed_form
 from diffproj.calibration.data import Data
-from diffproj.calibration.fit import ordinary
+from diffproj.calibration.fit import normal_tensors
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.intrinsics import check_no_skew
@@ -61,7 +61,7 @@ def from_nothing(
             found = _fisheye(data, middle, rest, float(max(size)), bow)
         else:
             found = _perspective(data, middle, rest, size, tied, model != "none")
-    return ordinary(found)
+    return normal_tensors(found)
 
 
 def _perspective(

@@ -1,7 +1,7 @@
-"""Does the calibration hold on views it has not seen, and would it come out the same on others like them?
+"""Cross-validation and bootstrap of a calibration, over its views.
 
-`cross_validate` refits without each part of the views in turn and measures on the part that was left out; `bootstrap`
-refits on views drawn again with repetition (Efron 1979). Both solve all refits side by side, as one batch.
+`cross_validate` refits without each fold of the views in turn and evaluates on that fold; `bootstrap` refits on views
+resampled with replacement (Efron 1979). Both solve all refits as one batch.
 """
 
 from collections.abc import Mapping
@@ -23,14 +23,14 @@ from diffproj.targets.views import Views
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Errors of a calibration inside and outside of the views that it was fitted to.
+    """Errors of k refits on the views that they were fitted to, and on those held out.
 
     Attributes:
         fits: the k refits, as one calibration of batch shape `(k,)`.
-        in_sample_px: RMS error of the fitted corners in pixels `(k,)`.
-        held_out_px: the same of the corners left out, `(k,)`.
-        in_sample_world: RMS distance of the fitted corners, put back on the board, from their places `(k,)`.
-        held_out_world: the same of the corners left out, `(k,)`, in world units.
+        in_sample_px: RMS reprojection error of the fitted corners in pixels `(k,)`.
+        held_out_px: the same for the held-out corners, `(k,)`.
+        in_sample_world: RMS error of the fitted corners, back-projected onto the board, in world units `(k,)`.
+        held_out_world: the same for the held-out corners, `(k,)`.
     """
 
     fits: Calibration
@@ -40,7 +40,7 @@ class CrossValidation:
     held_out_world: Float[Tensor, " k"]
 
     def summary(self) -> str:
-        """A table for people: each fold, and the root mean square over them."""
+        """A table of text: each fold, and the root mean square over the folds."""
         columns = [self.in_sample_px, self.held_out_px, self.in_sample_world, self.held_out_world]
         lines = ["fold   fitted px   held out px   fitted world   held out world"]
         rows = [*torch.stack(columns, dim=-1).tolist(), [float(c.square().mean().sqrt()) for c in columns]]
@@ -54,10 +54,10 @@ class CrossValidation:
 def cross_validate(
     views: Views, board: Target, distortion: LensModel = "brown5", folds: int = 5, **options: Any
 ) -> CrossValidation:
-    """Refit without each of k parts of the views, and measure on the part that was left out.
+    """Refit without each of k folds of the views, and evaluate on the held-out fold.
 
-    The pose of a view that was left out is found from every second corner and judges the others, then the other way
-    round, so that no corner judges itself.
+    The pose of a held-out view is estimated from every second corner and evaluated on the others, then with the roles
+    exchanged, so that no corner is evaluated with a pose that it contributed to.
 
     Args:
         views: corners `(V, N, 2)` of one camera; view i is left out of fit i mod k.
@@ -67,7 +67,7 @@ def cross_validate(
         options: as `calibrate` takes them.
 
     Raises:
-        ValueError: there are fewer views than folds, or many cameras.
+        ValueError: fewer views than folds, fewer than 2 folds, more than one camera, or `bow`.
         CalibrationError: a refit did not converge.
 
     Example:
@@ -90,12 +90,12 @@ def cross_validate(
     held_out = every.hiding(~out.unsqueeze(-1).expand(every.visible.shape))
     second = torch.arange(views.pixels.shape[-2], device=views.device) % 2 == 1
     errors = []
-    for judges in (second, ~second):
-        located = locate(held_out.hiding(judges), board, fits.camera)
-        errors.append(_squared_errors(located, held_out.hiding(~judges)))
+    for posing in (second, ~second):
+        located = locate(held_out.hiding(posing), board, fits.camera)
+        errors.append(_squared_errors(located, held_out.hiding(~posing)))
     px, world = (_rms([error[i] for error in errors], [error[2] for error in errors]) for i in range(2))
-    own = _squared_errors(fits, Views.unchecked(every.pixels, fits.used, every.names, every.size))
-    return CrossValidation(fits, _rms([own[0]], [own[2]]), px, _rms([own[1]], [own[2]]), world)
+    in_sample = _squared_errors(fits, Views.unchecked(every.pixels, fits.used, every.names, every.size))
+    return CrossValidation(fits, _rms([in_sample[0]], [in_sample[2]]), px, _rms([in_sample[1]], [in_sample[2]]), world)
 
 
 def bootstrap(
@@ -106,24 +106,25 @@ def bootstrap(
     seed: int = 0,
     **options: Any,
 ) -> Mapping[str, Float[Tensor, ""]]:
-    """Standard deviations of the shared parameters over refits to views drawn with repetition.
+    """Standard deviations of the shared parameters over refits to views resampled with replacement.
 
-    They believe no model of the noise; with few views they are rough: 13 views know them to a third.
+    No noise model is assumed. With few views the estimates are rough: from 13 views, accurate to about a third.
 
     Args:
         views: corners `(V, N, 2)` of one camera.
         board: anything with `.points (N, 3)` on z = 0.
         distortion: the lens.
-        draws: how many refits.
-        seed: of the draws.
-        options: as `calibrate` takes them, but for `weights`, which say how often a view was drawn.
+        draws: number of refits.
+        seed: of the random draws.
+        options: as `calibrate` takes them, except `weights`, which count here how often a view was drawn.
 
     Returns:
-        The deviations by name, as `Covariance.deviations` names them. Draws that did not converge are left out.
+        The standard deviations by parameter name, as in `Covariance.deviations`. Draws that did not converge are left
+        out.
 
     Raises:
-        ValueError: many cameras, fewer than 2 draws, or weights.
-        CalibrationError: hardly any draw determines the camera.
+        ValueError: more than one camera, fewer than 2 draws, or weights.
+        CalibrationError: fewer than half of the draws, or fewer than 2, converged.
 
     Example:
         >>> import diffproj as dp
@@ -136,7 +137,7 @@ def bootstrap(
     if draws < 2:
         raise ValueError(f"draws: want at least 2, got {draws}")
     if "weights" in options:
-        raise ValueError("weights: want none, for they say here how often a view was drawn")
+        raise ValueError("weights: want none, for they count here how often a view was drawn")
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randint(len(views), (draws, len(views)), generator=generator).to(views.device)
     counts = torch.nn.functional.one_hot(drawn, len(views)).sum(1).to(torch.float64)
@@ -151,17 +152,17 @@ def bootstrap(
 
 
 def _repeated(views: Views, count: int) -> Views:
-    """The same views for many cameras side by side."""
+    """The same views for a batch of cameras."""
     pixels = views.pixels.expand(count, *views.pixels.shape)
     return Views.unchecked(pixels, views.visible.expand(count, *views.visible.shape), views.names, views.size)
 
 
-def _squared_errors(calibration: Calibration, judged: Views) -> tuple[Tensor, Tensor, Tensor]:
-    """Sums of squared errors `(k,)` in pixels and in world units over the corners that are judged, and their number."""
+def _squared_errors(calibration: Calibration, evaluated: Views) -> tuple[Tensor, Tensor, Tensor]:
+    """Sums of squared errors `(k,)` in pixels and in world units over the evaluated corners, and their number."""
     projected, valid = calibration.cameras.project(calibration.board_points.unsqueeze(-3))
-    pixels = judged.pixels.to(projected)
+    pixels = evaluated.pixels.to(projected)
     landed, on_plane = back_project(pixels, calibration.cameras, Plane.z(0.0))
-    counts = judged.visible & valid & on_plane
+    counts = evaluated.visible & valid & on_plane
     px = (projected - pixels).square().sum(-1)
     world = (landed - calibration.points)[..., :2].square().sum(-1)
     total = [torch.where(counts, part, 0.0).sum((-2, -1)) for part in (px, world)]

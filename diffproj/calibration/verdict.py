@@ -1,4 +1,4 @@
-"""How a calibration ended, in words: which views contradict the board, and what the views do not determine."""
+"""Diagnosis of a fit: views that contradict the board, parameters that the views do not determine."""
 
 import math
 
@@ -10,19 +10,21 @@ from diffproj.calibration.fit import Fit, Task
 from diffproj.calibration.solver import Status
 from diffproj.targets.chessboard import Chessboard
 
-WORST_DEVIATION = 0.1
-"""Standard deviation of a focal length or principal point, relative to the focal length, beyond which the views are
-said not to determine it."""
-WORST_FIT = 0.1
-"""RMS residual of a view, relative to how far its corners spread, beyond which they are not the board's."""
-FACE_ON = 0.05
-"""A board whose image changes its scale by less than this part is as good as face on."""
-PARALLEL = math.radians(15)
-"""Boards closer than this to parallel say little of the focal length, and are found tilted at random."""
+MAX_RELATIVE_STD = 0.1
+"""Standard deviation of a focal length or principal point, relative to the focal length, above which it counts as
+undetermined."""
+MAX_RELATIVE_RESIDUAL = 0.1
+"""RMS residual of a view, relative to the RMS distance of its corners from their centroid, above which they do not
+match the board."""
+MIN_FORESHORTENING = 0.05
+"""Relative change of scale over the board's image (foreshortening) below which the view counts as face on."""
+PARALLEL_ANGLE = math.radians(15)
+"""Angle between boards below which they count as parallel: they hardly determine the focal length, and the tilt
+found is arbitrary."""
 
 
 def verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor, tuple[str, ...]]:
-    """The status `(P,)` of each camera, and for those that did not converge the cause; empty where there is none."""
+    """The status `(P,)` of each camera, and the cause in words where it did not converge (else empty)."""
     with torch.inference_mode():
         status, causes = _verdicts(found, names, board)
     return status.clone(), causes
@@ -33,19 +35,19 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     used = task.used.any(-1)
     R, t = solution.local
     known = found.plain_covariance()
-    unpoised = used & known.undetermined_views
-    mirrored = ~unpoised & _mirrored(R, t, task.points, used, board)
-    misfits = ~unpoised & used & (_relative_error(found) > WORST_FIT)
+    no_pose = used & known.undetermined_views
+    mirrored = ~no_pose & _mirrored(R, t, task.points, used, board)
+    misfits = ~no_pose & used & (_relative_error(found) > MAX_RELATIVE_RESIDUAL)
     unknown = known.undetermined.clone()
-    deviation = known.shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, :4]
-    unknown[:, :4] |= ~(deviation <= WORST_DEVIATION * solution.shared[:, :1].abs())
+    std = known.shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, :4]
+    unknown[:, :4] |= ~(std <= MAX_RELATIVE_STD * solution.shared[:, :1].abs())
     none = ~used.any(-1)
     finite = solution.cost.isfinite()
     redundant = (found.degrees_of_freedom() > 0) | (task.prior is not None)
-    if task.basis is not None and task.basis.shape[-1] == 0:  # poses alone: four corners have two residuals to spare
+    if task.basis is not None and task.basis.shape[-1] == 0:  # poses only: four corners leave two degrees of freedom
         unknown[:] = False
     status = solution.status
-    degenerate = none | mirrored.any(-1) | misfits.any(-1) | unknown.any(-1) | unpoised.any(-1) | ~redundant
+    degenerate = none | mirrored.any(-1) | misfits.any(-1) | unknown.any(-1) | no_pose.any(-1) | ~redundant
     status = torch.where(degenerate & finite & (status != Status.DIVERGED), Status.DEGENERATE, status)
     causes = [""] * len(status)
     if not bool(status.any()):
@@ -55,23 +57,25 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
             causes[p] = "no view shows at least 4 corners"
         elif not bool(finite[p]):
             causes[p] = (
-                "some corners have no place on the board, beyond the lens's fold or the horizon: fit a lens with fewer "
+                "the rays of some corners miss the board, beyond the lens's fold or the horizon: fit a lens with fewer "
                 "coefficients, or take objective='image'"
                 if task.objective == "plane" and bool(task.pixels[p][task.used[p]].isfinite().all())
                 else "the corners are not finite, or the start puts the board behind the camera"
             )
         elif status[p] == Status.DIVERGED:
             continue
-        elif bool(unpoised[p].any()):
-            causes[p] = f"the corners of {_listed(names, unpoised[p])} do not determine a pose: do they lie on a line?"
+        elif bool(no_pose[p].any()):
+            causes[p] = (
+                f"the corners of {_joined_names(names, no_pose[p])} do not determine a pose: do they lie on a line?"
+            )
         elif bool(misfits[p].any()):
             causes[p] = (
-                f"the corners of {_listed(names, misfits[p])} do not lie as the board's do: "
-                "are its columns and rows right, and is no corner mixed up?"
+                f"the corners of {_joined_names(names, misfits[p])} do not match the board: "
+                "are its columns and rows right, and are its corners in order?"
             )
         elif bool(mirrored[p].any()):
             causes[p] = (
-                f"{_listed(names, mirrored[p])} show{'s' * (int(mirrored[p].sum()) == 1)} the board mirrored: "
+                f"{_joined_names(names, mirrored[p])} show{'s' * (int(mirrored[p].sum()) == 1)} the board mirrored: "
                 "number the corners of each row from the other end"
             )
         elif not bool(redundant[p]) or bool(unknown[p].any()):
@@ -83,7 +87,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
 
 
 def _relative_error(found: Fit) -> Tensor:
-    """RMS residual of each view, reweighted, over the spread of what it is measured against `(P, V)`."""
+    """Reweighted RMS residual of each view, over the RMS distance of its corners from their centroid, `(P, V)`."""
     task = found.task
     count = task.used.sum(-1).clamp(min=1)
     seen = task.pixels if task.objective == "image" else task.points[:, :2].expand_as(task.pixels)
@@ -94,7 +98,7 @@ def _relative_error(found: Fit) -> Tensor:
 
 
 def _mirrored(R: Tensor, t: Tensor, points: Tensor, used: Tensor, board: object) -> Tensor:
-    """Which views are of the board's other side `(P, V)`: than it prints, or where it does not say, than most."""
+    """Which views show the board mirrored `(P, V)`: against a `Chessboard`'s axes, or else against the majority."""
     middle = R @ points.mean(0) + t
     away = (R[..., 2] * middle).sum(-1) > 0  # the board's z points away from the camera
     if isinstance(board, Chessboard):
@@ -108,21 +112,21 @@ def _undetermined(lacking: list[str], R: Tensor, foreshortening: Tensor, free_pr
     what = f"the views do not determine {', '.join(lacking)}" if lacking else "there are fewer corners than parameters"
     normals = R[..., 2]
     if len(normals) == 1:
-        why = "the only view is seen face on" if foreshortening[0] < FACE_ON else "one view alone says too little"
+        why = "the only view is seen face on" if foreshortening[0] < MIN_FORESHORTENING else "one view is not enough"
         remedy = "add views tilted by 20 to 50 degrees about both axes"
         return f"{what}: {why}; {remedy}{', or fix the principal point' * free_principal_point}"
     across = torch.linalg.cross(normals, normals[:1].expand_as(normals)).norm(dim=-1)
-    if bool((across < math.sin(PARALLEL)).all()):
+    if bool((across < math.sin(PARALLEL_ANGLE)).all()):
         what += ": all views are parallel"
     return f"{what}; add photographs with the board tilted by 20 to 50 degrees about both axes"
 
 
 def _foreshortening(task: Task) -> Tensor:
-    """By what part the scale of the image changes over the board `(P, V)`, whatever the camera."""
+    """Relative change of the image's scale over the board `(P, V)`, from the homography alone."""
     H = homographies(task.points, task.pixels, task.used)
     half = (task.points[:, :2] - task.points[:, :2].mean(0)).abs().amax(0)
     return (H[..., 2, :2].abs() * half).sum(-1) / H[..., 2, 2].abs()
 
 
-def _listed(names: tuple[str, ...], chosen: Tensor) -> str:
+def _joined_names(names: tuple[str, ...], chosen: Tensor) -> str:
     return ", ".join(names[i] for i in chosen.nonzero().flatten().tolist())

@@ -34,9 +34,9 @@ from diffproj._core.numerics import (
     dot,
     entries,
     in_blocks,
+    in_float64,
     interleaved,
     linear,
-    precise,
     rounding,
 )
 from diffproj.geometry.camera import Camera, as_camera
@@ -271,15 +271,15 @@ def _denominator(b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[T
 
 def _plane_matrix(camera: Camera, plane: Plane) -> Tensor:
     """`M (*B, 4, 3)` in float64, scaled to `max |M| = 1`; zero where the camera's centre lies in the plane."""
-    R, t = precise(camera.R), precise(camera.t)
-    normal, offset = precise(plane.normal), precise(plane.offset)
+    R, t = in_float64(camera.R), in_float64(camera.t)
+    normal, offset = in_float64(plane.normal), in_float64(plane.offset)
     b = dot(R, normal.unsqueeze(-2))  # the normal in the camera frame: n . C = -b . t
     center = -dot(R.mT, t.unsqueeze(-2))
     height = offset + dot(b, t)
     A = center.unsqueeze(-1) * b.unsqueeze(-2) + height[..., None, None] * R.mT
     M = torch.cat([A, b.unsqueeze(-2)], dim=-2)
     if camera.distortion is None:  # so far G is R^T, as behind a lens: a pinhole's M is that times diag(F^-1, 1)
-        F_inverse = pixel_to_normalized(precise(camera.K))
+        F_inverse = pixel_to_normalized(in_float64(camera.K))
         M = torch.cat([(M[..., :2].unsqueeze(-1) * F_inverse.unsqueeze(-3)).sum(dim=-2), M[..., 2:]], dim=-1)
     with torch.no_grad():  # the factor changes no point, so no derivative has to pass through it
         resting = rounding(camera.dtype) * (offset.abs() + vector_norm(b, dim=-1) * vector_norm(t, dim=-1))

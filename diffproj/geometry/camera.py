@@ -25,9 +25,9 @@ from diffproj._core.numerics import (
     check_tensor,
     dot,
     entries,
+    has_values,
     in_blocks,
     linear,
-    readable,
     transform,
 )
 from diffproj.geometry.exchange import Exchange
@@ -97,7 +97,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             raise TypeError(
                 f"distortion: want a lens such as dp.BrownConrady(coefficients), got {type(distortion).__name__}"
             )
-        if readable(K, R, t):
+        if has_values(K, R, t):
             check_intrinsics(K)
             _check_pose(R, t)
         self._assign(K, R, t, distortion, checked_size(size))
@@ -152,7 +152,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             ValueError: wrong shapes or devices, or an R that is no rotation.
         """
         R, t = check_tensor("R", R, 3, 3), check_tensor("t", t, 3)
-        if readable(R, t):
+        if has_values(R, t):
             _check_pose(R, t)
         return self._with(R=R, t=t)
 
@@ -213,7 +213,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         matrix = check_tensor("matrix", matrix, 3, 3)
         check_same_kind(camera=self.K, matrix=matrix)
         broadcast_batches(camera=self.batch_shape, matrix=matrix.shape[:-2])
-        if readable(matrix):
+        if has_values(matrix):
             check_warp(matrix, self.K, behind_lens=self.distortion is not None)
         ahead = self.K[..., :2, 2]
         if self.size is not None:

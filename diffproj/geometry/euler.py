@@ -1,16 +1,16 @@
-"""Rotations by angles: the paper's Euler angles, both ways. Axis-angle vectors come from Kornia.
+"""Rotation matrices from the paper's Euler angles, and the inverse; for axis-angle vectors see Kornia.
 
 The paper (Siswantoro et al. 2013, Eq. 1) composes a rotation from three angles in radians,
 
     R = R_x(psi) R_y(phi) R_z(theta),
 
-each factor turning by the right-hand rule about its axis. Written out,
+each factor a right-handed rotation about its axis. Written out,
 
     R = [ cos phi cos theta                      -cos phi sin theta                       sin phi          ]
         [ ...                                     ...                                    -sin psi cos phi  ]
         [ ...                                     ...                                     cos psi cos phi  ]
 
-from which the angles are read off again. At phi = +-pi/2 only psi +- theta is determined; psi is taken as 0 there.
+from which the angles are recovered. At phi = +-pi/2 (gimbal lock) only psi +- theta is determined, and psi is set to 0.
 """
 
 import torch
@@ -39,7 +39,7 @@ def rotation_from_euler(
     Example:
         >>> quarter = torch.tensor(torch.pi / 2, dtype=torch.float64)
         >>> zero = torch.zeros_like(quarter)
-        >>> rotation_from_euler(zero, zero, quarter).round().int()  # +x turns to +y
+        >>> rotation_from_euler(zero, zero, quarter).round().int()  # rotates +x to +y
         tensor([[ 0, -1,  0],
                 [ 1,  0,  0],
                 [ 0,  0,  1]], dtype=torch.int32)
@@ -60,14 +60,14 @@ def rotation_from_euler(
 def euler_from_rotation(
     R: Float[Tensor, "*batch 3 3"],
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Read `psi`, `phi`, `theta` off `R = R_x(psi) R_y(phi) R_z(theta)`.
+    """Recover `psi`, `phi`, `theta` from `R = R_x(psi) R_y(phi) R_z(theta)`.
 
     Args:
         R: rotation matrices `(*B, 3, 3)`.
 
     Returns:
-        `(psi, phi, theta)` in radians, each `(*B,)`; `phi` lies in [-pi/2, pi/2]. At `phi = +-pi/2`, where only a
-        combination of the other two is determined, `psi` is 0.
+        `(psi, phi, theta)` in radians, each `(*B,)`; `phi` is in [-pi/2, pi/2]. At gimbal lock, `phi = +-pi/2`, where
+        only a combination of the other two is determined, `psi` is 0.
 
     Raises:
         TypeError: `R` is no floating-point tensor.
@@ -82,7 +82,7 @@ def euler_from_rotation(
     cos_phi_squared = R[..., 0, 0] ** 2 + R[..., 0, 1] ** 2
     locked = cos_phi_squared <= (16 * torch.finfo(R.dtype).eps) ** 2
     one, zero = torch.ones_like(cos_phi_squared), torch.zeros_like(cos_phi_squared)
-    # atan2(0, 0) and sqrt(0) have no derivative: their arguments are replaced where the angles are locked.
+    # atan2(0, 0) and sqrt(0) have no derivative: their arguments are replaced at gimbal lock.
     phi = torch.atan2(R[..., 0, 2], torch.where(locked, zero, torch.where(locked, one, cos_phi_squared).sqrt()))
     psi = torch.atan2(torch.where(locked, zero, -R[..., 1, 2]), torch.where(locked, one, R[..., 2, 2]))
     theta = torch.atan2(

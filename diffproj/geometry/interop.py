@@ -1,7 +1,7 @@
-"""The parts of a camera in other libraries' shapes: OpenCV's arrays, Kornia's `PinholeCamera`.
+"""Conversion of a camera's parameters from and to OpenCV's arrays and Kornia's `PinholeCamera`.
 
-Both share diffproj's conventions (world to camera, pixel centres at integers), so only shapes and types change here;
-rotation vectors are axis times angle in radians. This file knows tensors only: `Camera` puts them together.
+Both share diffproj's conventions (world to camera, pixel centres at integers), so only shapes and types change;
+rotation vectors are axis times angle in radians. This file handles tensors only; `Camera` is built from them elsewhere.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from diffproj._core.numerics import lifted, readable
+from diffproj._core.numerics import at_least_float32, has_values
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 
@@ -22,9 +22,9 @@ ArrayLike = Tensor | np.ndarray | Sequence[Any]
 def tensors_from_opencv(
     K: ArrayLike, dist: ArrayLike | None, rvec: ArrayLike | None, tvec: ArrayLike | None
 ) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]:
-    """`(K, coefficients, R, t)` with OpenCV's rows and columns flattened; what is absent stays `None`.
+    """`(K, coefficients, R, t)` with OpenCV's row and column vectors flattened; absent arguments stay `None`.
 
-    Arrays become float64, or take the dtype and device of a tensor K; tensors keep their graph.
+    Arrays become float64, or take the dtype and device of K if it is a tensor; tensors keep their autograd graph.
 
     Raises:
         ValueError: a vector is neither `(*B, k)` nor a row or column.
@@ -51,7 +51,7 @@ def arrays_for_opencv(
     """`(K, dist, rvec, tvec)` as float64 arrays with the batch axes in front.
 
     Raises:
-        ValueError: K has skew or turns the image: OpenCV reads only focal lengths and principal point.
+        ValueError: K has skew or a rotation of the image: OpenCV uses only focal lengths and principal point.
     """
     K_array, R_array, t_array = _array(K), _array(R), _array(t)
     if np.any(K_array[..., 0, 1]) or np.any(K_array[..., 1, 0]):
@@ -70,12 +70,12 @@ def tensors_from_kornia(pinhole: PinholeCamera) -> tuple[Tensor, Tensor, Tensor,
     """
     K, R, t = pinhole.intrinsics[..., :3, :3], pinhole.extrinsics[..., :3, :3], pinhole.extrinsics[..., :3, 3]
     size = None
-    if readable(pinhole.width, pinhole.height):
+    if has_values(pinhole.width, pinhole.height):
         sizes = {(int(w), int(h)) for w, h in zip(pinhole.width, pinhole.height, strict=True)}
         if len(sizes) > 1:
             raise ValueError(f"camera: want one image size for the batch, got {sorted(sizes)}; convert them one by one")
         size = sizes.pop()
-    return lifted(K), lifted(R), lifted(t), size
+    return at_least_float32(K), at_least_float32(R), at_least_float32(t), size
 
 
 def pinhole_from_tensors(K: Tensor, R: Tensor, t: Tensor, size: tuple[int, int]) -> PinholeCamera:
@@ -104,7 +104,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _vector(name: str, value: Tensor, batch: torch.Size) -> Tensor:
-    """A vector behind its batch axes, whether OpenCV gave it as a row `(1, k)` or a column `(k, 1)`."""
+    """A vector `(*B, k)` from one that OpenCV may give as a row `(1, k)` or a column `(k, 1)`."""
     if value.ndim >= 2 and value.shape[-1] == 1:
         return value.squeeze(-1)
     if value.ndim == len(batch) + 2 and value.shape[-2] == 1:

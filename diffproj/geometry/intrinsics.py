@@ -1,32 +1,32 @@
-"""The intrinsics `K = [[F, c], [0, 0, 1]]`: as a matrix, as a row of numbers, and as the image is warped under them.
+"""The intrinsics `K = [[F, c], [0, 0, 1]]`: as a matrix, as parameters, and under a warp of the image.
 
-`F` is `diag(f_x, f_y)` for a camera as it was calibrated. An image that was turned, mirrored or sheared afterwards has
-another invertible 2x2 matrix in its place, and stays exact.
+`F` is `diag(f_x, f_y)` for a calibrated camera. After a rotation, reflection or shear of the image it is another
+invertible 2x2 matrix, and the camera model stays exact.
 """
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.numerics import precise
+from diffproj._core.numerics import in_float64
 
 
 def intrinsic_matrix(
     focal: Float[Tensor, "*batch 2"], center: Float[Tensor, "*batch 2"]
 ) -> Float[Tensor, "*batch 3 3"]:
-    """K of focal lengths and principal point, in px."""
+    """K from focal lengths and principal point, in px."""
     (f_x, f_y), (c_x, c_y) = focal.unbind(-1), center.unbind(-1)
     zero, one = torch.zeros_like(f_x), torch.ones_like(f_x)
     return torch.stack([f_x, zero, c_x, zero, f_y, c_y, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
 
 
 def focal_and_center(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """`f_x f_y c_x c_y` of a K without skew: the inverse of `intrinsic_matrix`."""
+    """`f_x f_y c_x c_y` from a K without skew: the inverse of `intrinsic_matrix`."""
     return torch.cat([K.diagonal(dim1=-2, dim2=-1)[..., :2], K[..., :2, 2]], dim=-1)
 
 
 def pixel_to_normalized(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 2 2"]:
-    """The inverse of `F`: takes a pixel's offset from the principal point to the normalised plane."""
+    """The inverse of `F`: maps a pixel's offset from the principal point to the normalised plane."""
     a, b, c, d = K[..., :2, :2].flatten(-2).unbind(-1)
     determinant = torch.addcmul(a * d, b, c, value=-1)
     return (torch.stack([d, -b, -c, a], dim=-1) / determinant.unsqueeze(-1)).unflatten(-1, (2, 2))
@@ -35,25 +35,25 @@ def pixel_to_normalized(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch
 def warped(
     K: Float[Tensor, "*#batch 3 3"], matrix: Float[Tensor, "*#batch 3 3"], ahead: Float[Tensor, "*#batch 2"]
 ) -> tuple[Float[Tensor, "*out 3 3"], Float[Tensor, "*out 3 3"]]:
-    """The intrinsics behind a warp of the image, and the rotation of the camera that goes with them.
+    """The intrinsics of a warped image, and the rotation of the camera that the warp implies.
 
-    A warp takes homogeneous pixels `p = K X_cam` to `H p`. `H K` splits into new intrinsics and a rotation,
+    A warp maps homogeneous pixels `p = K X_cam` to `H p`. `H K` factors into new intrinsics and a rotation,
 
         H K = |g| K' Q,        g the last row of H K, and the last row of Q its direction,
 
-    so the warped image is that of a camera with `K'`, turned by `Q`: `X_cam' = Q X_cam`. Of all such rotations Q is the
-    smallest; it is the identity where H is affine. H counts up to its factor, whose sign is such that a pixel `ahead`
-    stays in front of the camera.
+    so the warped image is that of a camera with `K'`, rotated by `Q`: `X_cam' = Q X_cam`. Of all such rotations Q is
+    the smallest; it is the identity where H is affine. The scale of H is arbitrary; its sign is chosen such that the
+    pixel `ahead` stays in front of the camera.
 
     Args:
         K: `(*B, 3, 3)`.
-        matrix: H `(*B, 3, 3)`, from pixels of the image to those of the warped one.
+        matrix: H `(*B, 3, 3)`, from pixels of the image to pixels of the warped image.
         ahead: a pixel `(*B, 2)` of the image that the warped image shows.
 
     Returns:
         `K'` and `Q`, both `(*B, 3, 3)` in the dtype of K.
     """
-    G = (precise(matrix).unsqueeze(-1) * precise(K).unsqueeze(-3)).sum(-2)
+    G = (in_float64(matrix).unsqueeze(-1) * in_float64(K).unsqueeze(-3)).sum(-2)
     w = (matrix[..., 2, :2] * ahead).sum(-1) + matrix[..., 2, 2]
     G = torch.where((w < 0)[..., None, None], -G, G)
     length = G[..., 2, :].norm(dim=-1)[..., None, None]
@@ -73,7 +73,7 @@ def check_intrinsics(K: Tensor) -> None:
     """Check values of K.
 
     Raises:
-        ValueError: not finite, another last row than (0, 0, 1), or no inverse.
+        ValueError: not finite, a last row other than (0, 0, 1), or singular.
     """
     last_row = K.new_tensor([0.0, 0.0, 1.0])
     if not bool(K.isfinite().all()):
@@ -87,10 +87,10 @@ def check_intrinsics(K: Tensor) -> None:
 
 
 def check_no_skew(K: Tensor) -> None:
-    """Check that F is diagonal, for where f_x, f_y, c_x and c_y stand for all of K.
+    """Check that F is diagonal, so that f_x, f_y, c_x and c_y represent K completely.
 
     Raises:
-        ValueError: it is not.
+        ValueError: F is not diagonal.
     """
     if bool((K[..., 0, 1] != 0).any() or (K[..., 1, 0] != 0).any()):
         raise ValueError("camera: want no skew, got K[..., 0, 1] or K[..., 1, 0] other than 0")
@@ -100,12 +100,12 @@ def check_warp(matrix: Tensor, K: Tensor, behind_lens: bool) -> None:
     """Check values of a warp of a camera's image.
 
     Raises:
-        ValueError: not finite, no inverse, or a projective warp of an image behind a lens.
+        ValueError: not finite, singular, or a projective warp for a camera with a lens.
     """
     if not bool(matrix.isfinite().all()):
         raise ValueError("matrix: want finite values, got NaN or infinity")
-    # Behind K the numbers of a row are of one size, whatever the warp shifts and scales.
-    rows = (precise(matrix).unsqueeze(-1) * precise(K).unsqueeze(-3)).sum(-2)
+    # Multiplied by K, the entries of a row have similar magnitudes, whatever the warp's shift and scale.
+    rows = (in_float64(matrix).unsqueeze(-1) * in_float64(K).unsqueeze(-3)).sum(-2)
     rows = rows / rows.norm(dim=-1, keepdim=True)
     if not bool((torch.linalg.det(rows).abs() > 8 * torch.finfo(matrix.dtype).eps).all()):
         raise ValueError("matrix: want an invertible one, got a singular one")

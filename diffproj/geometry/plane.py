@@ -20,7 +20,7 @@ from diffproj._core.numerics import (
     check_same_kind,
     check_tensor,
     dot,
-    readable,
+    has_values,
 )
 
 Numbers = Sequence[float] | float
@@ -69,7 +69,7 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         normal, offset = check_tensor("normal", normal, 3), check_tensor("offset", offset)
         check_same_kind(normal=normal, offset=offset)
         batch = broadcast_batches(normal=normal.shape[:-1], offset=offset.shape)
-        if readable(normal, offset):
+        if has_values(normal, offset):
             if not bool(normal.isfinite().all() and offset.isfinite().all()):
                 raise ValueError("plane: want a finite normal and offset, got NaN or infinity")
             if bool((normal == 0).all(dim=-1).any()):
@@ -146,7 +146,7 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         points = check_tensor("points", points, "N", 3)
         if points.shape[-2] < 3:
             raise ValueError(f"points: want at least 3, got {points.shape[-2]}")
-        if readable(points) and not bool(points.isfinite().all()):
+        if has_values(points) and not bool(points.isfinite().all()):
             raise ValueError("points: want finite values, got NaN or infinity")
         centroid = points.mean(dim=-2)
         spread = points - centroid.unsqueeze(-2)
@@ -178,7 +178,7 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         return super().__getitem__(index)
 
     def __repr__(self) -> str:
-        if self.batch_shape or not readable(self.normal):
+        if self.batch_shape or not has_values(self.normal):
             return f"Plane(batch_shape={tuple(self.batch_shape)}, per_point={self.is_per_point}, {self.dtype})"
         return f"Plane(normal={self.normal.tolist()}, offset={self.offset.item():g})"
 
@@ -255,7 +255,7 @@ def _smallest_eigenvector(scatter: Tensor) -> Tensor:
     """
     with torch.no_grad():
         values, vectors = torch.linalg.eigh(scatter.detach())
-        if readable(values) and bool((values[..., 1] <= 64 * torch.finfo(values.dtype).eps * values[..., 2]).any()):
+        if has_values(values) and bool((values[..., 1] <= 64 * torch.finfo(values.dtype).eps * values[..., 2]).any()):
             raise ValueError("points: want three that are not on one line, got points on a line")
         start, value = vectors[..., 0], values[..., 0]
     identity = torch.eye(3, dtype=scatter.dtype, device=scatter.device)

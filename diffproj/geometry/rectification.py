@@ -1,12 +1,12 @@
 """Metric top views of a plane, and the way back: `rectify` an image, `render` a texture.
 
-A top view is an image of a plane in world units: column j and row i of a rectangle of the plane's own two coordinates,
+A top view is an image of a plane in world units. Its column j and row i are at the plane's own coordinates (s, t),
 
     s = s_min + (j + 1/2) resolution        t = t_min + (i + 1/2) resolution        X = origin + s axis_s + t axis_t
 
-Pixels stand for squares, so that areas and edges keep their places at any resolution. Every pixel of either image is
-looked up in the other through the camera, lens included; where the other is finer, several samples are averaged, so
-that nothing aliases. Both are differentiable in image and camera.
+A pixel covers a square, so that areas and edges keep their places at any resolution. Every pixel of the target image
+is mapped to the source image through the camera, lens included. Where its footprint there is larger than a pixel, it is
+supersampled, by at most 8 x 8 bilinear samples, against aliasing. Both are differentiable in image and camera.
 """
 
 import math
@@ -25,17 +25,17 @@ from diffproj.geometry.grid import inside, pixel_grid
 from diffproj.geometry.plane import Plane
 
 LookUp = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Takes an offset in a pixel of the target, from 0 to 1, to places in the source `(*B, N, 2)`, and which are valid."""
-MOST_SAMPLES = 8
-"""Samples along each side of a pixel, at most."""
+"""Maps an offset within the target's pixels, from 0 to 1, to positions in the source `(*B, N, 2)` and `valid`."""
+MAX_SUPERSAMPLING = 8
+"""Maximum number of samples along each side of a pixel."""
 
 
 def plane_axes(plane: Plane) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
-    """The axes that top views use where none are given: `(origin, axis_s, axis_t)`, unit vectors at right angles.
+    """Default axes of top views: `(origin, axis_s, axis_t)`, the axes orthonormal.
 
     On a plane of constant z they are the world's: the point `(0, 0, z)`, x and y. On another plane `axis_s` is the
-    direction nearest to the world's x (to y, where the plane is nearly at right angles to x), `axis_t` completes
-    `axis_s x axis_t = n` for the normal turned to positive z, and the origin is the point nearest to the world's.
+    projection of the world's x (of y, where the normal is within 26 degrees of x), `axis_t` completes
+    `axis_s x axis_t = n` for the normal n turned to positive z, and the origin is the point closest to the world's.
 
     Args:
         plane: of batch shape `*B`.
@@ -68,15 +68,15 @@ def rectify(
 
     Args:
         image: `(*B, C, H, W)`, floating point.
-        camera: at its pose, of batch shape `*B`; the image is taken to be its whole image.
+        camera: with its pose, of batch shape `*B`; the image is taken to be its full image.
         plane: of batch shape `*B`.
         extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes.
-        resolution: world units a pixel of the top view.
+        resolution: world units per pixel of the top view.
         axes: `(origin, axis_s, axis_t)`, each `(*B, 3)`; those of `plane_axes` if left out.
 
     Returns:
-        The top view `(*B, C, rows, columns)`, and which of its pixels the image shows `(*B, rows, columns)`; 0
-        elsewhere.
+        The top view `(*B, C, rows, columns)`, 0 where not valid; and `valid (*B, rows, columns)`: at least half of the
+        pixel's samples are in the image.
 
     Raises:
         TypeError: the image is no floating-point tensor.
@@ -115,18 +115,19 @@ def render(
     size: tuple[int, int] | None = None,
     axes: tuple[Tensor, Tensor, Tensor] | None = None,
 ) -> tuple[Float[Tensor, "*out c h w"], Bool[Tensor, "*out h w"]]:
-    """Paint a plane's texture into a camera's image: the inverse of `rectify`.
+    """Render a plane's texture into a camera's image: the inverse of `rectify`.
 
     Args:
         texture: `(*B, C, rows, columns)`, floating point, filling the extent.
-        camera: at its pose, of batch shape `*B`.
+        camera: with its pose, of batch shape `*B`.
         plane: of batch shape `*B`.
         extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes.
         size: `(width, height)` of the image; the camera's if left out.
         axes: `(origin, axis_s, axis_t)`, each `(*B, 3)`; those of `plane_axes` if left out.
 
     Returns:
-        The image `(*B, C, H, W)`, and which of its pixels show the texture `(*B, H, W)`; 0 elsewhere.
+        The image `(*B, C, H, W)`, 0 where not valid; and `valid (*B, H, W)`: at least half of the pixel's samples are
+        on the texture.
 
     Raises:
         TypeError: the texture is no floating-point tensor.
@@ -137,7 +138,7 @@ def render(
         >>> K = torch.tensor([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
         >>> camera = dp.Camera(K, t=torch.tensor([0.0, 0, 1000]), size=(640, 480))
         >>> image, valid = render(torch.ones(1, 50, 100), camera, dp.Plane.z(0.0), (-100, -50, 100, 50))
-        >>> image.shape, int(valid.sum())  # 200 x 100 world units at 2 a pixel
+        >>> image.shape, int(valid.sum())  # 200 x 100 world units at 2 per pixel
         (torch.Size([1, 480, 640]), 5000)
     """
     texture, camera = _checked_image(texture), as_camera(camera)
@@ -165,8 +166,8 @@ def render(
 def _resampled(
     source: Tensor, look_up: LookUp, shape: tuple[int, int], size: tuple[int, int], like: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The mean of the samples of a source, `size` in pixels, that the pixels of a target of that shape look at."""
-    n = _samples(look_up, shape, size, like)
+    """Resample a source, of `(width, height)` `size`, to a target of `(rows, columns)` `shape`, with supersampling."""
+    n = _supersampling(look_up, shape, size, like)
     steps = ((torch.arange(n, dtype=like.dtype, device=like.device) + 0.5) / n).tolist()
     total, counts = torch.zeros((), dtype=source.dtype, device=source.device), torch.zeros((), device=source.device)
     for down in steps:
@@ -178,26 +179,26 @@ def _resampled(
     return torch.where(covered.unsqueeze(-3), mean, 0.0), covered
 
 
-def _samples(look_up: LookUp, shape: tuple[int, int], size: tuple[int, int], like: Tensor) -> int:
-    """How many pixels of the source nine tenths of the target's pixels are wide at most."""
+def _supersampling(look_up: LookUp, shape: tuple[int, int], size: tuple[int, int], like: Tensor) -> int:
+    """Samples per side: the side of the target pixels' footprint in the source, 90th percentile, at most 8."""
     with torch.no_grad():
         places, valid = look_up(like.new_tensor([0.5, 0.5]))
         shown = (valid & inside(places, size)).unflatten(-1, shape)
         places = places.unflatten(-2, shape)
-        widest = 1.0
+        footprint = 1.0
         for axis in (-1, -2):
             step = places.diff(dim=axis - 1).norm(dim=-1)
             count = shown.shape[axis] - 1
             step = step[shown.narrow(axis, 0, count) & shown.narrow(axis, 1, count)]
             if len(step):
-                widest = max(widest, float(step[:: 1 + len(step) // 100_000].quantile(0.9)))
-    return min(MOST_SAMPLES, math.ceil(widest - 0.25))
+                footprint = max(footprint, float(step[:: 1 + len(step) // 100_000].quantile(0.9)))
+    return min(MAX_SUPERSAMPLING, math.ceil(footprint - 0.25))
 
 
 def _sampled(
     source: Tensor, places: Tensor, valid: Tensor, shape: tuple[int, int], size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Bilinear samples `(*B, C, rows, columns)` of a source of that size, and where there are any."""
+    """Bilinear samples `(*B, C, rows, columns)` of the source at `places`, and which are inside it."""
     seen = valid & inside(places, size)
     last = places.new_tensor([max(size[0] - 1, 1), max(size[1] - 1, 1)])
     grid = torch.where(seen.unsqueeze(-1), places, 0.0) * 2 / last - 1
@@ -215,7 +216,7 @@ def _shape(extent: Sequence[float], resolution: float) -> tuple[int, int]:
     if not (s_max > s_min and t_max > t_min):
         raise ValueError(f"extent: want (s_min, t_min, s_max, t_max) with room between, got {tuple(extent)}")
     if not resolution > 0:
-        raise ValueError(f"resolution: want world units a pixel, above 0, got {resolution}")
+        raise ValueError(f"resolution: want world units per pixel, above 0, got {resolution}")
     return max(1, round((t_max - t_min) / resolution)), max(1, round((s_max - s_min) / resolution))
 
 

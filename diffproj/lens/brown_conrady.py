@@ -1,12 +1,13 @@
-"""`BrownConrady`: the lens of OpenCV's calibration, with an exact inverse and an honest domain.
+"""`BrownConrady`: OpenCV's lens model with an exact inverse and a domain on which it is proven to be one-to-one.
 
-Forward, the equations of `brown_equations`. Backward, Newton's method on them (the tilt, a homography, is undone in
-closed form first), in three parts:
+`distort` evaluates the equations of `brown_equations`. `undistort` inverts them by Newton's method (the tilt, a
+homography, is inverted in closed form first), in three stages:
 
-1. a start from a table of the inverse along the radius;
-2. a fixed number of Newton steps without a gradient tape, and a patient search for the few points they leave over;
-3. where a derivative is wanted, two more steps with the tape on. One step at the solution already has the exact first
-   derivative of the inverse function, two have the second.
+1. an initial estimate from a table of the inverse along the radius;
+2. a fixed number of Newton steps without autograd, then a globally convergent search, with a maximum number of steps,
+   for the few points that have not converged;
+3. where a derivative is wanted, two more Newton steps recorded by autograd. At the solution, one step has the exact
+   first derivative of the inverse function, two have the second.
 """
 
 import torch
@@ -26,16 +27,16 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
     """Radial, tangential, rational, thin-prism and tilt distortion, in OpenCV's order of coefficients.
 
     `k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]`, without unit but for the tilt angles, which are in
-    radians. Points are on the normalised plane `z = 1` of the camera frame (x right, y down, z forward). The lens
-    answers on a disc around the axis, `domain`, on which it is provably one-to-one; `valid` is false elsewhere, and
-    the result (0, 0) there.
+    radians. Points are on the normalised plane `z = 1` of the camera frame (x right, y down, z forward). Results are
+    valid on a disc around the axis, of radius `domain`, on which the lens is proven to be one-to-one; elsewhere
+    `valid` is false and the result is (0, 0).
 
     Args:
-        coefficients: `(*B, k)` with k one of 4, 5, 8, 12, 14; kept as they are, gradients flow to them.
+        coefficients: `(*B, k)` with k one of 4, 5, 8, 12, 14; differentiable.
 
     Raises:
         TypeError: not a floating-point tensor.
-        ValueError: no such number of coefficients, or a coefficient that is not finite.
+        ValueError: another number of coefficients, or a coefficient that is not finite.
 
     Example:
         >>> lens = BrownConrady(torch.tensor([-0.25, 0.09, 0.0, 0.0, -0.02], dtype=torch.float64))
@@ -51,21 +52,21 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
 
     @property
     def domain(self) -> Float[Tensor, "*lens"]:
-        """The radius of the disc of undistorted points on which the lens is one-to-one, `(*B,)`, without gradient.
+        """Radius of the disc of undistorted points on which the lens is one-to-one, `(*B,)`, without gradient.
 
-        The largest around the axis on which the symmetric part of the Jacobian is positive definite, rounded inward.
-        Infinite where the lens has no fold.
+        The largest disc around the axis on which the symmetric part of the Jacobian is positive definite; its radius
+        is rounded down. Infinite for a lens without a fold.
         """
         return self._domain()
 
     def distort(self, xy: Float[Tensor, "*batch n 2"]) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
-        """Undistorted points to distorted ones, both on the normalised plane.
+        """Distort points of the normalised plane.
 
         Args:
-            xy: `(*B, N, 2)`; batch axes broadcast against those of the lens.
+            xy: undistorted points `(*B, N, 2)`; batch axes broadcast against those of the lens.
 
         Returns:
-            Distorted points, and `valid`: inside the domain and finite. (0, 0) with zero gradient where not.
+            Distorted points, and `valid`: inside the domain and finite. (0, 0) with zero gradient where not valid.
         """
         xy = self._checked("xy", xy, 2)
         domain = self._domain()
@@ -86,16 +87,17 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
     def undistort(
         self, xy_distorted: Float[Tensor, "*batch n 2"]
     ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
-        """Distorted points to undistorted ones, both on the normalised plane: the exact inverse of `distort`.
+        """Undistort points of the normalised plane: the exact inverse of `distort`.
 
-        Derivatives are those of the inverse function, to second order, in points and coefficients, in reverse and in
+        First and second derivatives by points and coefficients are those of the inverse function, in reverse and
         forward mode.
 
         Args:
-            xy_distorted: `(*B, N, 2)`; batch axes broadcast against those of the lens.
+            xy_distorted: distorted points `(*B, N, 2)`; batch axes broadcast against those of the lens.
 
         Returns:
-            Undistorted points, and `valid`: there is one inside the domain. (0, 0) with zero gradient where not.
+            Undistorted points, and `valid`: a solution inside the domain was found. (0, 0) with zero gradient where
+            not valid.
         """
         xy_distorted = self._checked("xy_distorted", xy_distorted, 2)
         plan = self._plan()
@@ -115,14 +117,14 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
     def project_direction(
         self, direction: Float[Tensor, "*batch n 3"]
     ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
-        """Where directions of the camera frame arrive on the normalised plane.
+        """Project directions of the camera frame to distorted points on the normalised plane.
 
         Args:
             direction: `(*B, N, 3)`, of any length.
 
         Returns:
             Distorted points `(*B, N, 2)`, and `valid`: in front of the camera and inside the domain. (0, 0) with zero
-            gradient where not.
+            gradient where not valid.
         """
         direction = self._checked("direction", direction, 3)
         x, y, z = direction.unbind(-1)
@@ -135,7 +137,7 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
     def unproject(
         self, xy_distorted: Float[Tensor, "*batch n 2"]
     ) -> tuple[Float[Tensor, "*out n 3"], Bool[Tensor, "*out n"]]:
-        """The directions `(x, y, 1)` that arrive at distorted points; (0, 0, 1) where not valid."""
+        """Directions `(x, y, 1)` whose projections are the distorted points; (0, 0, 1) where not valid."""
         xy, valid = self.undistort(xy_distorted)
         return torch.nn.functional.pad(xy, (0, 1), value=1.0), valid
 

@@ -26,11 +26,12 @@ from torch import Tensor
 from diffproj.lens.polynomial import minus_product, polynomial
 
 COUNTS = (4, 5, 8, 12, 14)
+"""Numbers of coefficients that the model can have."""
 Columns = tuple[Tensor, ...]
 
 
 class Tilt(NamedTuple):
-    """Cosines and sines of the two angles, columns `(*B, 1)`."""
+    """Cosines and sines of the two tilt angles, columns `(*B, 1)`."""
 
     cos_x: Tensor
     sin_x: Tensor
@@ -42,7 +43,7 @@ class Tilt(NamedTuple):
         return self.sin_y * x - self.cos_y * self.sin_x * y + self.cos_x * self.cos_y
 
     def clearance(self, x: Tensor, y: Tensor) -> Tensor:
-        """The depth relative to its terms: close to 0 near the tilted sensor's horizon."""
+        """`W` relative to the sum of its terms' magnitudes: close to 0 near the tilted sensor's horizon."""
         terms = self.sin_y * x, self.cos_y * self.sin_x * y, self.cos_x * self.cos_y
         return self.depth(x, y) / sum(term.abs() for term in terms)
 
@@ -52,7 +53,7 @@ class Tilt(NamedTuple):
         return self.cos_x * x / depth, (self.cos_y * y - self.sin_x * self.sin_y * x) / depth
 
     def undo(self, x_tilted: Tensor, y_tilted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The point `(x', y')` that `apply` takes there, and `1 / W`, which must be positive."""
+        """The inverse of `apply`: the point `(x', y')`, and `1 / W`, which must be positive."""
         x = x_tilted / self.cos_x
         y = (y_tilted + self.sin_x * self.sin_y * x) / self.cos_y
         inverse_depth = (1 - self.sin_y * x + self.cos_y * self.sin_x * y) / (self.cos_x * self.cos_y)
@@ -60,17 +61,17 @@ class Tilt(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """The coefficients sorted by what they do, as columns `(*B, 1)` that broadcast against points `(*B, N)`.
+    """The coefficients grouped by term, as columns `(*B, 1)` that broadcast against points `(*B, N)`.
 
-    Polynomials are in `s`, lowest power first. A slope is twice a derivative by `s`: times `x` it is one by `x`.
+    Polynomials are in `s`, lowest power first. A "slope" is twice the derivative by `s`: times `x` it is that by `x`.
 
     Attributes:
-        above, above_slope: the radial numerator without its 1, divided by `s`; the slope of the numerator.
-        below, below_slope: the same of the denominator; `None` where the lens has none.
+        above, above_slope: `(numerator - 1) / s` of the radial factor; the slope of the numerator.
+        below, below_slope: the same for the denominator; `None` without rational terms.
         one, two_p1, two_p2: constants.
-        sideways_x, sideways_y: what is multiplied by `s` in a fixed direction: `p2 + s1 + s2 s` and `p1 + s3 + s4 s`.
+        sideways_x, sideways_y: the part of fixed direction, divided by `s`: `p2 + s1 + s2 s` and `p1 + s3 + s4 s`.
         sideways_slope_x, sideways_slope_y: the slopes of `s` times that.
-        tilt: `None` where the lens has none.
+        tilt: `None` without tilt.
     """
 
     above: Columns
@@ -88,7 +89,7 @@ class Terms(NamedTuple):
 
     @classmethod
     def of(cls, coefficients: Tensor) -> "Terms":
-        """Sort coefficients `(*B, k)`."""
+        """Group coefficients `(*B, k)`."""
         k1, k2, p1, p2, *rest = coefficients.unsqueeze(-2).unbind(-1)
         above = k1, k2, *rest[:1]
         below = tuple(rest[1:4])
@@ -115,7 +116,7 @@ def _slope(over_s: Columns) -> Columns:
 
 
 class Jacobian(NamedTuple):
-    """Derivatives of `(x', y')`: `xy` is that of `x'` by `y`."""
+    """Derivatives of `(x', y')` by `(x, y)`: `xy` is that of `x'` by `y`."""
 
     xx: Tensor
     xy: Tensor
@@ -124,7 +125,7 @@ class Jacobian(NamedTuple):
 
 
 def denominator(terms: Terms, s: Tensor) -> Tensor:
-    """That of the radial factor `g`, at squared radii `s`."""
+    """Denominator of the radial factor `g`, at squared radii `s`."""
     return torch.ones_like(s) if terms.below is None else 1 + s * polynomial(s, terms.below)
 
 
@@ -148,7 +149,7 @@ def radial_slope(terms: Terms, s: Tensor, factor: Tensor) -> Tensor:
 
 
 def term_growth(terms: Terms, s: Tensor) -> Tensor:
-    """How much larger than the radial factor its terms get at squared radii `s`: by this much rounding grows."""
+    """Sum of the magnitudes of the radial factor's terms over the factor: by this much rounding errors grow."""
     below = denominator(terms, s)
     growth = (1 + s * polynomial(s, [column.abs() for column in terms.above])) / (below * radial(terms, s))
     if terms.below is not None:
@@ -157,7 +158,7 @@ def term_growth(terms: Terms, s: Tensor) -> Tensor:
 
 
 def bend(terms: Terms, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """`(x', y')`: everything but the tilt."""
+    """`(x', y')`: all distortion but the tilt."""
     s = torch.addcmul(x * x, y, y)
     factor = torch.addcmul(_tangential_factor(terms, x, y), s, _growth(terms, s))
     sideways_x, sideways_y = polynomial(s, terms.sideways_x), polynomial(s, terms.sideways_y)
@@ -165,7 +166,7 @@ def bend(terms: Terms, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def bend_off(terms: Terms, target: tuple[Tensor, Tensor], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Jacobian]:
-    """What `(x', y')` lacks to the target, and the derivatives of `(x', y')`, in as few operations as possible."""
+    """Residual `target - (x', y')` and Jacobian of `(x', y')`, in as few operations as possible."""
     s = torch.addcmul(x * x, y, y)
     growth = _growth(terms, s)
     factor = torch.addcmul(_tangential_factor(terms, x, y), s, growth)
@@ -187,7 +188,7 @@ def bend_off(terms: Terms, target: tuple[Tensor, Tensor], x: Tensor, y: Tensor) 
 def newton_direction(
     terms: Terms, target: tuple[Tensor, Tensor], x: Tensor, y: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """What is missing at `(x, y)`, and Newton's step there as numerators and their common denominator."""
+    """Residual at `(x, y)`, and the Newton step there as its two numerators and their common denominator."""
     off_x, off_y, slope = bend_off(terms, target, x, y)
     determinant = minus_product(slope.xx * slope.yy, slope.xy, slope.yx)
     step_x = minus_product(slope.yy * off_x, slope.xy, off_y)
@@ -201,12 +202,12 @@ def _tangential_factor(terms: Terms, x: Tensor, y: Tensor) -> Tensor:
 
 
 class Tilted(NamedTuple):
-    """The whole lens at a point, and its slope.
+    """The full model, tilt included, at a point.
 
     Attributes:
-        x, y: where the point goes.
-        jacobian: the derivatives of that, times the depth.
-        depth: `W`, 1 without a tilt.
+        x, y: the distorted point.
+        jacobian: its derivatives, times the depth.
+        depth: `W`, 1 without tilt.
     """
 
     x: Tensor
@@ -216,7 +217,7 @@ class Tilted(NamedTuple):
 
 
 def tilted(terms: Terms, x: Tensor, y: Tensor) -> Tilted:
-    """The whole lens, tilt and all, with its derivatives."""
+    """Evaluate the full model, tilt included, with its derivatives."""
     zero = torch.zeros_like(x)
     x_off, y_off, bent = bend_off(terms, (zero, zero), x, y)
     tilt = terms.tilt

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from diffproj._core.batched import Batched, Rearrange
-from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, readable
+from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, has_values
 from diffproj.lens.plan import AXES, Plan, Recipe, domain_of, plan_of, register_recipe
 
 L = TypeVar("L", bound="CoefficientLens")
@@ -30,7 +30,7 @@ class CoefficientLens(Batched, ABC):
         if coefficients.shape[-1] not in self.counts:
             counts = ", ".join(map(str, self.counts))
             raise ValueError(f"coefficients: want {counts} of them on the last axis, got {coefficients.shape[-1]}")
-        if readable(coefficients) and not bool(coefficients.isfinite().all()):
+        if has_values(coefficients) and not bool(coefficients.isfinite().all()):
             raise ValueError(f"coefficients: want finite numbers, got {coefficients.tolist()}")
         self._assign(coefficients)
 
@@ -94,7 +94,7 @@ class CoefficientLens(Batched, ABC):
 
     def _domain(self) -> Tensor:
         """The domain, all that the way forward needs; remembered for as long as nobody writes to the coefficients."""
-        if not readable(self.coefficients):
+        if not has_values(self.coefficients):
             return domain_of(self._key, self.coefficients)
         if self._origin is not None:
             origin, rearrange = self._origin
@@ -103,7 +103,7 @@ class CoefficientLens(Batched, ABC):
 
     def _plan(self) -> Plan:
         """The whole plan, which the way back needs, remembered likewise."""
-        if not readable(self.coefficients):
+        if not has_values(self.coefficients):
             return plan_of(self._key, self.coefficients, self._domain())
         if self._origin is not None:
             origin, rearrange = self._origin

@@ -1,4 +1,4 @@
-"""What a lens does differently inside a compiled graph."""
+"""Special cases of the lenses inside a compiled graph."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,9 +11,9 @@ from diffproj._core.torch_private import constant_in_graphs, in_forward_mode, in
 
 
 def derivative_wanted(*tensors: Tensor) -> bool:
-    """As `wants_derivative`, but inside `torch.compile` too the answer is no where nobody asks.
+    """As `wants_derivative`, but exact inside `torch.compile` as well, where that function always returns true.
 
-    A graph is compiled anew when one of these answers changes: each of them is guarded.
+    The graph is guarded on each of these conditions and recompiled when one changes.
     """
     if not torch.compiler.is_compiling():
         return wants_derivative(*tensors)
@@ -28,29 +28,29 @@ def _transforming() -> bool:
 
 
 def coordinates(points: Tensor) -> tuple[Tensor, Tensor]:
-    """`x` and `y` of points `(*B, N, 2)` of which no derivative is wanted.
+    """`x` and `y` of points `(*B, N, 2)`, outside of autograd.
 
-    In a compiled graph for the processor they are taken apart by an opaque operation: a loop that reads every second
-    number is not vectorised, and runs at a quarter of the speed.
+    In a compiled graph for the CPU an opaque operation makes them contiguous first: a loop with stride 2 is not
+    vectorised and runs at a quarter of the speed.
     """
     if torch.compiler.is_compiling() and points.device.type == "cpu" and not _transforming():
-        points = _apart(points).movedim(0, -1)
+        points = _deinterleaved(points).movedim(0, -1)
     x, y = points.unbind(-1)
     return x, y
 
 
-@torch.library.custom_op("diffproj::apart", mutates_args=())
-def _apart(points: Tensor) -> Tensor:
+@torch.library.custom_op("diffproj::deinterleave", mutates_args=())
+def _deinterleaved(points: Tensor) -> Tensor:
     return points.movedim(-1, 0).clone(memory_format=torch.contiguous_format)
 
 
-@_apart.register_fake
-def _apart_shape(points: Tensor) -> Tensor:
+@_deinterleaved.register_fake
+def _deinterleaved_shape(points: Tensor) -> Tensor:
     return points.new_empty((points.shape[-1], *points.shape[:-1]))
 
 
 def with_batch_in_front(info: Any, in_dims: Sequence[int | None], *tensors: Tensor) -> list[Tensor]:
-    """Tensors that `vmap` hands to an opaque operation, with the axis it maps over in front of each."""
+    """Arguments of an opaque operation under `vmap`, with the mapped axis moved, or expanded, to the front of each."""
     return [
         tensor.expand(info.batch_size, *tensor.shape) if axis is None else tensor.movedim(axis, 0)
         for tensor, axis in zip(tensors, in_dims, strict=False)

@@ -1,12 +1,12 @@
 """`KannalaBrandt`: the fisheye lens, with an exact inverse up to and beyond 90 degrees from the axis.
 
-A direction `(x, y, z)` with the angle `theta` from the axis, and `side = |(x, y)|`, arrives at
+A direction `(x, y, z)` with the angle `theta` from the axis, and `side = |(x, y)|`, is projected to
 
     theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
     xy_distorted = theta_d / side (x, y)
 
-on the normalised plane, so that `rho = |xy_distorted|` is `theta_d`. Backward, the unknown is the ratio
-`sigma = theta / rho`, which is smooth at the centre where `theta` itself is not:
+on the normalised plane, so that `rho = |xy_distorted|` is `theta_d`. The inverse solves for the ratio
+`sigma = theta / rho`, which is a smooth function of the point at the centre, where `theta` itself is not:
 
     sigma (1 + k1 theta^2 + ... + k4 theta^8) = 1     with theta^2 = sigma^2 rho^2
     direction = (sigma sin(theta) / theta  xy_distorted, cos(theta))
@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj._core.numerics import in_blocks, precise, readable
+from diffproj._core.numerics import has_values, in_blocks, in_float64
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.compiling import coordinates, derivative_wanted, with_batch_in_front
 from diffproj.lens.domain import first_failure
@@ -30,25 +30,25 @@ from diffproj.lens.polynomial import polynomial
 from diffproj.lens.smooth import angle_over_side, sine_over_angle_and_cosine
 from diffproj.lens.table import InverseTable, inverse_table
 
-STEPS = 4
-"""Newton steps from the table's start to rounding, but for points next to a fold."""
-PATIENCE = 60
-"""Steps for those."""
-ANGLES = 512
-"""Angles to look at first for the end of the domain."""
+NEWTON_STEPS = 4
+"""Newton steps from the table's estimate to full precision, except for points next to a fold."""
+MAX_STEPS = 60
+"""Maximum number of steps for those."""
+GRID_ANGLES = 512
+"""Angles of the coarse grid on which the end of the domain is searched."""
 TOLERANCE = 16
-"""How many roundings of the equation a solution may be off by."""
+"""Largest residual of a solution, in units of the equation's rounding error."""
 
 
 class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
     """The equidistant fisheye with four coefficients, in the order of OpenCV's fisheye module.
 
-    Directions are in the camera frame (x right, y down, z forward), distorted points on the normalised plane. The lens
-    answers on a cone of field angles around the axis, `domain`, on which it is one-to-one, at most 180 degrees;
-    `valid` is false elsewhere, and the result the axis.
+    Directions are in the camera frame (x right, y down, z forward), distorted points on the normalised plane. Results
+    are valid up to the angle `domain` from the axis, at most 180 degrees, within which the lens is one-to-one;
+    elsewhere `valid` is false and the result is the axis.
 
     Args:
-        coefficients: `(*B, 4)`, `k1 k2 k3 k4`, without unit; kept as they are, gradients flow to them.
+        coefficients: `(*B, 4)`, `k1 k2 k3 k4`, without unit; differentiable.
 
     Raises:
         TypeError: not a floating-point tensor.
@@ -67,29 +67,29 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
 
     @property
     def domain(self) -> Float[Tensor, "*lens"]:
-        """The largest angle from the axis that the lens answers for, `(*B,)`, in radians, without gradient.
+        """Half the field of view: the largest valid angle from the axis, `(*B,)`, in radians, without gradient.
 
-        Up to it `theta_d` rises with `theta`; rounded inward; at most pi.
+        Up to it `theta_d` increases with `theta`; rounded down; at most pi.
         """
         return self._domain()
 
     def project_direction(
         self, direction: Float[Tensor, "*batch n 3"]
     ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
-        """Where directions of the camera frame arrive on the normalised plane.
+        """Project directions of the camera frame to distorted points on the normalised plane.
 
         Args:
             direction: `(*B, N, 3)`, of any length; `z` may be negative.
 
         Returns:
-            Distorted points `(*B, N, 2)`, and `valid`: inside the domain, finite and not 0. (0, 0) with zero gradient
-            where not.
+            Distorted points `(*B, N, 2)`, and `valid`: inside the domain, finite, not the zero vector, and not exactly
+            on the negative axis. (0, 0) with zero gradient where not valid.
         """
         domain = self._domain()
 
         def forward(directions: Tensor) -> tuple[Tensor, Tensor]:
             valid = _within(domain, directions.detach())
-            x, y, z = (directions / _size(directions)).unbind(-1)
+            x, y, z = (directions / _largest_component(directions)).unbind(-1)
             x, y, z = torch.where(valid, x, 0), torch.where(valid, y, 0), torch.where(valid, z, 1)
             side_squared = x * x + y * y
             k = list(self._usable(domain).unsqueeze(-2).unbind(-1))
@@ -102,17 +102,17 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
     def unproject(
         self, xy_distorted: Float[Tensor, "*batch n 2"]
     ) -> tuple[Float[Tensor, "*out n 3"], Bool[Tensor, "*out n"]]:
-        """The directions that arrive at distorted points: the exact inverse of `project_direction`.
+        """Directions whose projections are the distorted points: the exact inverse of `project_direction`.
 
-        Derivatives are those of the inverse function, to second order, in points and coefficients, in reverse and in
+        First and second derivatives by points and coefficients are those of the inverse function, in reverse and
         forward mode.
 
         Args:
             xy_distorted: `(*B, N, 2)` on the normalised plane.
 
         Returns:
-            Unit vectors `(*B, N, 3)`, and `valid`: there is one inside the domain. (0, 0, 1) with zero gradient where
-            not.
+            Unit vectors `(*B, N, 3)`, and `valid`: a solution inside the domain was found. (0, 0, 1) with zero gradient
+            where not valid.
         """
         plan = self._plan()
 
@@ -133,7 +133,7 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
     @staticmethod
     def _find_domain(coefficients: Tensor) -> Tensor:
         columns = list(coefficients.unsqueeze(-2).unbind(-1))
-        grid = _angles(coefficients).expand(*coefficients.shape[:-1], ANGLES)
+        grid = _angles(coefficients).expand(*coefficients.shape[:-1], GRID_ANGLES)
         angle, failed = first_failure(lambda theta, _: _slope(columns, theta * theta) > 0, grid)
         return torch.where(failed, angle, math.pi)
 
@@ -154,7 +154,7 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
 
 
 def _angles(like: Tensor) -> Tensor:
-    return torch.linspace(0, math.pi, ANGLES + 1, dtype=like.dtype, device=like.device)[1:]
+    return torch.linspace(0, math.pi, GRID_ANGLES + 1, dtype=like.dtype, device=like.device)[1:]
 
 
 def _profile(k: list[Tensor], angle_squared: Tensor) -> Tensor:
@@ -168,15 +168,15 @@ def _slope(k: list[Tensor], angle_squared: Tensor) -> Tensor:
     return 1 + angle_squared * polynomial(angle_squared, odd)
 
 
-def _size(direction: Tensor) -> Tensor:
-    """The largest component, by which a direction may be divided: its length is nobody's concern, nor is a gradient."""
+def _largest_component(direction: Tensor) -> Tensor:
+    """Largest absolute component, without gradient, to normalise by; 1 if it is 0 or not finite."""
     size = direction.detach().abs().amax(-1, keepdim=True)
     return torch.where((size > 0) & (size < torch.inf), size, 1)
 
 
 def _within(domain: Tensor, direction: Tensor) -> Tensor:
-    """Whether directions lie in the domain and have a place in the image."""
-    x, y, z = (direction / _size(direction)).unbind(-1)
+    """Whether directions lie in the domain and have a unique projection: not 0, nor exactly backwards."""
+    x, y, z = (direction / _largest_component(direction)).unbind(-1)
     side = torch.hypot(x, y)
     within = torch.atan2(side, z) <= domain.unsqueeze(-1)
     return within & torch.isfinite(side + z) & ((side > 0) | (z > 0)) & (domain > 0).unsqueeze(-1)
@@ -189,7 +189,7 @@ def _newton(k: list[Tensor], rho_squared: Tensor, sigma: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, Tensor]:
-    """`sigma` without a tape, 1 where there is none in the domain; and whether there is one."""
+    """`sigma` without autograd, 1 where there is no solution in the domain; and whether there is one."""
     k = list(coefficients.unsqueeze(-2).unbind(-1))
     x, y = coordinates(points)
     rho = torch.hypot(x, y)
@@ -198,18 +198,18 @@ def _search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, T
     rho_squared = rho * rho
     highest = _highest(plan.domain.unsqueeze(-1), rho)
     sigma = torch.minimum(InverseTable(plan.rho_max, plan.ratio).ratio_at(x, y, rho), highest)
-    sigma = _bracketed(k, rho_squared, sigma, highest, STEPS)
+    sigma = _bracketed(k, rho_squared, sigma, highest, NEWTON_STEPS)
     settled = _settled(k, plan.noise.unsqueeze(-1), rho_squared, sigma)
     batch = points.shape[:-2]
     lens = coefficients.expand(*batch, -1), plan.domain.expand(batch), plan.noise.expand(batch)
-    again = _look_again if readable(points, coefficients) else _look_again_blindly
+    again = _solve_remaining if has_values(points, coefficients) else _solve_remaining_op
     sigma, found = again(*lens, rho, sigma, possible & ~settled)
     valid = possible & (settled | found) & (sigma * rho <= plan.domain.unsqueeze(-1))
     return torch.where(valid, sigma, 1), valid
 
 
 def _highest(domain: Tensor, rho: Tensor) -> Tensor:
-    """An upper bound of the ratio: the angle is at most the domain."""
+    """Upper bound of `sigma`: the angle is at most the domain."""
     return torch.where(rho > 0, domain / rho, torch.inf).clamp_max(torch.finfo(rho.dtype).max)
 
 
@@ -219,44 +219,44 @@ def _settled(k: list[Tensor], noise: Tensor, rho_squared: Tensor, sigma: Tensor)
     return (sigma * _profile(k, sigma * sigma * rho_squared) - 1).abs() <= tolerance
 
 
-def _look_again(
+def _solve_remaining(
     coefficients: Tensor, domain: Tensor, noise: Tensor, rho: Tensor, sigma: Tensor, left: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Solve what is left over, however long it takes, in float64.
+    """Solve the points that have not converged, in float64, by at most `MAX_STEPS` bracketed Newton steps.
 
     Args:
         coefficients: `(*B, 4)`.
         domain: `(*B,)`, the plan's.
-        noise: the same.
+        noise: `(*B,)`, the plan's.
         rho: `(*B, N)`, distorted radii.
-        sigma: where the search has come so far.
-        left: which points are left over.
+        sigma: `(*B, N)`, the current estimate.
+        left: which points remain to be solved.
 
     Returns:
-        `sigma`, and which of those left over are solved now.
+        `sigma`, and which of the remaining points are solved now.
     """
     index = left.nonzero(as_tuple=True)
     if index[0].numel() == 0:
         return sigma, left
-    columns = list(precise(coefficients[index[:-1]]).unbind(-1))
-    reached, radius = precise(domain[index[:-1]]), precise(rho[index])
+    columns = list(in_float64(coefficients[index[:-1]]).unbind(-1))
+    reached, radius = in_float64(domain[index[:-1]]), in_float64(rho[index])
     highest = _highest(reached, radius)
-    solution = _bracketed(columns, radius * radius, precise(sigma[index]).minimum(highest), highest, PATIENCE)
+    solution = _bracketed(columns, radius * radius, in_float64(sigma[index]).minimum(highest), highest, MAX_STEPS)
     sigma = sigma.index_put(index, solution.to(sigma.dtype).minimum(highest.to(sigma.dtype)))
     return sigma, left.index_put(index, _settled(columns, noise[index[:-1]], radius * radius, solution))
 
 
-@torch.library.custom_op("diffproj::look_again_fisheye", mutates_args=())
-def _look_again_blindly(
+@torch.library.custom_op("diffproj::solve_remaining_kannala_brandt", mutates_args=())
+def _solve_remaining_op(
     coefficients: Tensor, domain: Tensor, noise: Tensor, rho: Tensor, sigma: Tensor, left: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The same as one opaque operation, for graphs and transforms in which nobody sees whether any are left over."""
-    solution, found = _look_again(coefficients, domain, noise, rho, sigma, left)
+    """`_solve_remaining` as one opaque operation, for graphs and transforms where `left` cannot be read."""
+    solution, found = _solve_remaining(coefficients, domain, noise, rho, sigma, left)
     return (sigma.clone(), left.clone()) if solution is sigma else (solution, found)
 
 
-@_look_again_blindly.register_fake
-def _look_again_shapes(
+@_solve_remaining_op.register_fake
+def _solve_remaining_shapes(
     coefficients: Tensor,  # noqa: ARG001
     domain: Tensor,  # noqa: ARG001
     noise: Tensor,  # noqa: ARG001
@@ -267,15 +267,15 @@ def _look_again_shapes(
     return torch.empty_like(sigma), torch.empty_like(left)
 
 
-@_look_again_blindly.register_vmap
-def _look_again_batched(
+@_solve_remaining_op.register_vmap
+def _solve_remaining_batched(
     info: Any, in_dims: tuple[int | None, ...], *tensors: Tensor
 ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-    return _look_again_blindly(*with_batch_in_front(info, in_dims, *tensors)), (0, 0)
+    return _solve_remaining_op(*with_batch_in_front(info, in_dims, *tensors)), (0, 0)
 
 
 def _bracketed(k: list[Tensor], rho_squared: Tensor, sigma: Tensor, high: Tensor, steps: int) -> Tensor:
-    """Newton's method between a lower and an upper bound, halving where it would leave them."""
+    """Newton's method between a lower and an upper bound, with bisection where a step would leave them."""
     low = torch.zeros_like(sigma)
     for _ in range(steps):
         angle_squared = sigma * sigma * rho_squared

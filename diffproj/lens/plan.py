@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffproj._core.numerics import precise
+from diffproj._core.numerics import in_float64
 from diffproj.lens.compiling import with_batch_in_front
 from diffproj.lens.table import NODES
 
@@ -90,7 +90,7 @@ def plan_of(key: str, coefficients: Tensor, domain: Tensor) -> Plan:
 
 
 def _rounded(key: str, coefficients: Tensor) -> Tensor:
-    exact = _recipes[key].domain(precise(coefficients))
+    exact = _recipes[key].domain(in_float64(coefficients))
     domain = exact.to(coefficients.dtype)
     domain = torch.where(domain.to(exact.dtype) > exact, torch.nextafter(domain, torch.zeros_like(domain)), domain)
     limits = torch.finfo(coefficients.dtype)
@@ -100,7 +100,7 @@ def _rounded(key: str, coefficients: Tensor) -> Tensor:
 
 
 def _worked_out(coefficients: Tensor, domain: Tensor, key: str) -> tuple[Tensor, ...]:
-    parts = _recipes[key].rest(precise(coefficients), precise(domain))
+    parts = _recipes[key].rest(in_float64(coefficients), in_float64(domain))
     return tuple(part.to(coefficients.dtype) for part in parts)
 
 

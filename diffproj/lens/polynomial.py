@@ -1,4 +1,4 @@
-"""Sums of products: polynomials by Horner's rule, and a difference in one operation."""
+"""Polynomials by Horner's rule, and `total - a b` in one operation."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def polynomial(x: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
-    """`c0 + c1 x + c2 x^2 + ...` for coefficients that broadcast against `x`; `c0` as it is if there is no other."""
+    """`c0 + c1 x + c2 x^2 + ...` for coefficients that broadcast against `x`; `c0` itself if it is the only one."""
     total = coefficients[-1]
     for coefficient in reversed(coefficients[:-1]):
         total = torch.addcmul(coefficient, total, x)
@@ -15,7 +15,7 @@ def polynomial(x: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
 
 
 def series(x: Tensor, coefficients: Sequence[float]) -> Tensor:
-    """The same for coefficients that are numbers."""
+    """The same for at least two coefficients that are numbers."""
     total = x * coefficients[-1] + coefficients[-2]
     for coefficient in reversed(coefficients[:-2]):
         total = total * x + coefficient
@@ -23,8 +23,9 @@ def series(x: Tensor, coefficients: Sequence[float]) -> Tensor:
 
 
 def minus_product(total: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """`total - a b`, in one operation where nothing fuses two.
+    """`total - a b`, in one operation.
 
-    In a compiled graph it is two: PyTorch 2.13 crashes on the forward derivative of `addcmul` with a factor there.
+    In a compiled graph, where operations are fused anyway, it is written as two: PyTorch 2.13 crashes there on the
+    forward derivative of `addcmul` with `value`.
     """
     return total - a * b if torch.compiler.is_compiling() else torch.addcmul(total, a, b, value=-1)

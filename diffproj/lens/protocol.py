@@ -1,4 +1,4 @@
-"""What a lens is: the one interface that cameras know, and that a lens from outside the package can offer too."""
+"""`Lens`: the interface between cameras and lens models, which a user's own lens can implement too."""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -9,16 +9,16 @@ from torch import Tensor
 
 @runtime_checkable
 class Lens(Protocol):
-    """A lens: from directions in the camera frame to distorted points on the normalised plane, and back.
+    """A lens: maps directions in the camera frame to distorted points on the normalised plane, and back.
 
-    The camera frame has x to the right, y down, z forward. The normalised plane is z = 1: a camera takes a distorted
-    point `xy` to the pixel `(f_x x + c_x, f_y y + c_y)`. Both ways promise the same: results are finite everywhere;
-    `valid` is false where the model has no honest answer, and there the result is constant, so that its gradient is
-    zero. Where it is true the result is differentiable twice in the points and in the lens's own parameters.
+    The camera frame has x to the right, y down, z forward. The normalised plane is z = 1: a camera maps a distorted
+    point `xy` to the pixel `(f_x x + c_x, f_y y + c_y)`. Both mappings return finite values everywhere. Where `valid`
+    is false (outside the model's domain) the result is a constant with zero gradient; where it is true the result is
+    twice differentiable by the points and by the lens's parameters.
 
-    **A lens of your own** needs no base class. Give it these attributes and methods and a camera accepts it. Tensors
-    of the lens carry its batch axes in front (`coefficients (*B, k)`), which broadcast against those of the points. To
-    be carried by `vmap`, `torch.func` and `torch.compile` along with its camera, the class must be registered with
+    **A custom lens** needs no base class: a camera accepts any object with these attributes and methods. Tensors of
+    the lens have its batch axes in front (`coefficients (*B, k)`), which broadcast against those of the points. For
+    `vmap`, `torch.func` and `torch.compile` along with its camera, the class must be registered with
     `dp.register_lens`.
 
     Example:
@@ -44,22 +44,22 @@ class Lens(Protocol):
 
     @property
     def domain(self) -> Float[Tensor, "*lens"]:
-        """`(*B,)`, how far the lens reaches: a radius on the normalised plane, or an angle from the axis in radians.
+        """`(*B,)`, the extent of valid points: a radius on the normalised plane, or an angle from the axis in radians.
 
-        Infinite where there is no limit, 0 where the lens is of no use at all.
+        Infinite where there is no limit, 0 where the lens is unusable.
         """
         ...
 
     def project_direction(
         self, direction: Float[Tensor, "*batch n 3"]
     ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
-        """Where directions of any length arrive on the normalised plane, and whether they do."""
+        """Project directions of any length to distorted points on the normalised plane; and which are valid."""
         ...
 
     def unproject(
         self, xy_distorted: Float[Tensor, "*batch n 2"]
     ) -> tuple[Float[Tensor, "*out n 3"], Bool[Tensor, "*out n"]]:
-        """The directions that arrive at these points, and whether there are any."""
+        """Directions whose projections are these points; and which are valid."""
         ...
 
     def to(self, *args: Any, **kwargs: Any) -> "Lens":
@@ -71,7 +71,7 @@ class Lens(Protocol):
         ...
 
     def detach(self) -> "Lens":
-        """The lens cut from the graph of its parameters."""
+        """The lens detached from the autograd graph of its parameters."""
         ...
 
     def __getitem__(self, index: Any) -> "Lens":

@@ -1,7 +1,7 @@
-"""Functions that are smooth at 0 although their formulas divide by 0 or take a root there, exact in all derivatives.
+"""Functions that are smooth at 0 although their formulas divide by 0 or take a root there; derivatives are exact.
 
-Each is a power series close to 0 and the formula elsewhere; the argument of either is replaced where the other one
-answers, so that no gradient passes through a division by 0.
+Each is a power series close to 0 and the formula elsewhere. In each branch the argument is replaced where the other
+branch applies, so that no gradient passes through a division by 0.
 """
 
 import math
@@ -12,7 +12,7 @@ from torch import Tensor
 from diffproj.lens.polynomial import series
 
 NEAR_ZERO = 0.02
-"""Up to here eleven terms of the series of the arc tangent are right to 1e-19, and seven are enough for the others."""
+"""End of the series' range: up to it the arc tangent's 11 terms are exact to 1e-19, the others' 7 terms suffice."""
 ARC_TANGENT = [(-1) ** n / (2 * n + 1) for n in range(11)]
 SINE = [(-1) ** n / math.factorial(2 * n + 1) for n in range(7)]
 COSINE = [(-1) ** n / math.factorial(2 * n) for n in range(7)]

@@ -1,13 +1,14 @@
-"""A start for Newton's method that makes few steps enough: a small table of the inverse along the radius.
+"""Initial estimate for Newton's method: a small table of the inverse along the radius, so that few steps suffice.
 
 Along a ray from the centre let `rho = f(r)` be the distorted radius and `rho_max = f(r_max)` that at the edge. At a
 fold the inverse has a square root, `r_max - r ~ sqrt(rho_max - rho)`. As a function of
 
     u = sqrt(1 - rho / rho_max)
 
-it is smooth up to the very edge, so that linear interpolation between a few uniform nodes in `u` is enough. The table
-holds `r / rho` of the mean over all rays, which is smooth at the centre too. Tangential and prism terms sway `rho_max`
-with the cosine and sine of the ray's direction; the table's answer is swayed with it, the more the closer to the edge.
+it is smooth up to the edge, so that linear interpolation between a few uniform nodes in `u` is accurate enough. The
+table holds `r / rho` averaged over all rays, which is smooth at the centre too. Tangential and prism terms make
+`rho_max` vary with the cosine and sine of the ray's direction (`sway`); the ratio is corrected by the same variation,
+the more the closer to the edge.
 """
 
 from collections.abc import Callable
@@ -17,7 +18,9 @@ import torch
 from torch import Tensor
 
 NODES = 64
+"""Nodes of the table."""
 SAMPLES = 96
+"""Samples of the forward profile from which it is built."""
 
 
 class InverseTable(NamedTuple):
@@ -32,7 +35,7 @@ class InverseTable(NamedTuple):
     ratio: Tensor
 
     def ratio_at(self, x: Tensor, y: Tensor, rho: Tensor) -> Tensor:
-        """`r / rho` for distorted points `(*B, N)` at radii `rho`; beyond the table's end that of its last node."""
+        """`r / rho` for distorted points `(*B, N)` of radius `rho`; beyond the table's end, that at its end."""
         mean, cosine, sine = self.rho_max.unsqueeze(-2).unbind(-1)
         tiny = torch.full_like(mean, torch.finfo(rho.dtype).tiny)
         along_mean = torch.addcmul(tiny, rho, mean)
@@ -53,12 +56,12 @@ def _interpolated(nodes: Tensor, index: Tensor, fraction: Tensor) -> Tensor:
 
 
 def inverse_table(profile: Callable[[Tensor], Tensor], radius: Tensor, sway: Tensor) -> InverseTable:
-    """Tabulate the inverse of a profile that rises from the centre with slope 1.
+    """Tabulate the inverse of a radial profile with slope 1 at the centre.
 
     Args:
-        profile: takes radii `(*B, n)` to distorted radii, in the mean over all rays.
-        radius: the finite radius at which to end `(*B,)`; the profile must rise up to there.
-        sway: the cosine and sine part of the distorted radius there, `(*B, 2)`.
+        profile: maps radii `(*B, n)` to distorted radii, averaged over all rays.
+        radius: the finite radius at which the table ends `(*B,)`; the profile must increase up to it.
+        sway: cosine and sine coefficients of the distorted radius at the end, `(*B, 2)`.
 
     Returns:
         The table.

@@ -23,8 +23,8 @@ from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from diffproj._core.numerics import check_tensor, precise
-from diffproj.calibration.covariance import finite
+from diffproj._core.numerics import check_tensor, in_float64
+from diffproj.calibration.covariance import zero_where_infinite
 from diffproj.calibration.parametrisation import Parametrisation, moved
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
@@ -85,7 +85,7 @@ class Measurement:
     @property
     def covariance(self) -> Float[Tensor, "*batch n 3 3"]:
         """The covariance of each point `(*B, N, 3, 3)` in squared world units; infinite where it is not determined."""
-        C = self._common @ finite(self._sigma).unsqueeze(-3) @ self._common.mT + self._own @ self._own.mT
+        C = self._common @ zero_where_infinite(self._sigma).unsqueeze(-3) @ self._common.mT + self._own @ self._own.mT
         return _without(C, self._unknown(self._common))
 
     @property
@@ -100,7 +100,7 @@ class Measurement:
         N = own.shape[-3]
         apart = torch.eye(N, dtype=own.dtype, device=own.device)[:, None, :, None]
         blocks = (own.unsqueeze(-2) * apart).flatten(-2).flatten(-3, -2)
-        C = G @ finite(self._sigma) @ G.mT + blocks
+        C = G @ zero_where_infinite(self._sigma) @ G.mT + blocks
         return _without(C, self._unknown(G))
 
     def quantity(self, function: Callable[[Tensor], Tensor], which: Sequence[Sequence[int]] | Tensor) -> Quantity:
@@ -137,7 +137,7 @@ class Measurement:
         own = (self._own[..., index, :, :] * g).sum(-2)  # (*B, M, k, 2): points named twice count together
         same = (index.unsqueeze(-1) == index.unsqueeze(-2)).to(own.dtype)
         noise = (own * (same @ own)).sum((-2, -1))
-        variance = ((common @ finite(self._sigma)) * common).sum(-1) + noise
+        variance = ((common @ zero_where_infinite(self._sigma)) * common).sum(-1) + noise
         variance = torch.where(self._unknown(common.unsqueeze(-2)).squeeze(-1).squeeze(-1), torch.inf, variance)
         valid = self.valid[..., index].all(-1)
         # The root's slope at 0 is infinite: a length between a point and itself has a deviation of 0 and no gradient.
@@ -235,7 +235,7 @@ def measure(
         >>> print(f"{length.value[0]:.1f} ± {length.deviation[0]:.1f} mm")
         199.9 ± 0.2 mm
     """
-    pixels = precise(check_tensor("pixels", pixels, "N", 2))
+    pixels = in_float64(check_tensor("pixels", pixels, "N", 2))
     if not isinstance(calibration, Calibration):
         camera, known = as_camera(calibration), None
         if pixel_sigma is None:
@@ -269,7 +269,7 @@ def measure(
         lift = lift - (D @ (by_point @ lift.unsqueeze(-1))).squeeze(-1)
         with_offset = torch.cat([-points, torch.ones_like(points[..., :1])], dim=-1)
         blocks.append(lift.unsqueeze(-1) * with_offset.unsqueeze(-2))
-        covariances.append(precise(plane_covariance))
+        covariances.append(in_float64(plane_covariance))
     sigma = torch.as_tensor(pixel_sigma, dtype=torch.float64, device=points.device)
     try:
         sigma = sigma.expand(points.shape[:-1])

@@ -6,7 +6,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor, nn
 
-from diffproj._core.numerics import precise
+from diffproj._core.numerics import in_float64
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera, as_camera
@@ -53,7 +53,7 @@ class CalibrationPrior(nn.Module):
         precision = C.new_zeros(size, size)
         precision[where.unsqueeze(-1), where] = inverse
         self.posed = view is not None
-        self.register_buffer("R_0", precise(camera.R.detach()).clone())
+        self.register_buffer("R_0", in_float64(camera.R.detach()).clone())
         self.register_buffer("center", self._vector(camera.detach()).clone())
         self.register_buffer("precision", precision)
 
@@ -63,9 +63,9 @@ class CalibrationPrior(nn.Module):
         return (off * (self.precision * off.unsqueeze(-2)).sum(-1)).sum(-1) / 2
 
     def _vector(self, camera: Camera) -> Tensor:
-        parts = [precise(Parametrisation.of(camera).pack(camera))]
+        parts = [in_float64(Parametrisation.of(camera).pack(camera))]
         if self.posed:
-            turned = (precise(camera.R).unsqueeze(-3) * self.R_0.unsqueeze(-2)).sum(-1).mT  # R R_0^T
+            turned = (in_float64(camera.R).unsqueeze(-3) * self.R_0.unsqueeze(-2)).sum(-1).mT  # R R_0^T
             omega = rotation_matrix_to_axis_angle(turned.reshape(-1, 3, 3)).reshape(*turned.shape[:-2], 3)
-            parts += [omega, precise(camera.t)]
+            parts += [omega, in_float64(camera.t)]
         return torch.cat([part.expand(*camera.batch_shape, part.shape[-1]) for part in parts], dim=-1)

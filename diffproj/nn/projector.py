@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from diffproj._core.numerics import readable
+from diffproj._core.numerics import has_values
 from diffproj.geometry.back_projection import PlaneMap
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
@@ -83,7 +83,7 @@ class PlaneProjector(GeometryModule):
         lens = self._lens
         if lens is not None and (torch.compiler.is_compiling() or lens.coefficients is not self._frozen_coefficients):
             lens = type(lens).unchecked(self._frozen_coefficients)
-            if readable(self._frozen_coefficients):  # kept, for it remembers what it works out about itself
+            if has_values(self._frozen_coefficients):  # kept, for it remembers what it works out about itself
                 self._lens = lens
         camera = Camera.unchecked(self._frozen_K, self._frozen_R, self._frozen_t, lens, self._camera.size)
         return PlaneMap.unchecked(self._matrix, camera, False)

@@ -1,4 +1,4 @@
-"""The printed chessboard: where its inner corners lie in the world, in the frame of OpenCV or of the paper."""
+"""The chessboard target: positions of its inner corners in the world, in the frame of OpenCV or of the paper."""
 
 import math
 import operator
@@ -17,9 +17,9 @@ Axes = Literal["opencv", "paper"]
 class Chessboard:
     """A flat chessboard, described by its inner corners: the points where four squares meet.
 
-    The corners are listed row by row, each row from left to right, as they appear on a board that lies upright. This
-    order is the same in both frames, so the same pixels fit both; only the coordinates differ. With side `s`, the
-    corner in row r and column c (both from 0) lies at
+    The corners are listed row by row, each row from left to right, as seen on an upright board. This order is the same
+    in both frames, so the same pixels fit both; only the coordinates differ. With side `s`, the corner in row r and
+    column c (both from 0) is at
 
     * `axes="opencv"`: `(c s, r s, 0)`: x to the right, y down, z into the board, away from the camera;
     * `axes="paper"`: `(r s, c s, 0)`: x from the top left corner down to the bottom left one, y from there to the top
@@ -30,11 +30,11 @@ class Chessboard:
     Args:
         columns: inner corners in a row: one less than the squares.
         rows: inner corners in a column: one less than the squares.
-        square: the side of one square. Its unit becomes the unit of the world; 25 mm by default.
+        square: the side of a square. Its unit is the world unit; 25 (mm) by default.
         axes: `"opencv"` or `"paper"`.
 
     Raises:
-        TypeError: columns or rows are no whole numbers, or square is no number.
+        TypeError: columns or rows are not integers, or square is not a number.
         ValueError: fewer than 2 columns or rows, a square that is not positive and finite, or unknown axes.
 
     Example:
@@ -65,12 +65,12 @@ class Chessboard:
 
     @property
     def size(self) -> tuple[int, int]:
-        """`(columns, rows)`, the order in which OpenCV takes them."""
+        """`(columns, rows)`, in OpenCV's order."""
         return self.columns, self.rows
 
     @property
     def points(self) -> Float[Tensor, "n 3"]:
-        """The inner corners in the world, row by row, in the unit of `square`: a fresh float64 tensor each time."""
+        """The inner corners in the world, row by row, in the unit of `square`: a new float64 tensor on each access."""
         row, column = torch.meshgrid(
             torch.arange(self.rows, dtype=torch.float64),
             torch.arange(self.columns, dtype=torch.float64),
@@ -82,7 +82,7 @@ class Chessboard:
     def outline(self) -> Float[Tensor, "4 3"]:
         """The outer corners of the printed squares, one square beyond the inner corners, in the unit of `square`.
 
-        They come as top left, top right, bottom right, bottom left.
+        In the order top left, top right, bottom right, bottom left.
 
         Example:
             >>> Chessboard(columns=4, rows=3, square=10.0).outline.tolist()
@@ -95,14 +95,14 @@ class Chessboard:
         )
 
     def _placed(self, row: Float[Tensor, " n"], column: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-        """Rows and columns, counted in squares, as world points in this board's frame."""
+        """World points in this board's frame from rows and columns in units of squares."""
         along = (column, row) if self.axes == "opencv" else (row, column)
         return torch.stack([*along, torch.zeros_like(row)], dim=-1) * self.square
 
 
 def _count(name: str, value: object) -> int:
     try:
-        count = operator.index(value)  # type: ignore[arg-type]  # a float or a string lands in the handler below
+        count = operator.index(value)  # type: ignore[arg-type]  # floats and strings raise TypeError
     except TypeError:
         raise TypeError(f"{name}: want a whole number of inner corners, got {value!r}") from None
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Find a chessboard's corners in photographs, to a fraction of a pixel and in one known order."""
+"""Detect a chessboard's corners in photographs, with sub-pixel accuracy and in a defined order."""
 
 import warnings
 from collections.abc import Callable, Iterable
@@ -13,13 +13,13 @@ from diffproj.targets.images import Photograph, Source, as_8_bit, grey, listed
 from diffproj.targets.views import Views
 
 WINDOW = 0.30
-"""Half the side of a corner's sub-pixel window, as a part of the distance to its nearest neighbour."""
+"""Half the side of a corner's sub-pixel window, relative to the distance to its nearest neighbour."""
 
 SMALLEST_WINDOW = 2
-"""The least half side in px: below it, a window holds too few gradients and the corner wanders."""
+"""Minimum half side in px: a smaller window contains too few gradients for a stable result."""
 
 LARGE = 1600
-"""Above this many px on the longer side, a photograph without success is searched again at half its size."""
+"""Longer side in px above which detection that fails is repeated at half the size."""
 
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
@@ -52,25 +52,25 @@ def detect(
     board: Chessboard,
     progress: Callable[[int, int], object] | None = None,
 ) -> Views:
-    """Find the board's inner corners in photographs of one camera.
+    """Detect the board's inner corners in photographs of one camera.
 
-    The corners come from OpenCV's classic detector and are refined to a fraction of a pixel (`cv2.cornerSubPix`) in a
-    window that follows the board's size in the image: half its side is 0.30 of the distance to the corner's nearest
-    neighbour. One window for all either jumps to neighbouring corners or leaves precision unused. A large photograph
-    (more than 1600 px on its longer side) without success is searched again at half its size, and so on; the refining
-    is always done at full size. Files are read as `cv2.imread` reads them.
+    The corners come from OpenCV's `findChessboardCorners` and are refined with sub-pixel accuracy (`cv2.cornerSubPix`)
+    in a window that scales with the board's image: half its side is 0.30 of the distance to the corner's nearest
+    neighbour. A window of fixed size either includes neighbouring corners or gives away precision. If detection fails
+    in a photograph of more than 1600 px on its longer side, it is repeated at half the size, and so on; refinement
+    always uses the full size. Files are read as `cv2.imread` reads them.
 
     The order is that of `Chessboard.points`, whatever the detector returned. It is never mirrored: along a row, then
-    down a column, turns clockwise in the image. And it starts in a dark corner of the board: the square inside the
-    first four corners is dark, and so is the one diagonally outside the first corner. Where columns + rows is odd, as
-    on a 9 x 6 board, this fixes the order: each corner keeps its number however the board is turned. Where it leaves
-    a choice, the first corner is the one nearest to the photograph's top left.
+    down a column, is clockwise in the image. It starts at a dark corner of the board: the square between the first four
+    corners is dark, and so is the one diagonally outside the first corner. Where columns + rows is odd, as on a 9 x 6
+    board, this determines the order: each corner keeps its number however the board is rotated. Otherwise, of the
+    remaining orders, that whose first corner is closest to the photograph's top left is chosen.
 
     Args:
         photographs: a file, a folder, a pattern such as `"photos/left*.jpg"`, one image, or a list of files and
             images. An image is an array as OpenCV has it, `(H, W)`, `(H, W, 1)`, `(H, W, 3)` in BGR or `(H, W, 4)` in
-            BGRA, of 8-bit or 16-bit integers (stretched over the range they hold) or floats from 0 to 1; or a tensor
-            as Kornia has it, `(C, H, W)` in RGB, of the same types, or `(B, C, H, W)`. All of one size.
+            BGRA, of 8-bit or 16-bit integers (16 bits: contrast-stretched) or floats from 0 to 1; or a tensor as
+            Kornia has it, `(C, H, W)` in RGB, of the same types, or `(B, C, H, W)`. All of one size.
         board: the board to look for, with at least 3 x 3 inner corners.
         progress: called with `(done, total)` after each photograph.
 
@@ -92,7 +92,7 @@ def detect(
         >>> views = detect(image, Chessboard(columns=9, rows=6))
         >>> views
         Views(1 view of 54 corners, 460 x 340 px, torch.float64)
-        >>> views.pixels[0, :2].round().tolist()  # the edges lie half a pixel before the pixels that they start
+        >>> views.pixels[0, :2].round().tolist()  # each edge is half a pixel before its first pixel
         [[70.0, 70.0], [110.0, 70.0]]
     """
     _check_board(board)
@@ -116,7 +116,7 @@ def detect(
 
 
 def find_corners(image: Shaped[np.ndarray, "h w"], board: Chessboard) -> Float[np.ndarray, "n 2"] | None:
-    """The board's corners in one grey image, refined and in order: `(N, 2)` px in float64, or None without a board.
+    """The board's corners in one grey image, refined and in order: `(N, 2)` px in float64; None if not found.
 
     Args:
         image: `(H, W)`, from 0 to 255, uint8 or float32.
@@ -129,7 +129,7 @@ def find_corners(image: Shaped[np.ndarray, "h w"], board: Chessboard) -> Float[n
 
 
 def _rough_corners(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Float32[np.ndarray, "n 2"] | None:
-    """OpenCV's detector; on large photographs that it fails on, once more at half the size and so on."""
+    """OpenCV's detector; where it fails on a large photograph, again at half the size, and so on."""
     found, corners = cv2.findChessboardCorners(image, board.size)
     if found:
         return corners.reshape(-1, 2)  # OpenCV 4 gives (N, 1, 2), OpenCV 5 (N, 2)
@@ -145,11 +145,11 @@ def _rough_corners(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Float3
 
 
 def refine_corners(image: Shaped[np.ndarray, "h w"], corners: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 2"]:
-    """Move corners to where the edges around them cross, each within a window of its own size.
+    """Refine corners with sub-pixel accuracy, each in a window of its own size.
 
     Args:
         image: `(H, W)`, uint8 or float32.
-        corners: `(N, 2)` px, float32, each nearer to its true place than to half a square.
+        corners: `(N, 2)` px, float32, each within half a square of its true position.
     """
     half_sides = np.maximum(WINDOW * nearest_distance(corners), SMALLEST_WINDOW).astype(int)
     refined = corners.copy()
@@ -171,12 +171,12 @@ def nearest_distance(corners: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n
 def in_order(
     corners: Float[np.ndarray, "n 2"], image: Shaped[np.ndarray, "h w"], board: Chessboard
 ) -> Float[np.ndarray, "n 2"]:
-    """Bring corners into the order of `Chessboard.points`; see `detect` for the rule.
+    """Sort corners into the order of `Chessboard.points`; see `detect` for the rule.
 
     Args:
-        corners: `(N, 2)` px, row by row in any of the orders that a detector may choose.
-        image: `(H, W)`, the grey image they were found in.
-        board: the board; square boards may be turned by 90 degrees, others by 180.
+        corners: `(N, 2)` px, row by row in any of the orders that a detector may return.
+        image: `(H, W)`, the grey image.
+        board: the board; boards with rows = columns may be rotated by 90 degrees, others by 180.
     """
     grid = corners.reshape(board.rows, board.columns, 2)
     grids = [grid, grid[::-1], grid[:, ::-1], grid[::-1, ::-1]]
@@ -189,7 +189,7 @@ def in_order(
 
 
 def _turns_clockwise(grid: Float[np.ndarray, "rows columns 2"]) -> bool:
-    """Whether top left, top right, bottom right, bottom left run clockwise as seen in the image (v points down)."""
+    """Whether top left, top right, bottom right, bottom left are clockwise in the image (v points down)."""
     u, v = np.stack([grid[0, 0], grid[0, -1], grid[-1, -1], grid[-1, 0]]).T
     return float(np.sum(u * np.roll(v, -1) - v * np.roll(u, -1))) > 0
 
@@ -197,8 +197,8 @@ def _turns_clockwise(grid: Float[np.ndarray, "rows columns 2"]) -> bool:
 def _starts_dark(grid: Float[np.ndarray, "rows columns 2"], image: Shaped[np.ndarray, "h w"]) -> bool:
     """Whether the square between the first four corners is one of the dark ones.
 
-    All squares between corners vote, so neither noise nor an uneven light decides; none outside them is looked at,
-    for the outermost may be cut off by the image's border.
+    Decided by the mean of all squares between corners, which is robust to noise and uneven illumination; squares
+    outside the corners are not used, since the image's border may cut them off.
     """
     squares = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     u, v = np.rint(squares).astype(int).T
@@ -217,7 +217,7 @@ def _check_board(board: object) -> None:
 
 
 def _common_size(listing: list[Photograph]) -> tuple[int, int]:
-    """Read every photograph once, so that none fails after a long search, and return the size they share."""
+    """Read every photograph once, so that none fails after a long search, and return their common size."""
     first, *others = listing
     height, width = grey(first).shape
     for other in others:

@@ -1,8 +1,8 @@
-"""The bundled corners: a real board in 26 real photographs, measured once and shipped as numbers.
+"""Bundled example data: the corners of a real board, detected in 26 photographs.
 
-The photographs, 640 x 480 px by the left and the right camera of a stereo pair, are those of the folder
-`examples/data` in Debian's package `opencv-doc` 4.6.0. They are not shipped. `python -m diffproj.targets FOLDER`
-measures them again; `data/left.json` and `data/right.json` say how they came about.
+The photographs, 640 x 480 px from the left and right cameras of a stereo pair, are those of the folder `examples/data`
+in Debian's package `opencv-doc` 4.6.0. They are not included. `python -m diffproj.targets FOLDER` repeats the
+detection; `data/left.json` and `data/right.json` record how they were made.
 """
 
 import json
@@ -24,23 +24,23 @@ Side = Literal["left", "right"]
 """The two cameras of the stereo pair."""
 
 NUMBERS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14)
-"""The photographs of each camera; the package has no number 10."""
+"""Numbers of the photographs of each camera; `opencv-doc` has no number 10."""
 
 BOARD = Chessboard(columns=9, rows=6, square=25.0)
 """The board in the photographs; `left_intrinsics.yml` beside them gives its square's side as 0.025 m."""
 
 REGENERATE = "python -m diffproj.targets FOLDER"
-"""The command that measures the photographs in a folder again."""
+"""The command that repeats the detection for the photographs in a folder."""
 
 DIGITS = 4
-"""Decimals of the recorded pixels, far below what corner detection resolves."""
+"""Decimals of the recorded pixels, far below the accuracy of corner detection."""
 
 
 def example_views(side: Side | str) -> Views:
     """The corners of the 9 x 6 board with 25 mm squares in 13 photographs of one of two real cameras.
 
-    Measured by `detect`, in px with whole numbers at pixel centres. The lens bends straight lines visibly. Left and
-    right photographs of the same number were taken at the same moment.
+    Detected by `detect`, in px with integers at pixel centres. The lens has visible distortion. Left and right
+    photographs of the same number were taken simultaneously.
 
     Args:
         side: `"left"` or `"right"`.
@@ -79,11 +79,11 @@ def regenerate(
     target: str | os.PathLike[str] | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> list[Path]:
-    """Measure the photographs again and write `left.json` and `right.json`, whole, once all is measured.
+    """Detect the corners in the photographs again, then write `left.json` and `right.json`, each atomically.
 
     Args:
-        folder: where the 26 photographs are.
-        target: where to write; the package's own data by default.
+        folder: of the 26 photographs.
+        target: folder to write to; the package's data folder by default.
         progress: called with `(done, total)` after each photograph.
 
     Returns:
@@ -109,7 +109,7 @@ def regenerate(
 
 
 def _as_json(views: Views, side: str) -> str:
-    """The record of one camera as text for people to read: a line for each row of the board."""
+    """The record of one camera as readable JSON, with a line for each row of the board."""
     record = {
         "about": f"Inner corners of a chessboard in the {side} camera's photographs, in px, whole numbers at pixel "
         "centres, row by row in the order of diffproj.Chessboard.points.",

@@ -1,4 +1,4 @@
-"""Photographs in any of the forms a user has them, as the grey images that corner detection works on."""
+"""Input photographs: files, folders, arrays or tensors, converted to grey images for corner detection."""
 
 import os
 import re
@@ -15,18 +15,18 @@ Source = str | os.PathLike[str] | np.ndarray | Tensor
 """A photograph, or several: a file, folder or pattern; an array or tensor."""
 
 SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".jp2", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
-"""Endings of the files that count as photographs when a folder is given."""
+"""Suffixes of the files in a folder that count as photographs."""
 
 LAYOUTS = "an array (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA, or a tensor (1 | 3 | 4, H, W) RGB"
 
 
 class Photograph(NamedTuple):
-    """One photograph that a user handed in.
+    """One input photograph.
 
     Attributes:
-        name: what its view is called: the file's name, or `image 3` for the third of several arrays.
-        label: what messages call it: the file with its folder, or the same as the name.
-        source: where the pixels are.
+        name: the name of its view: the file's name, or `image 3` for the third of several arrays.
+        label: its name in messages: the file with its folder, or the same as `name`.
+        source: the file or the pixels.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Photograph(NamedTuple):
 
 
 def listed(photographs: Source | Iterable[Source]) -> list[Photograph]:
-    """List one by one what the caller handed in.
+    """List the input photographs one by one.
 
     Args:
         photographs: a file, a folder (its photographs in natural order: `view2` before `view10`), a pattern such as
@@ -81,20 +81,20 @@ def _entries(photographs: Any) -> list[Any]:
 
 
 def _natural(path: Path) -> list[Any]:
-    """A key that sorts by the numbers in a name, not by their digits."""
+    """Key for natural order: numbers in a name are compared as numbers."""
     parts = re.split(r"([0-9]+)", path.name.lower())  # text at even places, numbers at odd ones
     return [int(part) if place % 2 else part for place, part in enumerate(parts)]
 
 
 def grey(photograph: Photograph) -> Shaped[np.ndarray, "h w"]:
-    """Bring a photograph to grey, `(H, W)`, from 0 to 255: uint8 where 8 bits came in, float32 otherwise.
+    """Convert a photograph to grey, `(H, W)`, from 0 to 255: uint8 for 8-bit input, float32 otherwise.
 
-    Files are read as `cv2.imread` reads them, which turns them upright where the camera noted how it was held. 16-bit
-    images are stretched over the range of values that they hold, for cameras of 10, 12 or 14 bits use a part of it.
+    Files are read as `cv2.imread` reads them, which applies the EXIF orientation. The contrast of 16-bit images is
+    stretched from their 0.1st to their 99.9th percentile, since cameras of 10, 12 or 14 bits use a part of the range.
 
     Raises:
         ValueError: the file is no image, the shape is none of the layouts, or floats are not in 0..1.
-        TypeError: the numbers are neither integers of 8 or 16 bits nor floats.
+        TypeError: the values are neither integers of 8 or 16 bits nor floats.
         OSError: the file cannot be read.
     """
     label, source = photograph.label, photograph.source
@@ -104,18 +104,18 @@ def grey(photograph: Photograph) -> Shaped[np.ndarray, "h w"]:
     if image.size == 0 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (1,), (3,), (4,)):
         raise ValueError(f"{label}: want {LAYOUTS}, got shape {tuple(source.shape)}")
     if image.shape[2:] == (4,):
-        image = image[..., :3]  # without the opacity
+        image = image[..., :3]  # without alpha
     scaled = np.ascontiguousarray(_scaled(label, image))
     return cv2.cvtColor(scaled, cv2.COLOR_BGR2GRAY) if scaled.shape[2:] == (3,) else scaled.reshape(scaled.shape[:2])
 
 
 def as_8_bit(image: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """A grey image from 0 to 255 in whole numbers."""
+    """A grey image from 0 to 255, rounded to uint8."""
     return image if image.dtype == np.uint8 else np.rint(image).astype(np.uint8)
 
 
 def _read(path: Path) -> np.ndarray:
-    # The bytes first: OpenCV alone tells neither a missing file from a broken one, nor takes every file name.
+    # cv2.imread does not distinguish a missing file from a broken one, and fails on some file names.
     data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if data.size else None
     if image is None:
@@ -124,7 +124,7 @@ def _read(path: Path) -> np.ndarray:
 
 
 def _channels_last(label: str, image: Tensor) -> np.ndarray:
-    """A tensor in RGB as OpenCV has it: `(H, W)` or `(H, W, C)` in BGR."""
+    """An RGB tensor in OpenCV's layout: `(H, W)` or `(H, W, C)` in BGR."""
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[0] not in (1, 3, 4)):
         raise ValueError(f"{label}: want {LAYOUTS}, got a tensor of shape {tuple(image.shape)}")
     image = image.detach().cpu()
@@ -135,11 +135,11 @@ def _channels_last(label: str, image: Tensor) -> np.ndarray:
 
 
 def _scaled(label: str, image: np.ndarray) -> np.ndarray:
-    """Any supported kind of number on the scale from 0 to 255."""
+    """Any supported dtype, scaled to 0..255."""
     if image.dtype == np.uint8:
         return image
     if image.dtype in (np.uint16, np.int16):
-        # Not the very extremes: one hot pixel would turn all others black.
+        # Percentiles instead of extremes: a single hot pixel would turn all others black.
         low, high = np.percentile(image, (0.1, 99.9))
         return np.clip((image.astype(np.float32) - low) * (255 / max(high - low, 1)), 0, 255).astype(np.float32)
     if np.issubdtype(image.dtype, np.floating):

@@ -1,7 +1,7 @@
-"""Board photographs and corner sets with known truth: the paper's set-up, rendered through the package's own kernel.
+"""Synthetic board photographs and corners with ground truth.
 
-A photograph is the board's print, `board_texture`, seen by `diffproj.render`: each pixel asks the question that
-back-projection answers. Vignetting and a Gaussian blur stand for the optics, Gaussian noise for the sensor.
+A photograph is the printed board, `board_texture`, rendered by `diffproj.render`, which back-projects every pixel onto
+the board. Vignetting and Gaussian blur model the optics, Gaussian noise the sensor.
 """
 
 import math
@@ -24,11 +24,11 @@ from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.views import Views
 
 BLACK, WHITE, TABLE = 0.12, 0.88, 0.55
-"""Grey values of the print, the paper and the table that the board lies on, in 0..1."""
+"""Grey values of the printed squares, the paper and the table under the board, in 0..1."""
 
 
 class Texture(NamedTuple):
-    """What is printed on a plane, as `diffproj.render` takes it.
+    """The texture of a plane, with the arguments that `diffproj.render` takes.
 
     Attributes:
         image: grey values `(1, rows, columns)` in 0..1.
@@ -42,13 +42,13 @@ class Texture(NamedTuple):
 
 
 def board_texture(board: Chessboard, texels: int = 32) -> Texture:
-    """The board as it is printed on z = 0, s to the right along its rows and t down along its columns.
+    """The texture of the board on z = 0, s to the right along its rows and t down along its columns.
 
-    One square of white paper surrounds the printed squares, and one square of table the paper.
+    The printed squares have a white margin of one square, and the paper a margin of table of one square.
 
     Args:
         board: in either frame.
-        texels: along the side of a square; edges fall between them.
+        texels: per side of a square; edges are between texels.
 
     Example:
         >>> import diffproj as dp
@@ -58,7 +58,7 @@ def board_texture(board: Chessboard, texels: int = 32) -> Texture:
     """
     if texels < 1:
         raise ValueError(f"texels: want at least 1 along a square, got {texels}")
-    # Squares by number: 0 lies behind the first inner corner.
+    # Indices of squares: 0 follows the first inner corner.
     row, column = (torch.arange(-3, count + 2) for count in (board.rows, board.columns))
     row = row.unsqueeze(-1)
     printed = (row >= -1) & (row < board.rows) & (column >= -1) & (column < board.columns)
@@ -80,15 +80,14 @@ def photograph(
     vignetting: float = 0.3,
     seed: int = 0,
 ) -> UInt8[Tensor, "*batch h w"]:
-    """Render grey photographs of a board that lies on z = 0.
+    """Render grey photographs of a board at z = 0.
 
     Args:
-        camera: a camera of known size, of any batch shape `*B`.
-        board: the board; one square of white paper surrounds the printed squares.
-        blur_px: standard deviation of the optics' Gaussian blur in pixels; 0 for none.
-        noise: standard deviation of the sensor's noise, in units of the full range.
-        vignetting: how much of the law of natural vignetting the image shows: 1 for light that falls off with the
-            fourth power of the cosine of the angle from the axis, 0 for an even image.
+        camera: with an image size, of any batch shape `*B`.
+        board: the board, with a white margin of one square.
+        blur_px: standard deviation of the Gaussian blur in pixels; 0 for none.
+        noise: standard deviation of the sensor noise, relative to the full range of grey values.
+        vignetting: strength of natural vignetting: 1 for the cosine-fourth law, 0 for none.
         seed: of the noise.
 
     Returns:
@@ -113,7 +112,7 @@ def photograph(
     cameras = [camera] if not camera.batch_shape else [camera[i] for i in _indices(camera.batch_shape)]
     images = []
     for single in cameras:
-        # In float32, right to 1e-6 of the scene: a thousandth of a pixel.
+        # float32 is accurate to 1e-6 of the scene, a thousandth of a pixel.
         single = single.detach().to("cpu", torch.float32)
         texture = board_texture(board, _texels(single, board))
         shown, seen = render(texture.image, single, Plane.z(0.0), texture.extent, axes=texture.axes)
@@ -127,7 +126,7 @@ def photograph(
 
 
 def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px: float = 0.2, seed: int = 0) -> Views:
-    """The board's corners as cameras of batch shape `(*B, V)` would see them, with Gaussian noise on each coordinate.
+    """Project the board's corners into cameras of batch shape `(*B, V)`, with Gaussian noise on each coordinate.
 
     Args:
         camera: the true cameras.
@@ -136,10 +135,10 @@ def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px:
         seed: of the noise.
 
     Returns:
-        Views `(*B, V, N, 2)`; corners outside the image, or that the camera cannot see, are marked as not visible.
+        Views `(*B, V, N, 2)`; corners outside the image, or without a valid projection, are marked as not visible.
 
     Raises:
-        ValueError: the camera has no axis of views.
+        ValueError: the camera has no batch axis.
 
     Example:
         >>> import diffproj as dp
@@ -167,18 +166,18 @@ def random_cameras(
     distance: tuple[float, float] = (1.5, 3.0),
     seed: int = 0,
 ) -> Camera:
-    """The camera at random poses from which it sees the whole board, batch shape `(*B, V)`.
+    """The camera at random poses with the whole board in view, of batch shape `(*B, V)`.
 
     Args:
-        camera: of batch shape `*B` and known size; its pose does not matter.
+        camera: of batch shape `*B`, with an image size; its pose is ignored.
         board: the board, in either frame.
         views: V.
-        tilt: the board's tilts about x and y, and turns about z, are uniform up to this in radians.
-        distance: of the board's middle from the camera, uniform between these multiples of the board's longer side.
-        seed: of the draws.
+        tilt: limit of the board's rotations about x, y and z, which are uniform within +- this, in radians.
+        distance: of the board's centre from the camera, uniform between these multiples of its longer side.
+        seed: of the random draws.
 
     Raises:
-        ValueError: the camera has no size, or sees the whole board from hardly any such pose.
+        ValueError: the camera has no size, or too few of the drawn poses have the whole board in view.
 
     Example:
         >>> import diffproj as dp
@@ -204,7 +203,7 @@ def random_cameras(
             draw = torch.rand(count, 6, generator=generator, dtype=camera.dtype)
             turned = rotation_from_euler(*((2 * draw[:, :3] - 1) * tilt).unbind(-1)) @ upright
             depth = (distance[0] + (distance[1] - distance[0]) * draw[:, 3]) * extent
-            # The middle of the board falls anywhere on the image.
+            # The board's centre is uniform over the image.
             width, height = single.size or (0, 0)
             where = draw[:, 4:] * torch.tensor([width - 1.0, height - 1.0], dtype=camera.dtype)
             direction, valid = single.without_pose().directions(where)
@@ -226,7 +225,7 @@ def random_cameras(
 
 
 def _texels(camera: Camera, board: Chessboard) -> int:
-    """Texels along a square, about two for each pixel where the board is nearest."""
+    """Texels per side of a square: about two per pixel where the board's image is largest, from 8 to 256."""
     pixels, valid = camera.project(board.points.to(camera.dtype))
     pixels = torch.where(valid.unsqueeze(-1), pixels, torch.nan).reshape(board.rows, board.columns, 2)
     sides = torch.cat([pixels.diff(dim=axis).norm(dim=-1).flatten() for axis in (0, 1)])
@@ -235,7 +234,7 @@ def _texels(camera: Camera, board: Chessboard) -> int:
 
 
 def _falloff(camera: Camera) -> Float[Tensor, "h w"]:
-    """The fourth power of the cosine of the angle under which light meets the sensor, `1 / (1 + r^2)^2`."""
+    """Natural vignetting: the cosine-fourth law, `1 / (1 + r^2)^2`."""
     width, height = camera.size or (0, 0)
     pixels = pixel_grid(height, width, camera.K).reshape(-1, 2)
     xy = transform(pixel_to_normalized(camera.K), pixels - camera.K[:2, 2])

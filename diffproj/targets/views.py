@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj._core.batched import Batched
-from diffproj._core.numerics import broadcast_batches, check_tensor, readable
+from diffproj._core.numerics import broadcast_batches, check_tensor, has_values
 from diffproj.geometry.grid import checked_size
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
@@ -90,7 +90,7 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
         batch = f"{' x '.join(map(str, self.batch_shape))} cameras, " if self.batch_shape else ""
         views = f"{len(self)} view{'' if len(self) == 1 else 's'} of {self.pixels.shape[-2]} corners"
         hidden = ""
-        if readable(self.visible) and not self.visible.all():
+        if has_values(self.visible) and not self.visible.all():
             hidden = f" ({int((~self.visible).sum())} hidden)"
         size = f", {self.size[0]} x {self.size[1]} px" if self.size is not None else ""
         return f"Views({batch}{views}{hidden}{size}, {self.dtype})"
@@ -203,7 +203,7 @@ def _check_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:
 
 def _check_finite(pixels: Tensor, visible: Tensor, names: tuple[str, ...]) -> None:
     """Refuse a visible corner that is not finite, and say where it is, wherever values can be read."""
-    if not readable(pixels, visible):
+    if not has_values(pixels, visible):
         return
     wrong = visible & ~pixels.isfinite().all(dim=-1)
     if wrong.any():

@@ -71,12 +71,12 @@ def test_a_step_is_that_of_the_dense_normal_equations(damping: float, with_prior
     prior = Prior(shared + 1, torch.diag_embed(torch.full_like(shared, 7.0))) if with_prior else None
     x, z = rough(shared, local)
     _, equations = _Terms(problem, 2, None, None, prior).at(x, z)
-    dx, dz, promise = damped_step(equations, torch.tensor([damping], dtype=D))
+    dx, dz, reduction = damped_step(equations, torch.tensor([damping], dtype=D))
     off = x[0] - prior.mean[0] if prior is not None else torch.zeros(2, dtype=D)
     want = dense_step(problem.linearise(x, z)[0], damping, prior, off)
     got = torch.cat([dx[0], dz[0].reshape(-1)])
     torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-12 * float(want.abs().amax()))
-    assert promise > 0
+    assert reduction > 0
 
 
 def test_finds_the_minimum() -> None:
