@@ -38,7 +38,7 @@ from diffproj.lens.brown_conrady import BrownConrady
 from diffproj.lens.kannala_brandt import KannalaBrandt
 from diffproj.lens.models import register_lens
 from diffproj.lens.protocol import Lens
-from diffproj.measurement.accuracy_map import AccuracyMap, image_map, plane_map
+from diffproj.measurement.accuracy_map import AccuracyMap
 from diffproj.measurement.measure import Measurement, Quantity, measure
 from diffproj.nn.camera import LearnableCamera
 from diffproj.nn.loss import PlaneLoss
@@ -97,7 +97,6 @@ __all__ = [
     "example_views",
     "explain",
     "ground_resolution",
-    "image_map",
     "image_residuals",
     "load_calibration",
     "load_camera",
@@ -106,7 +105,6 @@ __all__ = [
     "paper_route",
     "paper_setup",
     "plane_axes",
-    "plane_map",
     "plane_residuals",
     "rectify",
     "refine",
@@ -118,8 +116,12 @@ __all__ = [
 ]
 
 
+_RENAMED = {"image_map": "AccuracyMap.over_image", "plane_map": "AccuracyMap.over_plane"}
+
+
 def __getattr__(name: str) -> Any:
-    """`diffproj.figures` at its first use: it needs matplotlib, which nothing else does."""
+    """`diffproj.figures` at its first use, for it needs matplotlib, which nothing else does; names that changed."""
     if name == "figures":
         return import_module("diffproj.figures")
-    raise AttributeError(f"module 'diffproj' has no attribute {name!r}")
+    remedy = f"; it is diffproj.{_RENAMED[name]} now" if name in _RENAMED else ""
+    raise AttributeError(f"module 'diffproj' has no attribute {name!r}{remedy}")

@@ -60,10 +60,10 @@ def fig7(experiment: Experiment, magnification: float = 50.0) -> Figure:
 
 
 def accuracy(found: AccuracyMap, unit: str = "world units") -> Figure:
-    """Ground resolution and predicted deviation over the image; the line surrounds what the calibration's corners did.
+    """Ground resolution and predicted standard deviation over the image; the line surrounds the calibration's corners.
 
     Args:
-        found: the map, from `image_map`.
+        found: the map, from `AccuracyMap.over_image`.
         unit: of the world, for the labels.
     """
     figure = Figure(figsize=(9.6, 3.9), layout="constrained")

@@ -3,7 +3,8 @@
 Two figures for each place: the ground resolution, world units that one pixel covers along its worst direction, which is
 geometry; and the predicted standard deviation of a point measured there, along its worst direction, which adds what the
 calibration does not know. Places beyond the horizon or the lens's reach are not valid. `covered` tells the part of the
-image that the calibration's corners surround: outside of it a lens model extrapolates, and the deviation tells how far.
+image that the calibration's corners surround: outside of it a lens model extrapolates, and the standard deviation tells
+how far.
 """
 
 import math
@@ -14,10 +15,11 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from kornia.geometry.grid import create_meshgrid
 from torch import Tensor
 
 from diffproj.calibration.result import Calibration
+from diffproj.geometry.back_projection import ground_resolution
+from diffproj.geometry.grid import pixel_grid
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.measure import measure, view_number
 
@@ -43,112 +45,125 @@ class AccuracyMap:
     resolution: Float[Tensor, "h w"]
     deviation: Float[Tensor, "h w"]
 
+    @classmethod
+    def over_image(
+        cls,
+        calibration: Calibration,
+        plane: Plane | None = None,
+        view: int | str = 0,
+        step: float = 8.0,
+        pixel_sigma: float | None = None,
+    ) -> "AccuracyMap":
+        """The map over the whole image.
 
-def image_map(
-    calibration: Calibration,
-    plane: Plane | None = None,
-    view: int | str = 0,
-    step: float = 8.0,
-    pixel_sigma: float | None = None,
-) -> AccuracyMap:
-    """The map over the whole image.
+        Args:
+            calibration: of one camera, with its covariance.
+            plane: in the frame of the board that the view saw; the board's own, z = 0, if left out.
+            view: the number or the name of the view whose pose holds.
+            step: about how far apart the places are in px; the first and the last row and column lie on the image's
+                edge.
+            pixel_sigma: standard deviation of each coordinate of a measured pixel; the calibration's residual level if
+                left out.
 
-    Args:
-        calibration: of one camera, with its covariance.
-        plane: in the frame of the board that the view saw; the board's own, z = 0, if left out.
-        view: the number or the name of the view whose pose holds.
-        step: about how far apart the places are in px; the first and the last row and column lie on the image's edge.
-        pixel_sigma: noise of a measured pixel; the calibration's residual level if left out.
+        Raises:
+            ValueError: many cameras or planes, no size, no such view, or a step that is not positive.
 
-    Raises:
-        ValueError: many cameras, no size, no such view, or a step that is not positive.
+        Example:
+            >>> import diffproj as dp
+            >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+            >>> accuracy = dp.AccuracyMap.over_image(calibration, step=40)
+            >>> accuracy.deviation.shape, bool(accuracy.covered[6, 8])
+            (torch.Size([13, 17]), True)
+        """
+        size = calibration.camera.size
+        if calibration.views.batch_shape or size is None:
+            raise ValueError("calibration: want one camera of known size; index the views, or give them a size")
+        if not step > 0:
+            raise ValueError(f"step: want a positive distance in px, got {step}")
+        columns, rows = (math.ceil((side - 1) / step) + 1 for side in size)
+        pixels = _grid(rows, columns, (0.0, 0.0, size[0] - 1.0, size[1] - 1.0), calibration.points)
+        return _mapped(pixels, calibration, _single(plane), view, pixel_sigma)
 
-    Example:
-        >>> import diffproj as dp
-        >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-        >>> accuracy = image_map(calibration, step=40)
-        >>> accuracy.deviation.shape, bool(accuracy.covered[6, 8])
-        (torch.Size([13, 17]), True)
-    """
-    size = calibration.camera.size
-    if calibration.views.batch_shape or size is None:
-        raise ValueError("calibration: want one camera of known size; index the views, or give them a size")
-    if not step > 0:
-        raise ValueError(f"step: want a positive distance in px, got {step}")
-    columns, rows = (math.ceil((side - 1) / step) + 1 for side in size)
-    unit = create_meshgrid(rows, columns, normalized_coordinates=True, dtype=torch.float64)[0]
-    last = torch.tensor(size, dtype=torch.float64) - 1
-    pixels = ((unit + 1) / 2 * last).to(calibration.points.device)
-    return _mapped(pixels, calibration, plane or Plane.z(0.0), view, pixel_sigma)
+    @classmethod
+    def over_plane(
+        cls,
+        calibration: Calibration,
+        extent: Sequence[float],
+        plane: Plane | None = None,
+        view: int | str = 0,
+        shape: Sequence[int] = (60, 80),
+        pixel_sigma: float | None = None,
+    ) -> "AccuracyMap":
+        """The map over a rectangle of the board's x and y, on a plane that is a height over them.
+
+        Args:
+            calibration: of one camera, with its covariance.
+            extent: `(x_min, y_min, x_max, y_max)` in world units of the board's frame.
+            plane: in that frame, not at right angles to the board; the board's own, z = 0, if left out.
+            view: the number or the name of the view whose pose holds.
+            shape: rows, along y, and columns, along x.
+            pixel_sigma: standard deviation of each coordinate of a measured pixel; the calibration's residual level if
+                left out.
+
+        Raises:
+            ValueError: many cameras or planes, no such view, an empty extent, or an upright plane.
+
+        Example:
+            >>> import diffproj as dp
+            >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+            >>> accuracy = dp.AccuracyMap.over_plane(calibration, (0, 0, 200, 125), shape=(6, 9))
+            >>> bool(accuracy.valid.all()), bool((accuracy.deviation < 0.2).all())  # millimetres
+            (True, True)
+        """
+        if calibration.views.batch_shape:
+            raise ValueError(f"calibration: want one camera, got batch shape {tuple(calibration.views.batch_shape)}")
+        if len(extent) != 4:
+            raise ValueError(f"extent: want (x_min, y_min, x_max, y_max), got {tuple(extent)}")
+        x_min, y_min, x_max, y_max = extent
+        if not (x_max > x_min and y_max > y_min):
+            raise ValueError(f"extent: want (x_min, y_min, x_max, y_max) with room between, got {tuple(extent)}")
+        plane = _single(plane)
+        if abs(float(plane.unit_normal[2])) < UPRIGHT:
+            raise ValueError("plane: want one that is a height over the board's x and y, got an upright one")
+        rows, columns = shape
+        xy = _grid(rows, columns, (x_min, y_min, x_max, y_max), calibration.points)
+        z = (plane.offset - (plane.normal[:2] * xy).sum(-1)) / plane.normal[2]
+        points = torch.cat([xy, z.unsqueeze(-1)], dim=-1)
+        camera = calibration.cameras[view_number(calibration, view)]
+        pixels, seen = camera.project(points.flatten(0, 1))
+        if camera.size is not None:
+            seen = seen & camera.in_image(pixels)
+        pixels = torch.where(seen.unsqueeze(-1), pixels, torch.nan).reshape(*points.shape[:2], 2)
+        return replace(_mapped(pixels, calibration, plane, view, pixel_sigma), points=points)
 
 
-def plane_map(
-    calibration: Calibration,
-    extent: Sequence[float],
-    plane: Plane | None = None,
-    view: int | str = 0,
-    shape: Sequence[int] = (60, 80),
-    pixel_sigma: float | None = None,
-) -> AccuracyMap:
-    """The map over a rectangle of the board's x and y, on a plane that is a height over them.
+UPRIGHT = 1e-9
+"""The z of a unit normal below which a plane is at right angles to the board."""
 
-    Args:
-        calibration: of one camera, with its covariance.
-        extent: `(x_min, y_min, x_max, y_max)` in world units of the board's frame.
-        plane: in that frame, not at right angles to the board; the board's own, z = 0, if left out.
-        view: the number or the name of the view whose pose holds.
-        shape: rows, along y, and columns, along x.
-        pixel_sigma: noise of a measured pixel; the calibration's residual level if left out.
 
-    Raises:
-        ValueError: many cameras, no such view, an empty extent, or an upright plane.
-
-    Example:
-        >>> import diffproj as dp
-        >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-        >>> accuracy = plane_map(calibration, (0, 0, 200, 125), shape=(6, 9))
-        >>> bool(accuracy.valid.all()), bool((accuracy.deviation < 0.2).all())  # millimetres
-        (True, True)
-    """
-    if calibration.views.batch_shape:
-        raise ValueError(f"calibration: want one camera, got batch shape {tuple(calibration.views.batch_shape)}")
-    if len(extent) != 4:
-        raise ValueError(f"extent: want (x_min, y_min, x_max, y_max), got {tuple(extent)}")
-    x_min, y_min, x_max, y_max = extent
-    if not (x_max > x_min and y_max > y_min):
-        raise ValueError(f"extent: want (x_min, y_min, x_max, y_max) with room between, got {tuple(extent)}")
+def _single(plane: Plane | None) -> Plane:
+    """One plane in float64; the board's where none was given."""
     plane = (plane or Plane.z(0.0)).to(torch.float64)
-    if bool(plane.normal[..., 2].abs() < 1e-9 * plane.normal.norm(dim=-1)):
-        raise ValueError("plane: want one that is a height over the board's x and y, got an upright one")
-    unit = (create_meshgrid(*shape, normalized_coordinates=True, dtype=torch.float64)[0] + 1) / 2
-    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in ((x_min, y_min), (x_max, y_max)))
-    xy = (low + unit * (high - low)).to(calibration.points.device)
-    z = (plane.offset - (plane.normal[:2] * xy).sum(-1)) / plane.normal[2]
-    points = torch.cat([xy, z.unsqueeze(-1)], dim=-1)
-    number = view_number(calibration, view)
-    camera = calibration.cameras[number]
-    pixels, seen = camera.project(points.reshape(-1, 3))
-    if camera.size is not None:
-        last = torch.tensor(camera.size, dtype=torch.float64, device=pixels.device) - 0.5
-        seen = seen & ((pixels >= -0.5) & (pixels <= last)).all(-1)
-    pixels = torch.where(seen.unsqueeze(-1), pixels, torch.nan).reshape(*points.shape[:2], 2)
-    return replace(_mapped(pixels, calibration, plane, view, pixel_sigma), points=points)
+    if plane.batch_shape:
+        raise ValueError(f"plane: want one plane, got batch shape {tuple(plane.batch_shape)}")
+    return plane
+
+
+def _grid(rows: int, columns: int, extent: tuple[float, float, float, float], like: Tensor) -> Tensor:
+    """Places `(rows, columns, 2)` at equal distances, from the first corner of the extent to the last."""
+    low, high = like.new_tensor(extent[:2]), like.new_tensor(extent[2:])
+    steps = like.new_tensor([columns - 1, rows - 1]).clamp(min=1)
+    return low + pixel_grid(rows, columns, like) / steps * (high - low)
 
 
 def _mapped(
     pixels: Tensor, calibration: Calibration, plane: Plane, view: int | str, pixel_sigma: float | None
 ) -> AccuracyMap:
+    """The map at pixels `(H, W, 2)`; NaN stands for a place without a pixel."""
     shape = pixels.shape[:2]
-    flat = pixels.reshape(-1, 2)
+    flat = pixels.flatten(0, 1)
     measured = measure(flat, calibration, plane, view, pixel_sigma)
-    unit = measure(flat, calibration, plane, view, pixel_sigma=1.0)
-    resolution = torch.linalg.svdvals(unit._own)[:, 0]
-    covariance = measured.covariance
-    infinite = covariance.isinf().any(-1).any(-1)
-    finite = torch.where(infinite[:, None, None], 0.0, covariance)
-    deviation = torch.linalg.eigvalsh(finite)[:, -1].clamp(min=0).sqrt()
-    deviation = torch.where(infinite, torch.inf, deviation)
-    valid = measured.valid
+    resolution, valid = ground_resolution(flat, calibration.cameras[view_number(calibration, view)], plane)
 
     def shown(values: Tensor) -> Tensor:
         return torch.where(valid, values, torch.nan).reshape(shape)
@@ -159,8 +174,15 @@ def _mapped(
         valid.reshape(shape),
         _surrounded(flat, calibration).reshape(shape),
         shown(resolution),
-        shown(deviation),
+        shown(_largest_deviation(measured.covariance)),
     )
+
+
+def _largest_deviation(covariance: Tensor) -> Tensor:
+    """The standard deviation along the worst direction `(N,)`; infinite where a coordinate is not determined."""
+    infinite = covariance.isinf().any(-1).any(-1)
+    largest = torch.linalg.eigvalsh(torch.where(infinite[:, None, None], 0.0, covariance))[:, -1]
+    return torch.where(infinite, torch.inf, largest.clamp(min=0).sqrt())
 
 
 def _surrounded(pixels: Tensor, calibration: Calibration) -> Tensor:
