@@ -11,8 +11,8 @@ so that the covariance of all points together is
 
 with `D = dX / d uv`, G the derivative by theta and by the plane, and Sigma their joint covariance: the calibration's,
 with its correlations between intrinsics and pose, and the plane's where one is given. A quantity of some of the points
-has the variance `g^T C g`, g its gradient: to first order, as sampling confirms while deviations are small beside the
-distance. Nothing is worked out for all pairs of points before it is asked for.
+has the variance `g^T C g`, g its gradient. This is first order: sampling agrees as long as standard deviations are
+small beside the distance. The covariance of all pairs of points is computed only where it is asked for (`joint`).
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
 
 SIGNIFICANT = 3.0
-"""Deviations below which a length is not told from 0."""
+"""How many standard deviations a value has to be away from 0 to be told from it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +41,15 @@ class Quantity:
 
     Attributes:
         value: `(*B, M)`; NaN where a point that it needs is not valid.
-        deviation: `(*B, M)`, in the unit of the value; infinite where the calibration does not determine it.
+        deviation: standard deviation `(*B, M)` in the unit of the value; infinite where the calibration does not
+            determine it.
     """
 
     value: Float[Tensor, "*shape"]
     deviation: Float[Tensor, "*shape"]
 
     def interval(self, level: float = 0.95) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
-        """The bounds between which the truth lies with that probability, for Gaussian noise.
+        """Lower and upper bounds between which the truth lies with that probability, for Gaussian noise.
 
         Raises:
             ValueError: the level is not between 0 and 1.
@@ -60,7 +61,7 @@ class Quantity:
 
     @property
     def significant(self) -> Bool[Tensor, "*shape"]:
-        """Whether the value is at least three of its deviations from 0; not where both are 0."""
+        """Whether the value is at least three of its standard deviations from 0; false where both are 0."""
         return (self.value.abs() >= SIGNIFICANT * self.deviation) & (self.value != 0)
 
 
@@ -71,13 +72,15 @@ class Measurement:
     Attributes:
         points: `(*B, N, 3)` in world units.
         valid: `(*B, N)`, as `back_project` gives it.
-        complete: whether the uncertainty of the intrinsics is in; if not, that of the pixels alone, or of the pixels
-            and of a pose that was located with a bare camera.
+        includes_intrinsics: whether the standard deviations include the uncertainty of focal lengths, principal point
+            and lens. They do for a calibration with its covariance. For a camera alone, or a calibration from a file
+            without a covariance, they hold the pixels' noise only; for a pose that `locate` found with a camera alone,
+            the pixels' noise and the pose's uncertainty.
     """
 
     points: Float[Tensor, "*batch n 3"]
     valid: Bool[Tensor, "*batch n"]
-    complete: bool
+    includes_intrinsics: bool
     _common: Tensor  # G (*B, N, 3, Q)
     _sigma: Tensor  # Sigma (*B, Q, Q), infinite on the diagonal only
     _own: Tensor  # sigma_i D_i (*B, N, 3, 2)
@@ -104,7 +107,7 @@ class Measurement:
         return _without(C, self._unknown(G))
 
     def quantity(self, function: Callable[[Tensor], Tensor], which: Sequence[Sequence[int]] | Tensor) -> Quantity:
-        """Any number that depends on a few of the points, with its deviation.
+        """Any number that depends on a few of the points, with its standard deviation.
 
         Args:
             function: takes k points `(k, 3)` to a number; written with PyTorch's functions, so that it has a gradient.
@@ -140,7 +143,7 @@ class Measurement:
         variance = ((common @ zero_where_infinite(self._sigma)) * common).sum(-1) + noise
         variance = torch.where(self._unknown(common.unsqueeze(-2)).squeeze(-1).squeeze(-1), torch.inf, variance)
         valid = self.valid[..., index].all(-1)
-        # The root's slope at 0 is infinite: a length between a point and itself has a deviation of 0 and no gradient.
+        # The root's slope at 0 is infinite: the length between a point and itself has deviation 0 and zero gradient.
         known = valid & (variance > 0)
         deviation = torch.where(known, torch.where(known, variance, 1.0).sqrt(), 0.0)
         return Quantity(torch.where(valid, value, torch.nan), torch.where(valid, deviation, torch.nan))
@@ -162,7 +165,7 @@ class Measurement:
         return self.quantity(_area, [every])
 
     def summary(self) -> str:
-        """Points and successive lengths with their deviations, as a text for people; for one camera.
+        """Points and successive lengths with their standard deviations, as a text for people; for one camera.
 
         Raises:
             ValueError: there are many cameras.
@@ -181,7 +184,7 @@ class Measurement:
             for n, (length, deviation, significant) in enumerate(rows):
                 note = "" if significant else "  less than three deviations from 0"
                 lines.append(f"{n} to {n + 1:<4} {length:10.3f} ± {deviation:.3f}{note}")
-        if not self.complete:
+        if not self.includes_intrinsics:
             known = "pixels and the pose" if self._sigma.shape[-1] else "pixels alone"
             lines.append(f"The deviations hold the noise of the {known}: the camera came without a covariance.")
         return "\n".join(lines)
@@ -213,7 +216,7 @@ def measure(
     Args:
         pixels: `(*B, N, 2)`, in the photograph of that view.
         calibration: of batch shape `*B`, from `calibrate` or `refine`, or from `locate` for a new photograph; or a
-            camera at its pose, whose own uncertainty is then not known and not in.
+            camera at its pose, whose own uncertainty is then not included.
         plane: in the frame of the board that the view saw.
         view: the number or the name of the view whose pose holds.
         pixel_sigma: standard deviation of each coordinate of the measured pixels, a number or `(*B, N)`; the
@@ -236,52 +239,36 @@ def measure(
         199.9 ± 0.2 mm
     """
     pixels = in_float64(check_tensor("pixels", pixels, "N", 2))
-    if not isinstance(calibration, Calibration):
-        camera, known = as_camera(calibration), None
-        if pixel_sigma is None:
-            raise ValueError("pixel_sigma: want the noise of the pixels, for a camera alone does not know it")
+    if isinstance(calibration, Calibration):
+        camera, known, level = _at_view(calibration, view)
     else:
-        number = view_number(calibration, view)
-        if not bool(calibration.used[..., number, :].any(-1).all()):
-            raise ValueError(f"view: want one whose pose is known, got {view!r}, of which no corner was used")
-        camera = calibration.cameras[..., number]
-        known = calibration.covariance.view(number) if calibration.has_covariance else None
-        if pixel_sigma is None and calibration.pixel_sigma is not None:
-            pixel_sigma = calibration.pixel_sigma.unsqueeze(-1)
-        if pixel_sigma is None:
-            raise ValueError("pixel_sigma: want the noise of the pixels, for this calibration does not know it")
-    camera = camera.to(torch.float64)
-    plane = plane.to(torch.float64)
+        camera, known, level = as_camera(calibration), None, None
+    if pixel_sigma is None and level is None:
+        source = "this calibration" if isinstance(calibration, Calibration) else "a camera alone"
+        raise ValueError(f"pixel_sigma: want the noise of the pixels, for {source} does not know it")
+    camera, plane = camera.to(torch.float64), plane.to(torch.float64)
     points, valid = back_project(pixels, camera, plane)
     batch = points.shape[:-2]
+    sigma = _expanded(level if pixel_sigma is None else pixel_sigma, like=points)
     by_theta, by_point = _projection_derivatives(points, camera, known)
-    normal = plane.normal if plane.is_per_point else plane.normal.unsqueeze(-2)
-    T = _tangents(normal).expand(*points.shape, 2)  # (*B, N, 3, 2)
-    across = _inverse2(by_point @ T)
-    D = torch.where(valid[..., None, None], T @ across, 0.0)
+    tangents = plane.tangents()
+    T = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)  # (*B, N, 3, 2)
+    D = torch.where(valid[..., None, None], T @ _inverse2(by_point @ T), 0.0)
     blocks, covariances = [-D @ by_theta], [torch.zeros(*batch, 0, 0).to(D) if known is None else known]
     if plane_covariance is not None:
         plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
         if plane.is_per_point:
             raise ValueError("plane_covariance: want one plane for all points, got one for each (Plane.per_point)")
-        n = normal.expand_as(points)
+        n = plane.normal.unsqueeze(-2).expand_as(points)
         lift = n / n.square().sum(-1, keepdim=True)
         lift = lift - (D @ (by_point @ lift.unsqueeze(-1))).squeeze(-1)
         with_offset = torch.cat([-points, torch.ones_like(points[..., :1])], dim=-1)
         blocks.append(lift.unsqueeze(-1) * with_offset.unsqueeze(-2))
         covariances.append(in_float64(plane_covariance))
-    sigma = torch.as_tensor(pixel_sigma, dtype=torch.float64, device=points.device)
-    try:
-        sigma = sigma.expand(points.shape[:-1])
-    except RuntimeError:
-        want, got = tuple(points.shape[:-1]), tuple(sigma.shape)
-        raise ValueError(f"pixel_sigma: want a number or a shape that broadcasts to {want}, got {got}") from None
-    if bool((sigma.detach() < 0).any()):
-        raise ValueError("pixel_sigma: want standard deviations of at least 0, got negative ones")
     common = torch.where(valid[..., None, None], torch.cat(blocks, dim=-1), 0.0)
     own = sigma[..., None, None] * D
-    complete = isinstance(calibration, Calibration) and known is not None and calibration.knows_intrinsics
-    return Measurement(points, valid, complete, common, _block_diagonal(covariances, batch), own)
+    includes_intrinsics = isinstance(calibration, Calibration) and known is not None and calibration.knows_intrinsics
+    return Measurement(points, valid, includes_intrinsics, common, _block_diagonal(covariances, batch), own)
 
 
 def _sets(name: str, which: Sequence[Sequence[int]] | Tensor, k: int) -> Tensor:
@@ -301,6 +288,29 @@ def view_number(calibration: Calibration, view: int | str) -> int:
     if not -len(names) <= view < len(names):
         raise ValueError(f"view: want a number below {len(names)}, got {view}")
     return view % len(names)
+
+
+def _at_view(calibration: Calibration, view: int | str) -> tuple[Camera, Tensor | None, Tensor | None]:
+    """The camera at the pose of a view, the covariance of both, and the noise of a pixel `(*B, 1)`, where known."""
+    number = view_number(calibration, view)
+    if not bool(calibration.used[..., number, :].any(-1).all()):
+        raise ValueError(f"view: want one whose pose is known, got {view!r}, of which no corner was used")
+    known = calibration.covariance.view(number) if calibration.has_covariance else None
+    level = None if calibration.pixel_sigma is None else calibration.pixel_sigma.unsqueeze(-1)
+    return calibration.cameras[..., number], known, level
+
+
+def _expanded(pixel_sigma: float | Tensor | None, like: Tensor) -> Tensor:
+    """The standard deviation of each pixel `(*B, N)`, for points `(*B, N, 3)`."""
+    sigma = torch.as_tensor(pixel_sigma, dtype=torch.float64, device=like.device)
+    try:
+        sigma = sigma.expand(like.shape[:-1])
+    except RuntimeError:
+        want, got = tuple(like.shape[:-1]), tuple(sigma.shape)
+        raise ValueError(f"pixel_sigma: want a number or a shape that broadcasts to {want}, got {got}") from None
+    if bool((sigma.detach() < 0).any()):
+        raise ValueError("pixel_sigma: want standard deviations of at least 0, got negative ones")
+    return sigma
 
 
 def _projection_derivatives(points: Tensor, camera: Camera, known: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -324,15 +334,6 @@ def _projection_derivatives(points: Tensor, camera: Camera, known: Tensor | None
     # A bow bends the board that was calibrated on, not what is measured.
     by_theta = torch.cat([J[..., :s], J.new_zeros(*J.shape[:-1], bow), J[..., s : s + 6]], dim=-1)
     return (by_theta if known is not None else by_theta[..., :0]), J[..., s + 6 :]
-
-
-def _tangents(normal: Tensor) -> Tensor:
-    """Two unit vectors of the plane `(..., 3, 2)`, at right angles to each other."""
-    smallest = torch.nn.functional.one_hot(normal.abs().argmin(-1), 3).to(normal)
-    first = torch.linalg.cross(normal, smallest)
-    first = first / first.norm(dim=-1, keepdim=True)
-    second = torch.linalg.cross(normal, first)
-    return torch.stack([first, second / second.norm(dim=-1, keepdim=True)], dim=-1)
 
 
 def _inverse2(matrix: Tensor) -> Tensor:

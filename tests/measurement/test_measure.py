@@ -165,7 +165,7 @@ def test_a_view_by_number_or_name_and_a_camera_alone(calibration: dp.Calibration
     assert torch.equal(by_number.joint(), by_name.joint())
     alone = dp.measure(pixels, calibration.cameras[4], Z, pixel_sigma=float(calibration.pixel_sigma))
     assert torch.equal(alone.points, by_number.points)
-    assert not alone.complete
+    assert not alone.includes_intrinsics
     assert (alone.deviations[:, :2] < by_number.deviations[:, :2]).all()
     assert "noise of the pixels alone" in alone.summary()
     assert "noise of the pixels alone" not in by_number.summary()
@@ -177,7 +177,7 @@ def test_a_saved_calibration_measures_just_as_well(calibration: dp.Calibration, 
     pixels = calibration.views.pixels[2, [0, 8, 53]]
     first, second = (dp.measure(pixels, c, Z, view=2) for c in (calibration, again))
     torch.testing.assert_close(second.joint(), first.joint(), rtol=1e-12, atol=1e-15)
-    assert second.complete
+    assert second.includes_intrinsics
 
 
 def test_a_located_photograph_knows_the_intrinsics_uncertainty() -> None:
