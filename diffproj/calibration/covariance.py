@@ -21,6 +21,7 @@ A parameter that the corners do not determine has infinite variance, and covaria
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -109,6 +110,36 @@ class Covariance:
         poses = poses * known.unsqueeze(-1) * known.unsqueeze(-2)
         poses = poses + torch.diag_embed(torch.where(known > 0, 0.0, torch.inf))
         return torch.cat([torch.cat([self.shared, cross.mT], dim=-1), torch.cat([cross, poses], dim=-1)], dim=-2)
+
+    def to_fields(self) -> dict[str, Any]:
+        """Everything in it as plain lists, for a file. An infinite variance is 0 here; the masks tell where."""
+        tensors = {
+            "shared": torch.where(self.shared.isfinite(), self.shared, 0.0),
+            "follow": self._follow,
+            "mixed": self._mixed,
+            "alone": self._alone,
+            "undetermined": self.undetermined,
+            "undetermined_views": self.undetermined_views,
+        }
+        return {"names": list(self.names), **{key: tensor.tolist() for key, tensor in tensors.items()}}
+
+    @classmethod
+    def from_fields(cls, fields: dict[str, Any]) -> "Covariance":
+        """The covariance that `to_fields` gave, in float64.
+
+        Raises:
+            KeyError: a field is missing.
+            TypeError: a field holds something other than numbers.
+            ValueError: a field's lists are not of equal lengths.
+        """
+        undetermined, undetermined_views = (
+            torch.tensor(fields[key], dtype=torch.bool) for key in ("undetermined", "undetermined_views")
+        )
+        shared, *blocks = (
+            torch.tensor(fields[key], dtype=torch.float64) for key in ("shared", "follow", "mixed", "alone")
+        )
+        infinite = torch.diag_embed(torch.where(undetermined, torch.inf, 0.0).to(shared))
+        return cls(tuple(fields["names"]), shared + infinite, undetermined, undetermined_views, *blocks)
 
 
 def zero_where_infinite(covariance: Tensor) -> Tensor:
