@@ -1,28 +1,58 @@
-"""The formats by name and suffix."""
+"""The formats by name, and by the suffix of a file."""
 
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
-Format = Literal["opencv", "json"]
+from diffproj.calibration.result import Calibration
+from diffproj.files import opencv, own_json
+from diffproj.geometry.camera import Camera
 
-
-_SUFFIXES: dict[str, Format] = {".yml": "opencv", ".yaml": "opencv", ".xml": "opencv", ".json": "json"}
-
-
+FormatName = Literal["opencv", "json"]
 PathLike = str | os.PathLike[str]
 
 
-def named(path: Path, format: str | None) -> Format:  # noqa: A002
-    """The format that the caller named, or else the one that goes with the suffix.
+@runtime_checkable
+class Format(Protocol):
+    """What the module of a format offers."""
+
+    SUFFIXES: tuple[str, ...]
+    """Of its files, in lower case."""
+
+    def dumps(self, path: Path, item: Camera | Calibration) -> str:
+        """A camera or a calibration as the text of the file.
+
+        Raises:
+            ValueError: it has something that the format cannot hold.
+        """
+        ...
+
+    def read_camera(self, path: Path) -> Camera:
+        """The camera in a file; of a calibration, the one without a pose.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is not of this format, or damaged.
+        """
+        ...
+
+
+FORMATS: dict[FormatName, Format] = {"opencv": opencv, "json": own_json}
+
+
+def format_of(path: Path, name: str | None = None) -> Format:
+    """The format of that name, or else the one that goes with the suffix.
 
     Raises:
         ValueError: there is no such format, or none with this suffix.
     """
-    if format is None:
-        if path.suffix.lower() not in _SUFFIXES:
-            raise ValueError(f"{path}: want a suffix of {', '.join(_SUFFIXES)}, or format='opencv' or 'json'")
-        return _SUFFIXES[path.suffix.lower()]
-    if format not in ("opencv", "json"):
-        raise ValueError(f"format: want 'opencv' or 'json', got {format!r}")
-    return format
+    names = " or ".join(map(repr, FORMATS))
+    if name is not None:
+        if name not in FORMATS:
+            raise ValueError(f"format: want {names}, got {name!r}")
+        return FORMATS[name]
+    for known in FORMATS.values():
+        if path.suffix.lower() in known.SUFFIXES:
+            return known
+    suffixes = ", ".join(suffix for known in FORMATS.values() for suffix in known.SUFFIXES)
+    raise ValueError(f"{path}: want a suffix of {suffixes}, or format={names}")

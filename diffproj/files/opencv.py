@@ -1,4 +1,4 @@
-"""OpenCV's YAML and XML: one camera, as OpenCV's calibration program writes it."""
+"""OpenCV's YAML and XML: one camera, under the keys that OpenCV's own calibration program writes."""
 
 from pathlib import Path
 
@@ -9,9 +9,11 @@ from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera
 from diffproj.lens.kannala_brandt import KannalaBrandt
 
+SUFFIXES: tuple[str, ...] = (".yml", ".yaml", ".xml")
+
 
 def dumps(path: Path, item: Camera | Calibration) -> str:
-    """A camera as the text of a file; XML where the suffix says so.
+    """A camera as the text of a file, XML where the suffix is `.xml`; of a calibration also poses and errors.
 
     Raises:
         ValueError: a batch of cameras, a pose, skew or a lens that OpenCV does not have.
@@ -24,7 +26,7 @@ def dumps(path: Path, item: Camera | Calibration) -> str:
     K, dist, rvec, tvec = camera.to_opencv()
     if rvec.any() or tvec.any():
         raise ValueError(f"{path}: OpenCV's formats hold no pose; use .json, or save camera.without_pose()")
-    suffix = path.suffix.lower() if path.suffix.lower() in (".xml", ".yml", ".yaml") else ".yml"
+    suffix = ".xml" if path.suffix.lower() == ".xml" else ".yml"
     storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     if camera.size is not None:
         storage.write("image_width", camera.size[0])

@@ -1,4 +1,12 @@
-"""The own JSON: any batch of cameras, or a whole calibration with its corners and its covariance."""
+"""This package's own JSON: any batch of cameras, or a whole calibration with its corners and its covariance.
+
+    {"format": "diffproj camera", "version": 1,
+     "camera": {"dtype", "size", "K", "R", "t", "lens": {"model", "coefficients"}},
+     "calibration": {"R", "t", "points", "pixels", "visible", "used", ..., "covariance"}}
+
+`calibration` is there only where a whole calibration was saved. Numbers are written so that they come back exactly.
+JSON has neither NaN nor infinity: `null` stands for NaN.
+"""
 
 import json
 import math
@@ -16,19 +24,22 @@ from diffproj.geometry.camera import Camera
 from diffproj.lens.models import KINDS, coefficients_of
 from diffproj.targets.views import Views
 
-JSON_FORMAT = "diffproj camera"
+SUFFIXES: tuple[str, ...] = (".json",)
+KIND, VERSION = "diffproj camera", 1
+"""What every file says of itself."""
 
 
-JSON_VERSION = 1
-
-
-def dumps(item: Camera | Calibration) -> str:
+def dumps(path: Path, item: Camera | Calibration) -> str:
     """A camera or a calibration as the text of a file.
 
     Raises:
         ValueError: a lens of another library.
     """
-    return _readable(json.dumps(_without_nan(_document(item)), indent=1, allow_nan=False))
+    camera = item.camera if isinstance(item, Calibration) else item
+    document = {"format": KIND, "version": VERSION, "camera": _camera_fields(path, camera)}
+    if isinstance(item, Calibration):
+        document["calibration"] = _calibration_fields(item)
+    return _readable(json.dumps(_without_nan(document), indent=1, allow_nan=False))
 
 
 def read_camera(path: Path) -> Camera:
@@ -38,19 +49,19 @@ def read_camera(path: Path) -> Camera:
         FileNotFoundError: there is no such file.
         ValueError: it is no camera file of this package, or damaged.
     """
-    return _camera(path, _read(path)["camera"])
+    return _camera(path, _document(path)["camera"])
 
 
-def read_calibration(path: Path) -> Calibration:
-    """The calibration in a file.
+def read_calibration(path: Path) -> Calibration | None:
+    """The calibration in a file; `None` where it holds a camera alone.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is no camera file of this package, holds a camera alone, or is damaged.
+        ValueError: it is no camera file of this package, or damaged.
     """
-    document = _read(path)
+    document = _document(path)
     if "calibration" not in document:
-        raise ValueError(f"{path}: want a calibration, got a camera alone; load_camera reads it")
+        return None
     camera = _camera(path, document["camera"])
     try:
         found = document["calibration"]
@@ -61,7 +72,7 @@ def read_calibration(path: Path) -> Calibration:
         status, iterations = (torch.tensor(found[key]) for key in ("status", "iterations"))
         bow = None if found["bow"] is None else _tensor(found["bow"], torch.float64)
         posed = camera if not camera.batch_shape else camera[..., None]
-        covariance = _covariance_from_fields(found["covariance"])
+        covariance = None if found["covariance"] is None else Covariance.from_fields(found["covariance"])
         return Calibration(
             camera,
             posed.at(R, t),
@@ -81,76 +92,51 @@ def read_calibration(path: Path) -> Calibration:
         raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
 
 
-def _document(item: Camera | Calibration) -> dict[str, Any]:
-    camera = item.camera if isinstance(item, Calibration) else item
+def _camera_fields(path: Path, camera: Camera) -> dict[str, Any]:
     lens = camera.distortion
     try:
         coefficients = coefficients_of(lens, camera.t)
     except TypeError:
-        raise ValueError(f"distortion: want one of {', '.join(KINDS)}, got {type(lens).__name__}") from None
-    document: dict[str, Any] = {
-        "format": JSON_FORMAT,
-        "version": JSON_VERSION,
-        "camera": {
-            "dtype": str(camera.dtype).removeprefix("torch."),
-            "size": camera.size,
-            "K": camera.K.tolist(),
-            "R": camera.R.tolist(),
-            "t": camera.t.tolist(),
-            "lens": None if lens is None else {"model": type(lens).__name__, "coefficients": coefficients.tolist()},
-        },
+        raise ValueError(f"{path}: distortion: want one of {', '.join(KINDS)}, got {type(lens).__name__}") from None
+    return {
+        "dtype": str(camera.dtype).removeprefix("torch."),
+        "size": camera.size,
+        "K": camera.K.tolist(),
+        "R": camera.R.tolist(),
+        "t": camera.t.tolist(),
+        "lens": None if lens is None else {"model": type(lens).__name__, "coefficients": coefficients.tolist()},
     }
-    if isinstance(item, Calibration):
-        document["calibration"] = {
-            "rms": item.rms.tolist(),
-            "status": item.status.tolist(),
-            "iterations": item.iterations.tolist(),
-            "objective": item.objective,
-            "bow": None if item.bow is None else item.bow.tolist(),
-            "R": item.cameras.R.tolist(),
-            "t": item.cameras.t.tolist(),
-            "points": item.points.tolist(),
-            "names": item.views.names,
-            "size": item.views.size,
-            "pixels": item.views.pixels.tolist(),
-            "visible": item.views.visible.tolist(),
-            "used": item.used.tolist(),
-            "rejected": item.rejected.tolist(),
-            "causes": item.causes,
-            "pixel_sigma": None if item.pixel_sigma is None else item.pixel_sigma.tolist(),
-            "covariance": _covariance_fields(item),
-        }
-    return document
+
+
+def _calibration_fields(item: Calibration) -> dict[str, Any]:
+    return {
+        "rms": item.rms.tolist(),
+        "status": item.status.tolist(),
+        "iterations": item.iterations.tolist(),
+        "objective": item.objective,
+        "bow": None if item.bow is None else item.bow.tolist(),
+        "R": item.cameras.R.tolist(),
+        "t": item.cameras.t.tolist(),
+        "points": item.points.tolist(),
+        "names": item.views.names,
+        "size": item.views.size,
+        "pixels": item.views.pixels.tolist(),
+        "visible": item.views.visible.tolist(),
+        "used": item.used.tolist(),
+        "rejected": item.rejected.tolist(),
+        "causes": item.causes,
+        "pixel_sigma": None if item.pixel_sigma is None else item.pixel_sigma.tolist(),
+        "covariance": item.covariance.to_fields() if item.has_covariance else None,
+    }
 
 
 def _same(covariance: Covariance) -> Covariance:
+    """What a calibration calls for its covariance; a function of the module, so that it can be pickled."""
     return covariance
 
 
-def _covariance_fields(item: Calibration) -> dict[str, Any] | None:
-    """The blocks of the covariance; what is infinite is 0 here and known by the masks, for JSON has no infinity."""
-    if not item.has_covariance:
-        return None
-    known = item.covariance
-    fields = {key: getattr(known, f"_{key}").tolist() for key in ("follow", "mixed", "alone")}
-    fields |= {key: getattr(known, key).tolist() for key in ("undetermined", "undetermined_views")}
-    shared = torch.where(known.shared.isfinite(), known.shared, 0.0)
-    return {"names": known.names, "shared": shared.tolist(), **fields}
-
-
-def _covariance_from_fields(fields: dict[str, Any] | None) -> Covariance | None:
-    if fields is None:
-        return None
-    unknown, unknown_views = (
-        torch.tensor(fields[key], dtype=torch.bool) for key in ("undetermined", "undetermined_views")
-    )
-    shared, *blocks = (_tensor(fields[key], torch.float64) for key in ("shared", "follow", "mixed", "alone"))
-    infinite = torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(shared))
-    return Covariance(tuple(fields["names"]), shared + infinite, unknown, unknown_views, *blocks)
-
-
 def _without_nan(value: Any) -> Any:
-    """The same with `None` for what is no finite number, for JSON has only those."""
+    """The same with `None` for numbers that are not finite, which JSON does not have."""
     if isinstance(value, dict):
         return {key: _without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -168,17 +154,16 @@ def _readable(text: str) -> str:
     return re.sub(r"\[[^\[\]{}]*\]", lambda match: re.sub(r"\s*\n\s*", " ", match[0]), text) + "\n"
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _document(path: Path) -> dict[str, Any]:
+    """What is in a file, known to be one of this package and of this version."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path}: want a JSON file, got something else ({error})") from error
-    if not isinstance(document, dict) or document.get("format") != JSON_FORMAT or "camera" not in document:
+    if not isinstance(document, dict) or document.get("format") != KIND or "camera" not in document:
         raise ValueError(f"{path}: want a camera file of diffproj, got another JSON file")
-    if document.get("version") != JSON_VERSION:
-        raise ValueError(
-            f"{path}: want version {JSON_VERSION}, got {document.get('version')}; a newer diffproj reads it"
-        )
+    if document.get("version") != VERSION:
+        raise ValueError(f"{path}: want version {VERSION}, got {document.get('version')}; a newer diffproj reads it")
     return document
 
 

@@ -6,12 +6,11 @@ from kornia.geometry.camera import PinholeCamera
 
 from diffproj._core.atomic import write_whole
 from diffproj.calibration.result import Calibration
-from diffproj.files import opencv, own_json
-from diffproj.files.formats import Format, PathLike, named
+from diffproj.files.formats import FormatName, PathLike, format_of
 from diffproj.geometry.camera import Camera, as_camera
 
 
-def save_camera(path: PathLike, camera: Camera | PinholeCamera | Calibration, format: Format | None = None) -> None:  # noqa: A002
+def save_camera(path: PathLike, camera: Camera | PinholeCamera | Calibration, format: FormatName | None = None) -> None:  # noqa: A002
     """Save a camera or a calibration.
 
     Args:
@@ -38,4 +37,4 @@ def save_camera(path: PathLike, camera: Camera | PinholeCamera | Calibration, fo
     if isinstance(camera, PinholeCamera):
         camera = as_camera(camera)
     path = Path(path)
-    write_whole(path, own_json.dumps(camera) if named(path, format) == "json" else opencv.dumps(path, camera))
+    write_whole(path, format_of(path, format).dumps(path, camera))

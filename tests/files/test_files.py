@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ import torch
 
 import diffproj as dp
 from diffproj._core import atomic
+from diffproj.files.load import load
 
 D = torch.float64
 
@@ -59,6 +61,33 @@ def test_whole_calibration_comes_back(tmp_path: Path, calibration: dp.Calibratio
     assert found.views.names == calibration.views.names
     assert found.summary() == calibration.summary()
     assert_same(dp.load_camera(tmp_path / "c.json"), calibration.camera)
+
+
+def test_load_gives_what_the_file_holds(tmp_path: Path, camera: dp.Camera, calibration: dp.Calibration) -> None:
+    dp.save_camera(tmp_path / "calibration.JSON", calibration)
+    dp.save_camera(tmp_path / "camera.json", camera)
+    dp.save_camera(tmp_path / "camera.Yaml", calibration)
+    whole = load(tmp_path / "calibration.JSON")
+    assert isinstance(whole, dp.Calibration)
+    assert whole.summary() == calibration.summary()
+    for name, want in (("camera.json", camera), ("camera.Yaml", calibration.camera)):
+        found = load(tmp_path / name)
+        assert isinstance(found, dp.Camera)
+        assert_same(found, want)
+
+
+def test_covariance_comes_back(calibration: dp.Calibration) -> None:
+    unknown = torch.zeros(9, dtype=torch.bool)
+    unknown[[2, 8]] = True
+    shared = torch.where(unknown | unknown[:, None], 0.0, calibration.covariance.shared)
+    shared = shared + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(D))
+    want = replace(calibration.covariance, shared=shared, undetermined=unknown)
+    fields = want.to_fields()
+    assert list(fields) == ["names", "shared", "follow", "mixed", "alone", "undetermined", "undetermined_views"]
+    found = dp.Covariance.from_fields(json.loads(json.dumps(fields, allow_nan=False)))
+    assert found.names == want.names
+    assert torch.equal(found.undetermined, want.undetermined)
+    assert torch.equal(found.full(), want.full())
 
 
 def test_opencv_reads_a_calibration(tmp_path: Path, calibration: dp.Calibration) -> None:
