@@ -2,18 +2,19 @@
 
 import sys
 
+from diffproj.cli import main as run
+
 
 def main() -> int:
     """Run the command line, or say what it needs."""
     try:
-        from diffproj.cli import main as run
+        return run()
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
         if missing not in ("matplotlib", "rich"):
             raise
         print(f"diffproj: the command line needs {missing}; pip install 'diffproj[cli]'", file=sys.stderr)
         return 1
-    return run()
 
 
 if __name__ == "__main__":

@@ -1,45 +1,59 @@
 """The `diffproj` command: joins calibration, measurement, experiment, figures and files.
 
+Each command is a module of its own with `add_options` and `run`, and is imported only when it is called: help and
+mistakes in the command line wait for nothing else.
+
 Exit codes: 0 done, 1 the work failed (one line says what and what to do), 2 the command was not understood, 130
 interrupted from the keyboard.
 """
 
 import argparse
+import re
 import sys
-import warnings
 from collections.abc import Sequence
+from importlib import import_module
 
-from diffproj.calibration.result import CalibrationError
-from diffproj.cli import calibrate, experiment, measure
-from diffproj.cli.inputs import shielded
-from diffproj.cli.terminal import failure, note
-from diffproj.targets.detection import BoardNotFoundWarning
+from diffproj import __version__
+
+COMMANDS = {
+    "calibrate": "find a camera from photographs of a chessboard, and write a camera file",
+    "measure": "measure points, lengths and an area on a plane in a photograph, with error bars",
+    "experiment": "calibrate, put corners back on the board, and print the errors (the paper's Table 1 and Fig. 7)",
+}
+"""What each command does; its module has its name."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
-    options = _parser().parse_args(shielded(sys.argv[1:] if arguments is None else arguments))
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("always", BoardNotFoundWarning)
-            warnings.showwarning = lambda message, *_: note(str(message))
-            return options.run(options)
-    except (ValueError, OSError, CalibrationError) as error:
-        note(failure(error))
-        return 1
-    except KeyboardInterrupt:
-        note("interrupted")
-        return 130
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given[:1] == ["help"]:  # `diffproj help measure` is `diffproj measure --help`
+        given = [*given[1:], "--help"]
+    options = _parser(given).parse_args(shielded(given))
+    from diffproj.cli.running import run
+
+    return run(options)
 
 
-def _parser() -> argparse.ArgumentParser:
+def shielded(arguments: Sequence[str]) -> list[str]:
+    """Put a space before lists of numbers such as `-5,3`, so that argparse does not take them for options.
+
+    A single negative number needs no shield.
+    """
+    return [f" {text}" if re.match(r"-[.\d][^,]*,", text) else text for text in arguments]
+
+
+def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
+    """The parser of the command line, with the options of the command that is called."""
     parser = argparse.ArgumentParser(
         prog="diffproj",
         description="Pixels of one calibrated camera to world coordinates on known planes.",
-        epilog="'diffproj COMMAND --help' tells more about a command.",
+        epilog="'diffproj help COMMAND' tells more about a command.",
     )
+    parser.add_argument("--version", action="version", version=f"diffproj {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    calibrate.add_command(commands)
-    measure.add_command(commands)
-    experiment.add_command(commands)
+    called = next((text for text in arguments if not text.startswith("-")), None)
+    for name, summary in COMMANDS.items():
+        command = commands.add_parser(name, help=summary)
+        if name == called:
+            import_module(f"diffproj.cli.{name}").add_options(command)
     return parser

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.result import Calibration
-from diffproj.cli.inputs import Commands, board_size, camera_file, find_corners, photographs, square_side
+from diffproj.cli.inputs import board_size, camera_file, find_corners, photographs, square_side
 from diffproj.cli.terminal import RESULTS, aligned, progress_bars, result, rounded
 from diffproj.files.save import save_camera
 from diffproj.lens.models import LensModel
@@ -41,16 +41,11 @@ command was not understood
 """
 
 
-def add_command(commands: Commands) -> None:
-    """Add the command to the parser's."""
-    command = commands.add_parser(
-        "calibrate",
-        help="find a camera from photographs of a chessboard, and write a camera file",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        usage="%(prog)s PHOTO [PHOTO ...] --board CxR --square SIDE [options]",
-    )
+def add_options(command: argparse.ArgumentParser) -> None:
+    """Give the command its description and its options."""
+    command.description, command.epilog = DESCRIPTION, EPILOG
+    command.formatter_class = argparse.RawDescriptionHelpFormatter
+    command.usage = "%(prog)s PHOTO [PHOTO ...] --board CxR --square SIDE [options]"
     command.add_argument(
         "photographs", nargs="+", type=Path, metavar="PHOTO", help="photographs by one camera, or folders of them"
     )

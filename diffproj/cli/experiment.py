@@ -7,9 +7,8 @@ from typing import get_args
 from rich.markup import escape
 from rich.table import Table
 
-from diffproj import figures
 from diffproj._core.atomic import write_whole
-from diffproj.cli.inputs import Commands, board_size, find_corners, photographs, square_side
+from diffproj.cli.inputs import board_size, find_corners, photographs, square_side
 from diffproj.cli.terminal import RESULTS, progress_bars, result
 from diffproj.files.save import save_camera
 from diffproj.lens.models import LensModel
@@ -20,18 +19,16 @@ from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.examples import example_views
 from diffproj.targets.views import Views
 
+DESCRIPTION = (
+    "Calibrates a camera from views of a chessboard, finds the pose of each test view, puts every corner of it back on "
+    "the board's plane and compares it with its known place. Prints Table 1 and writes table1.csv, fig7.png and "
+    "camera.json (the whole calibration) to the output folder."
+)
 
-def add_command(commands: Commands) -> None:
-    """Add the command to the parser's."""
-    command = commands.add_parser(
-        "experiment",
-        help="calibrate, put corners back on the board, and print the errors (the paper's Table 1 and Fig. 7)",
-        description=(
-            "Calibrates a camera from views of a chessboard, finds the pose of each test view, puts every corner of it "
-            "back on the board's plane and compares it with its known place. Prints Table 1 and writes table1.csv, "
-            "fig7.png and camera.json (the whole calibration) to the output folder."
-        ),
-    )
+
+def add_options(command: argparse.ArgumentParser) -> None:
+    """Give the command its description and its options."""
+    command.description = DESCRIPTION
     source = command.add_mutually_exclusive_group()
     source.add_argument(
         "--data",
@@ -77,6 +74,8 @@ def add_command(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
+    from diffproj import figures  # here, for matplotlib takes long to load; first of all, for it may be missing
+
     views, board, split = _corners(options)
     if options.split is not None:
         split = parse_split(options.split, len(views))

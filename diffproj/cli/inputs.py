@@ -2,8 +2,7 @@
 
 import argparse
 import math
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +13,9 @@ from diffproj.targets.detection import detect
 from diffproj.targets.images import SUFFIXES, Source, listed
 from diffproj.targets.views import Views
 
-Commands = Any  # argparse's own type for what add_subparsers returns is private
 CAMERA_SUFFIXES = (".json", ".yaml", ".yml", ".xml")
 SMALLEST_BOARD = 3
 """Inner corners each way that the corner detector needs."""
-
-
-def shielded(arguments: Sequence[str]) -> list[str]:
-    """Put a space before lists of numbers such as `-5,3`, so that argparse does not take them for options.
-
-    A single negative number needs no shield.
-    """
-    return [f" {text}" if re.match(r"-[.\d][^,]*,", text) else text for text in arguments]
 
 
 def board_size(text: str) -> tuple[int, int]:

@@ -4,6 +4,7 @@ import os
 import re
 import runpy
 import shutil
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -377,8 +378,60 @@ def test_values_are_shown_as_far_as_they_are_known(value: float, deviation: floa
 
 
 def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in [name for name in sys.modules if name.split(".")[:2] == ["diffproj", "cli"]]:
+    for name in [name for name in sys.modules if name.startswith("diffproj.cli.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "rich.console", None)
+    monkeypatch.setattr(sys, "argv", ["diffproj", "calibrate", "photo.png", "--board", "9x6", "--square", "25"])
     assert __main__.main() == 1
-    assert "pip install 'diffproj[cli]'" in capsys.readouterr().err
+    assert "diffproj: the command line needs rich; pip install 'diffproj[cli]'" in capsys.readouterr().err
+
+
+def test_missing_matplotlib_is_found_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delattr(dp, "figures")
+    monkeypatch.delitem(sys.modules, "diffproj.figures")
+    monkeypatch.setitem(sys.modules, "matplotlib.colors", None)
+    monkeypatch.setattr(sys, "argv", ["diffproj", "experiment", "--output", str(tmp_path / "folder")])
+    assert __main__.main() == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "the command line needs matplotlib" in err
+    assert not (tmp_path / "folder").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (["help"], 0, "find a camera from photographs of a chessboard"),
+        (["--help"], 0, "'diffproj help COMMAND' tells more about a command."),
+        (["--version"], 0, f"diffproj {dp.__version__}\n"),
+        (["calibrat"], 2, "invalid choice: 'calibrat' (choose from"),
+        (["help", "nothing"], 2, "invalid choice: 'nothing'"),
+        ([], 2, "the following arguments are required: COMMAND"),
+    ],
+)
+def test_help_and_mistakes_load_no_command(arguments: list[str], code: int, text: str) -> None:
+    program = (
+        "import sys, diffproj; before = set(sys.modules); from diffproj import cli\n"
+        f"try: cli.main({arguments})\n"
+        "except SystemExit as error: code = error.code\n"
+        "loaded = {name.partition('.')[0] for name in set(sys.modules) - before}\n"
+        "print(*(name for name in sys.modules if name.startswith('diffproj.cli.')), loaded & {'rich', 'matplotlib'})\n"
+        "sys.exit(code)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == code
+    assert text in done.stdout + done.stderr
+    assert done.stdout.endswith("set()\n")
+    assert len(done.stdout.splitlines()[-1].split()) == 1
+
+
+def test_help_on_a_command_is_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    texts = []
+    for arguments in (["help", "measure"], ["measure", "--help"]):
+        with pytest.raises(SystemExit, match="0"):
+            cli.main(arguments)
+        texts.append(capsys.readouterr().out)
+    assert texts[0] == texts[1]
+    assert texts[0].startswith("usage: diffproj measure PHOTO --camera FILE")

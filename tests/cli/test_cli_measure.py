@@ -12,8 +12,9 @@ import torch
 
 import diffproj as dp
 from diffproj import cli, synthetic
-from diffproj.cli.inputs import shielded
-from diffproj.cli.measure import REASONS, _coordinate, _crosses, _equation, _shown
+from diffproj.cli import shielded
+from diffproj.cli.measure_document import REASONS, crosses
+from diffproj.cli.measure_tables import coordinate, equation, shown
 
 D = torch.float64
 BOARD = ("--board", "8x5", "--square", "25")
@@ -153,6 +154,18 @@ def test_view_without_covariance(capsys: pytest.CaptureFixture[str]) -> None:
     assert "the pixels' noise of 0.5 px ONLY" in out
 
 
+def test_located_with_a_camera_alone_does_not_know_the_camera(capsys: pytest.CaptureFixture[str]) -> None:
+    board = dp.Chessboard(8, 5, 25.0)
+    located = dp.locate(dp.detect("photo.png", board), board, dp.load_camera("alone.json"))
+    dp.save_camera("located.json", located)
+    options = ("--camera", "located.json", "--view", "photo.png", "--points", *CORNERS)
+    try:
+        assert parsed(capsys, *options)["deviations_include"] == ["pixels", "pose"]
+        assert "NOT how surely the camera is" in " ".join(run(capsys, *options)[1].split())
+    finally:
+        Path("located.json").unlink()
+
+
 def test_text_for_people(capsys: pytest.CaptureFixture[str]) -> None:
     points = [*CORNERS, "395,300.02", "-2000,-4000.5"]
     code, out, err = run(capsys, "photo.png", "--camera", "camera.json", *BOARD, "--points", *points)
@@ -230,7 +243,7 @@ def test_corners_that_no_pose_explains(capsys: pytest.CaptureFixture[str], monke
     def fail(*_: object) -> None:
         raise dp.CalibrationError("locate: diverged")
 
-    monkeypatch.setattr("diffproj.cli.measure.locate", fail)
+    monkeypatch.setattr("diffproj.cli.scene.locate", fail)
     code, out, err = run(capsys, "photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS)
     assert (code, out) == (1, "")
     assert "photo.png: no pose of the board explains its corners; check --camera, --board and --square" in err
@@ -283,15 +296,15 @@ def test_lists_of_numbers_are_no_options() -> None:
 
 def test_outlines_that_cross() -> None:
     square = [[0.0, 0, 1], [1, 0, 1], [1, 0, 2], [0, 0, 2]]
-    assert not _crosses(square, (0.0, -1.0, 0.0, 0.0))
-    assert _crosses([square[i] for i in (0, 2, 1, 3)], (0.0, -1.0, 0.0, 0.0))
+    assert not crosses(square, (0.0, -1.0, 0.0, 0.0))
+    assert crosses([square[i] for i in (0, 2, 1, 3)], (0.0, -1.0, 0.0, 0.0))
 
 
 def test_equations_and_quantities_for_people() -> None:
-    assert _equation([0, 0, 1, 0]) == "z = 0"
-    assert _equation([0, -1, 0.5, -3]) == "-y + 0.5 z = -3"
-    assert _equation([2, -3, 0, 1]) == "2 x - 3 y = 1"
-    assert _coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 0) == ("2.5", " ± unknown")
-    assert _coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 1) == ("0.00", " ± 0.20")
-    assert _coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 2) == ("0", "")
-    assert _shown({"value": 2.5, "deviation": None, "interval_95": None}) == ("2.5", "unknown", "unknown")
+    assert equation([0, 0, 1, 0]) == "z = 0"
+    assert equation([0, -1, 0.5, -3]) == "-y + 0.5 z = -3"
+    assert equation([2, -3, 0, 1]) == "2 x - 3 y = 1"
+    assert coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 0) == ("2.5", " ± unknown")
+    assert coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 1) == ("0.00", " ± 0.20")
+    assert coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 2) == ("0", "")
+    assert shown({"value": 2.5, "deviation": None, "interval_95": None}) == ("2.5", "unknown", "unknown")

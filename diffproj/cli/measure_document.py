@@ -1,0 +1,120 @@
+"""What `diffproj measure` found, as one JSON document: points count from 1, and what is not known is `None`."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from diffproj.cli.scene import Scene
+from diffproj.geometry.back_projection import Reason, explain
+from diffproj.geometry.camera import Camera
+from diffproj.geometry.plane import Plane
+from diffproj.measurement.measure import Measurement, Quantity
+
+REASONS = {
+    Reason.NOT_FINITE: "the pixel is no number",
+    Reason.OUTSIDE_LENS: "no ray comes through the lens to this pixel",
+    Reason.CAMERA_ON_PLANE: "the camera itself lies in the plane",
+    Reason.PARALLEL: "its ray runs parallel to the plane, as to the horizon",
+    Reason.BEHIND: "its ray meets the plane only behind the camera, as above the horizon",
+}
+
+
+def document(
+    scene: Scene, plane: Plane, pixel_sigma: float, pixels: torch.Tensor, measured: Measurement
+) -> dict[str, Any]:
+    """Everything that was measured.
+
+    Args:
+        scene: the camera at its pose.
+        plane: what was measured on.
+        pixel_sigma: the standard deviation of a pixel's coordinates.
+        pixels: `(N, 2)`.
+        measured: their points.
+    """
+    camera = scene.calibration.cameras[scene.view]
+    points, remarks = _points(camera, plane, pixels, measured)
+    found = _quantities(measured.lengths()) if len(points) > 1 else []
+    lengths = [{"from": number, "to": number + 1, **length} for number, length in enumerate(found, start=1)]
+    for number, length in enumerate(lengths, start=1):
+        if length["significant"] is False:
+            remarks.append(f"The length {number} to {number + 1} is below three deviations: it cannot be told from 0.")
+    area = _quantities(measured.area())[0] if len(points) > 2 else None
+    normal = plane.normal.tolist()
+    if area is not None and area["value"] is not None and crosses(measured.points.tolist(), normal):
+        remarks.append("The outline crosses itself, so its area means little: give the points in order around it.")
+    elif area is not None and area["significant"] is False:
+        remarks.append("The area is below three deviations: it cannot be told from 0.")
+    return {
+        "camera": str(scene.camera_file),
+        "photograph": None if scene.photograph is None else str(scene.photograph),
+        "view": scene.calibration.views.names[scene.view],
+        "view_rms": _known(float(scene.calibration.view_rms[scene.view])),
+        "plane": [*normal, float(plane.offset)],
+        "pixel_sigma": pixel_sigma,
+        "deviations_include": list(scene.includes),
+        "points": points,
+        "lengths": lengths,
+        "area": area,
+        "remarks": remarks,
+    }
+
+
+def _points(
+    camera: Camera, plane: Plane, pixels: torch.Tensor, measured: Measurement
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """The points, and remarks on those that are not on the plane or not in the photograph."""
+    rows, remarks = [], []
+    seen = camera.in_image(pixels).tolist() if camera.size is not None else [True] * len(pixels)
+    columns = (pixels, explain(pixels, camera, plane), measured.points, measured.deviations)
+    for number, (pixel, code, point, deviation) in enumerate(
+        zip(*(column.tolist() for column in columns), strict=True), start=1
+    ):
+        reason = Reason(code)
+        valid = reason == Reason.VALID
+        row = {"number": number, "pixel": pixel, "valid": valid, "reason": None if valid else reason.name}
+        row["world"] = [_known(x) for x in point] if valid else None
+        row["deviation"] = [_known(x) for x in deviation] if valid else None
+        rows.append(row)
+        if not valid:
+            remarks.append(f"Point {number} is not on the plane: {REASONS[reason]}.")
+        elif not seen[number - 1]:
+            width, height = camera.size or (0, 0)
+            remarks.append(f"Point {number} lies outside the photograph of {width} x {height} px.")
+    return rows, remarks
+
+
+def _known(number: float) -> float | None:
+    return number if math.isfinite(number) else None
+
+
+def _quantities(found: Quantity) -> list[dict[str, Any]]:
+    low, high = found.interval(0.95)
+    columns = (found.value, found.deviation, low, high, found.significant & (found.value > 0))
+    return [
+        {
+            "value": _known(value),
+            "deviation": _known(deviation),
+            "interval_95": [below, above] if math.isfinite(below) and math.isfinite(above) else None,
+            "significant": significant if math.isfinite(value) else None,
+        }
+        for value, deviation, below, above, significant in zip(*(column.tolist() for column in columns), strict=True)
+    ]
+
+
+def crosses(points: list[list[float]], normal: Sequence[float]) -> bool:
+    """Whether two sides of the outline cross, seen along the axis that the plane's normal is nearest to."""
+    away = max(range(3), key=lambda axis: abs(normal[axis]))
+    flat = [[x for axis, x in enumerate(point) if axis != away] for point in points]
+    n = len(flat)
+    sides = [(flat[i], flat[(i + 1) % n]) for i in range(n)]
+
+    def turn(a: list[float], b: list[float], c: list[float]) -> float:
+        return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+    return any(
+        turn(a, b, c) * turn(a, b, d) < 0 and turn(c, d, a) * turn(c, d, b) < 0
+        for i, (a, b) in enumerate(sides)
+        for c, d in sides[i + 2 :]
+    )

@@ -1,0 +1,111 @@
+"""What `diffproj measure` found, as tables and sentences for people."""
+
+from typing import Any
+
+from rich.table import Table
+
+from diffproj.cli.scene import Scene
+from diffproj.cli.terminal import RESULTS, aligned, result, rounded
+
+EXACT = 1e-9
+"""Part of a coordinate below which its deviation is rounding: the plane alone says what the coordinate is."""
+
+
+def say(document: dict[str, Any], scene: Scene) -> None:
+    """Print what was measured.
+
+    Args:
+        document: see `measure_document`.
+        scene: the camera at its pose.
+    """
+    result(f"{scene.title}\n")
+    RESULTS.print(_points_table(document, scene.unit))
+    if document["lengths"]:
+        result("")
+        RESULTS.print(_lengths_table(document["lengths"]))
+    area = document["area"]
+    if area is not None:
+        value, deviation, interval = shown(area)
+        known = f"{value} ± {deviation}, 95 % interval {interval}"
+        text = "not known, for not all points are on the plane" if area["value"] is None else known
+        result(f"\nArea of the outline 1 to {len(document['points'])}: {text}")
+    if document["remarks"]:
+        result("")
+    for remark in document["remarks"]:
+        RESULTS.print(remark, markup=False)
+    result("")
+    noise = f"the pixels' noise of {document['pixel_sigma']:.2g} px"
+    sentence = {
+        3: f"The deviations hold {noise}, and how surely the pose and the camera are known.",
+        2: f"The deviations hold {noise} and how surely the pose is known, but NOT how surely the camera is, for its "
+        "file does not tell: the truth may lie further off. A .json from 'diffproj calibrate' tells it.",
+        1: f"The deviations hold {noise} ONLY, and not how surely the pose and the camera are known, for the file does "
+        "not tell: the truth may lie further off. A .json from 'diffproj calibrate' tells it.",
+    }
+    RESULTS.print(sentence[len(document["deviations_include"])], markup=False)
+
+
+def _points_table(document: dict[str, Any], unit: str) -> Table:
+    table = Table(title=f"Points on the plane {equation(document['plane'])}, in {unit}", title_justify="left")
+    table.add_column("point", justify="right")
+    table.add_column("pixel u, v", no_wrap=True)
+    found = [row for row in document["points"] if row["valid"]]
+    columns = []
+    for axis, name in enumerate("xyz"):
+        table.add_column(f"{name} ± deviation", overflow="fold")
+        pairs = [coordinate(row["world"], row["deviation"], axis) for row in found]
+        starts = aligned([value for value, _ in pairs]) if pairs else []
+        columns.append([start + rest for start, (_, rest) in zip(starts, pairs, strict=True)])
+    cells = iter(zip(*columns, strict=True))
+    for row in document["points"]:
+        u, v = row["pixel"]
+        table.add_row(str(row["number"]), f"{u:g}, {v:g}", *(next(cells) if row["valid"] else ("none",) * 3))
+    return table
+
+
+def coordinate(world: list[float], deviations: list[float | None], axis: int) -> tuple[str, str]:
+    """A coordinate and what follows it; bare where the plane alone says what it is."""
+    value, deviation = world[axis], deviations[axis]
+    scale = max(map(abs, world))
+    if deviation is None:
+        return f"{value:.6g}", " ± unknown"
+    if deviation <= EXACT * max(scale, 1e-300):
+        return ("0" if abs(value) <= EXACT * scale else f"{value:.6g}"), ""
+    text, spread = rounded(value, deviation)
+    return text, f" ± {spread}"
+
+
+def _lengths_table(lengths: list[dict[str, Any]]) -> Table:
+    table = Table(title="Lengths", title_justify="left")
+    for name in ("from, to", "length", "standard deviation", "95 % interval"):
+        table.add_column(name, overflow="fold")
+    rows = [shown(length) for length in lengths]
+    values, deviations = (aligned(column) for column in zip(*((row[0], row[1]) for row in rows), strict=True))
+    for length, value, deviation, (_, _, interval) in zip(lengths, values, deviations, rows, strict=True):
+        table.add_row(f"{length['from']}, {length['to']}", value, deviation, interval)
+    return table
+
+
+def shown(quantity: dict[str, Any]) -> tuple[str, str, str]:
+    """A quantity, its deviation and its interval, all to the deviation's second digit."""
+    value, deviation, interval = quantity["value"], quantity["deviation"], quantity["interval_95"]
+    if value is None:
+        return "none", "", ""
+    if deviation is None or interval is None:
+        return f"{value:.6g}", "unknown", "unknown"
+    if deviation == 0:
+        return f"{value:.6g}", "0", ""
+    low, high = (rounded(bound, deviation)[0] for bound in interval)
+    return (*rounded(value, deviation), f"{low} to {high}")
+
+
+def equation(plane: list[float]) -> str:
+    """The plane's equation for people: `z = 0`, `0.6 x + 0.8 z = 5`."""
+    *normal, offset = plane
+    terms = [(factor, name) for factor, name in zip(normal, "xyz", strict=True) if factor]
+    text = " ".join(
+        f"{'-' if factor < 0 else '+'} {'' if abs(factor) == 1 else f'{abs(factor):g} '}{name}"
+        for factor, name in terms
+    )
+    text = text.removeprefix("+ ") if text.startswith("+") else text.replace("- ", "-", 1)
+    return f"{text} = {offset:g}"

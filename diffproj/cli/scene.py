@@ -1,0 +1,110 @@
+"""Where the camera stood: at a view that it was calibrated with, or before a board in a new photograph."""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+from diffproj.calibration.calibrate import locate
+from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.cli.inputs import find_corners, photographs
+from diffproj.cli.terminal import progress_bars
+from diffproj.files.load import load
+from diffproj.geometry.camera import Camera
+from diffproj.targets.chessboard import Chessboard
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The camera at its pose.
+
+    Attributes:
+        camera_file: the camera's file.
+        photograph: the photograph, where a new one was given.
+        calibration: whose view it is.
+        view: the number of the view.
+        includes: whose uncertainty the standard deviations include: pixels, pose, camera.
+        title: where the pose comes from, and how well it fits.
+        unit: what the world's unit is.
+    """
+
+    camera_file: Path
+    photograph: Path | None
+    calibration: Calibration
+    view: int
+    includes: tuple[str, ...]
+    title: str
+    unit: str
+
+
+def stored_view(options: argparse.Namespace) -> Scene:
+    """The pose of a view that the camera was calibrated with.
+
+    Raises:
+        ValueError: the file holds no such view, or more than one, or no pose of it.
+    """
+    path, name = options.camera, options.view
+    _, calibration = _loaded(path)
+    if calibration is None:
+        raise ValueError(
+            f"--view: want a .json with a whole calibration, got a camera without views in {path}; give a photograph "
+            "with --board and --square"
+        )
+    names = calibration.views.names
+    if name not in names:
+        listed = ", ".join(names[:20]) + (f" and {len(names) - 20} more" if len(names) > 20 else "")
+        raise ValueError(f"--view: want a view of {path}, got {name!r}; it has {listed}")
+    if names.count(name) > 1:
+        raise ValueError(
+            f"--view: want a name of one view, got {name!r}, which {names.count(name)} views of {path} have; give the "
+            "photograph with --board and --square"
+        )
+    number = names.index(name)
+    if not bool(calibration.used[number].any()):
+        raise ValueError(f"--view: {name!r} was left out of the calibration in {path}, so its pose is not known")
+    includes = ("pixels", "pose") if calibration.has_covariance else ("pixels",)
+    title = f"{path}: view {name}\nRMS {float(calibration.view_rms[number]):.4f} px"
+    includes += ("camera",) if calibration.knows_intrinsics else ()
+    return Scene(path, None, calibration, number, includes, title, "the calibration's unit")
+
+
+def new_photograph(options: argparse.Namespace) -> Scene:
+    """The pose before the board in a new photograph.
+
+    Raises:
+        ValueError: no single photograph, no board in it, another size than the camera's, or no pose that fits.
+    """
+    camera, calibration = _loaded(options.camera)
+    sources = photographs([options.photograph])
+    if len(sources) > 1:
+        raise ValueError(f"PHOTO: want one photograph, got {len(sources)} in {options.photograph}")
+    columns, rows = options.board
+    board = Chessboard(columns, rows, options.square)
+    with progress_bars() as bars:
+        views = find_corners(sources, board, bars)
+    if camera.size is not None and camera.size != views.size:
+        (w, h), (width, height) = views.size or (0, 0), camera.size
+        raise ValueError(
+            f"PHOTO: want {width} x {height} px as in {options.camera}, got {w} x {h} px in {options.photograph}; take "
+            "it with the camera as it was calibrated, and do not resize or crop it"
+        )
+    try:
+        located = locate(views, board, camera if calibration is None else calibration)
+    except CalibrationError as error:
+        raise ValueError(
+            f"{options.photograph}: no pose of the board explains its corners; check --camera, --board and --square"
+        ) from error
+    includes = ("pixels", "pose")
+    title = f"{options.photograph}: board found\nRMS {float(located.rms):.4f} px over {int(located.used.sum())} corners"
+    if calibration is not None:
+        title += f" ({float(calibration.rms):.4f} px in the calibration)"
+        includes += ("camera",) if calibration.knows_intrinsics else ()
+    return Scene(options.camera, options.photograph, located, 0, includes, title, "the unit of --square")
+
+
+def _loaded(path: Path) -> tuple[Camera, Calibration | None]:
+    """The one camera in a file, and the calibration where the file holds one."""
+    found = load(path)
+    camera, calibration = (found.camera, found) if isinstance(found, Calibration) else (found, None)
+    if camera.batch_shape:
+        raise ValueError(f"--camera: want one camera, got {camera.batch_shape.numel()} side by side in {path}")
+    return camera, calibration
