@@ -1,0 +1,124 @@
+"""Every call of the README's table works as it is written, in an empty folder with photographs and camera files."""
+
+import doctest
+import io
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+import torch
+from kornia.augmentation import RandomHorizontalFlip
+
+import diffproj as dp
+from diffproj import cli
+
+README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+D = torch.float64
+
+
+def rows() -> dict[str, list[str]]:
+    """From what the reader wants to the calls, one for each piece of code in the second column."""
+    table = README.partition("| I want to | call |\n|---|---|\n")[2].partition("\n\n")[0]
+    cells = [re.fullmatch(r"\| (.+?) \| (.+) \|", line) for line in table.splitlines()]
+    assert all(cells)
+    return {cell[1]: re.findall("`(.+?)`", cell[2]) for cell in cells if cell}
+
+
+ROWS = rows()
+
+
+@pytest.fixture(scope="module")
+def example() -> dict[str, Any]:
+    """What the README's first example defines."""
+    source = README.partition("```python\n")[2].partition("```")[0]
+    names: dict[str, Any] = {}
+    test = doctest.DocTestParser().get_doctest(source, names, "README", "README.md", 0)
+    assert doctest.DocTestRunner().run(test, clear_globs=False, out=io.StringIO().write).failed == 0
+    return test.globs
+
+
+@pytest.fixture(scope="module")
+def folder(example: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photographs of the board by the camera of the example, and its files."""
+    folder = tmp_path_factory.mktemp("readme")
+    (folder / "photos").mkdir()
+    calibration, board = example["calibration"], example["board"]
+    for number in range(6):
+        image = dp.synthetic.photograph(calibration.cameras[number], board, seed=number).numpy()
+        cv2.imwrite(str(folder / "photos" / f"{number}.jpg"), image)
+    shutil.copy(folder / "photos" / "3.jpg", folder / "photo.jpg")
+    dp.save_camera(folder / "camera.json", calibration)
+    dp.save_camera(folder / "camera.yaml", calibration)
+    return folder
+
+
+def inputs(example: dict[str, Any]) -> dict[str, Any]:
+    """The names of the table: those of the example, and small inputs for what a reader brings."""
+    camera, calibration = example["camera"], example["calibration"]
+    K, dist, rvec, tvec = camera.to_opencv()
+    right = dp.example_views("right")
+    plane = dp.Plane.z(0.0)
+    image = torch.rand(1, 1, 480, 640, dtype=D)
+    augment = RandomHorizontalFlip(p=1.0)
+    augment(image)
+    undistorted = dp.Camera(camera.K, camera.R, camera.t, size=camera.size)
+    return {
+        **{name: example[name] for name in ("torch", "dp", "board", "views", "calibration", "camera", "pixels")},
+        **{name: example[name] for name in ("points", "valid")},
+        "K": K,
+        "dist": dist,
+        "rvec": rvec,
+        "tvec": tvec,
+        "w": 640,
+        "h": 480,
+        "corners": torch.stack([calibration.views.pixels, right.pixels]),
+        "visible": torch.stack([calibration.views.visible, right.visible]),
+        "plane": plane,
+        "extent": (0.0, 0.0, 200.0, 125.0),
+        "resolution": 2.5,
+        "image": image,
+        "texture": torch.rand(1, 50, 80, dtype=D),
+        "augment": augment,
+        "projector": dp.PlaneProjector(camera, plane),
+        "cameras": calibration.cameras,
+        "which": torch.arange(13) < 5,
+        "target": torch.zeros(2, 3, dtype=D),
+        "normals": torch.tensor([[0.0, 0, 1], [0.0, 0.1, 1]], dtype=D),
+        "offsets": torch.tensor([0.0, 10.0], dtype=D),
+        "coefficients": camera.distortion.coefficients,
+        "xy": torch.rand(5, 2, dtype=D) * 0.2,
+        "left": 100,
+        "top": 50,
+        "undistorted": undistorted,
+        "pinhole": undistorted.to_kornia(),
+        "psi": torch.tensor(0.1),
+        "phi": torch.tensor(0.2),
+        "theta": torch.tensor(0.3),
+        "R": camera.R,
+    }
+
+
+@pytest.fixture
+def names(example: dict[str, Any], folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
+    monkeypatch.chdir(folder)
+    with torch.enable_grad():
+        yield inputs(example)
+
+
+def test_the_table_is_found() -> None:
+    assert len(ROWS) > 35
+    assert all(ROWS.values())
+
+
+@pytest.mark.parametrize("wish", ROWS)
+def test_calls_work_as_they_are_written(wish: str, names: dict[str, Any]) -> None:
+    for call in ROWS[wish]:
+        if call.startswith("diffproj "):
+            assert cli.main(shlex.split(call)[1:]) == 0
+        else:
+            exec(compile(call, "README.md", "exec"), names)  # noqa: S102
