@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from diffproj.calibration.calibrate import locate
+from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.inputs import Commands, board_size, camera_file, find_corners, numbers, photographs, square_side
 from diffproj.cli.terminal import RESULTS, aligned, progress_bars, result, rounded
