@@ -21,9 +21,12 @@ Conventions, which hold everywhere:
 from importlib import import_module
 from typing import Any
 
-from diffproj.calibration.calibrate import calibrate, locate, refine
+from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.locate import locate
 from diffproj.calibration.losses import Cauchy, Huber, Loss, SoftL1
+from diffproj.calibration.options import CalibrationOptions, LocateOptions
+from diffproj.calibration.refine import refine
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Status
 from diffproj.calibration.validation import CrossValidation, bootstrap, cross_validate
@@ -64,6 +67,7 @@ __all__ = [
     "BrownConrady",
     "Calibration",
     "CalibrationError",
+    "CalibrationOptions",
     "CalibrationPrior",
     "Camera",
     "Cauchy",
@@ -76,6 +80,7 @@ __all__ = [
     "LearnableCamera",
     "LearnablePlane",
     "Lens",
+    "LocateOptions",
     "Loss",
     "Measurement",
     "PaperSetup",

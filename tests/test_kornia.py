@@ -38,7 +38,7 @@ CALLS: dict[str, Callable[[Any, dp.Views], Any]] = {
     "ground_resolution": lambda camera, views: dp.ground_resolution(views.pixels, camera, Z),
     "image_residuals": lambda camera, views: dp.image_residuals(camera, views, BOARD),
     "plane_residuals": lambda camera, views: dp.plane_residuals(camera, views, BOARD),
-    "refine": lambda camera, views: dp.refine(camera, views, BOARD).cameras,
+    "refine": lambda camera, views: dp.refine(views, BOARD, camera).cameras,
     "rectify": lambda camera, views: dp.rectify(
         torch.ones(6, 1, 120, 160, dtype=D), camera, Z, (0.0, 0.0, 60.0, 50.0), 2.0
     ),

@@ -16,7 +16,7 @@ class Data:
     """Views and board, checked, in float64, with the cameras' axes flattened to P.
 
     Attributes:
-        views, board: as given.
+        views, target: as given.
         batch: `*B`.
         points: the board's `(N, 3)`, without graph.
         pixels: `(P, V, N, 2)`, without graph.
@@ -29,21 +29,21 @@ class Data:
         ValueError: views, board and weights do not fit together, or the board is of no use.
     """
 
-    def __init__(self, views: Views, board: Target, weights: Tensor | None) -> None:
+    def __init__(self, views: Views, target: Target, weights: Tensor | None) -> None:
         if not isinstance(views, Views):
             raise TypeError(f"views: want dp.Views, got {type(views).__name__}; dp.Views(pixels, size=...) makes them")
         if len(views) == 0:
             raise ValueError("views: want at least one, got none")
-        if not isinstance(board, Target):
-            raise TypeError(f"board: want dp.Chessboard or anything with .points (N, 3), got {type(board).__name__}")
-        self.views, self.board, self.batch = views, board, views.batch_shape
-        self.given_points = in_float64(board.points.to(views.device))
+        if not isinstance(target, Target):
+            raise TypeError(f"target: want dp.Chessboard or anything with .points (N, 3), got {type(target).__name__}")
+        self.views, self.target, self.batch = views, target, views.batch_shape
+        self.given_points = in_float64(target.points.to(views.device))
         self.given_pixels = in_float64(views.pixels)
         points = self.given_points.detach()
         count = views.pixels.shape[-2]
         if points.shape != (count, 3):
             raise ValueError(
-                f"views: want {points.shape[0]} corners in each as the board has, got {count}; "
+                f"views: want {points.shape[0]} corners in each as the target has, got {count}; "
                 "do columns and rows of the board fit?"
             )
         _check_points(points)
@@ -74,11 +74,11 @@ class Data:
 
 def _check_points(points: Tensor) -> None:
     if not bool(points.isfinite().all()) or bool((points[:, 2] != 0).any()):
-        raise ValueError("board: want finite points, all on z = 0")
+        raise ValueError("target: want finite points, all on z = 0")
     apart = torch.cdist(points, points) + torch.eye(len(points), dtype=points.dtype, device=points.device).mul(1e300)
     extent = (points - points.mean(0)).abs().amax()
     if len(points) < 4 or bool(apart.amin() <= 1e-9 * extent):
         i, j = divmod(int(apart.argmin()), len(points)) if len(points) > 1 else (0, 0)
-        raise ValueError(f"board: want at least 4 points, all distinct, got {len(points)} with {i} and {j} alike")
+        raise ValueError(f"target: want at least 4 points, all distinct, got {len(points)} with {i} and {j} alike")
     if float(torch.linalg.svdvals(points[:, :2] - points[:, :2].mean(0))[1]) <= 1e-9 * float(extent):
-        raise ValueError("board: want points that do not lie on one line")
+        raise ValueError("target: want points that do not lie on one line")

@@ -4,7 +4,6 @@ Everything here works on a batch of P cameras, with batch axes flattened. `Task`
 `fit` runs the solver over it in blocks of cameras.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,10 +15,11 @@ from diffproj.calibration import covariance as covariances
 from diffproj.calibration.board_error import BoardError
 from diffproj.calibration.covariance import Covariance, Scores
 from diffproj.calibration.losses import Loss
+from diffproj.calibration.options import Progress
 from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.reprojection import Reprojection
 from diffproj.calibration.result import Objective
-from diffproj.calibration.solver import Equations, Prior, Solution, chosen, solve
+from diffproj.calibration.solver import Equations, Prior, Solution, select, solve
 from diffproj.lens.models import LensModel
 
 BLOCK_CORNERS = 24_000
@@ -29,9 +29,6 @@ MAX_REJECTION_ROUNDS = 10
 """Maximum number of rounds of outlier rejection."""
 NEGLIGIBLE_PX = 1e-11
 """Size of residuals, in pixels, that is rounding error of pixel coordinates."""
-
-Progress = Callable[[int, int], Any]
-"""Called with the number of steps done and their maximum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +250,7 @@ def _fit(
             task = replace(task, used=kept)
             again = attempt(task, solution.shared, solution.local, done)
             # Cameras whose inliers did not change keep their solution to the bit.
-            solution = chosen(changed.numpy(force=True), again, solution)
+            solution = select(changed.numpy(force=True), again, solution)
             iterations = iterations + torch.where(changed, again.iterations, 0)
     tell(total, total)
     return Fit(task, solution._replace(iterations=iterations), given & ~inliers)

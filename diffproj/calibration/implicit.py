@@ -16,8 +16,7 @@ from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, Task
 from diffproj.calibration.parametrisation import POSE, moved
 from diffproj.calibration.solver import Prior
-from diffproj.geometry.back_projection import back_project
-from diffproj.geometry.plane import Plane
+from diffproj.targets.residuals import projected_minus_seen, put_back_minus_known
 
 
 def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
@@ -76,14 +75,9 @@ def _costs(
     if task.bow:
         points = bowed(data.given_points, flat[:, None, -2:])
     seen = torch.where(task.used.unsqueeze(-1), pixels, 0.0).flatten(0, 1).unsqueeze(1)
-    if task.objective == "plane":
-        landed, valid = back_project(seen, cameras, Plane.z(0.0))
-        residual = (landed - points)[..., :2]
-    else:
-        projected, valid = cameras.project(points)
-        residual = projected - seen
-    counts = (task.used.flatten(0, 1).unsqueeze(1) & valid).unsqueeze(-1)
-    squared = torch.where(counts, residual, 0.0).square().sum(-1)
+    error = put_back_minus_known if task.objective == "plane" else projected_minus_seen
+    residual, _ = error(cameras, points, seen, task.used.flatten(0, 1).unsqueeze(1))
+    squared = residual[..., :2].square().sum(-1)
     value = squared if task.loss is None else task.loss.value(squared)
     if weights is not None:
         value = value * weights.flatten(0, 1).unsqueeze(1)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
-import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -14,6 +13,7 @@ from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.parametrisation import BOW, Parametrisation
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
+from diffproj.targets.residuals import projected_minus_seen
 from diffproj.targets.views import Views
 
 Objective = Literal["image", "plane"]
@@ -114,9 +114,9 @@ class Calibration:
 
     def _residuals(self) -> tuple[Tensor, Tensor]:
         """The residuals, and how many corners of each view there are; one beyond the lens's fold does not count."""
-        projected, valid = self.cameras.project(self.board_points.unsqueeze(-3))
-        counts = self.used & valid
-        return torch.where(counts.unsqueeze(-1), projected - self.views.pixels, 0.0), counts.sum(-1)
+        points = self.board_points.unsqueeze(-3)
+        residuals, counts = projected_minus_seen(self.cameras, points, self.views.pixels, self.used)
+        return residuals, counts.sum(-1)
 
     @property
     def converged(self) -> Bool[Tensor, "*batch"]:

@@ -193,13 +193,13 @@ def solve(
         if done.any():
             # The final step still improves the unknowns, but its reduction is negligible: apply without evaluating it.
             last = done & (predicted <= FINAL_STEP_REDUCTION * control.cost)
-            shared, local = chosen(last, trial, (shared, local))
+            shared, local = select(last, trial, (shared, local))
         if not control.active.any():
             break
         trial_cost, trial_equations = terms.at(*trial)
         better = control.accept(_array(trial_cost), predicted)
         state, new = (shared, local, cost, equations), (*trial, trial_cost, trial_equations)
-        shared, local, cost, equations = chosen(better, new, state)
+        shared, local, cost, equations = select(better, new, state)
         if progress is not None:
             progress(iteration, cost)
     ends = control.status.astype(np.int64), control.iterations
@@ -349,7 +349,7 @@ def _array(values: Tensor) -> np.ndarray:
     return values.detach().to("cpu", torch.float64).numpy().copy()
 
 
-def chosen(mask: np.ndarray, new: Any, old: Any) -> Any:
+def select(mask: np.ndarray, new: Any, old: Any) -> Any:
     """Per problem, `new` where the mask is true, else `old`; for tensors and tuples of tensors."""
     if mask.all():
         return new
@@ -358,5 +358,5 @@ def chosen(mask: np.ndarray, new: Any, old: Any) -> Any:
     if isinstance(new, Tensor):
         where = torch.from_numpy(mask).to(new.device).reshape(-1, *(1,) * (new.ndim - 1))
         return torch.where(where, new, old)
-    parts = [chosen(mask, a, b) for a, b in zip(new, old, strict=True)]
+    parts = [select(mask, a, b) for a, b in zip(new, old, strict=True)]
     return type(new)(*parts) if hasattr(new, "_fields") else tuple(parts)

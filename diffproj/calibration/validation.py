@@ -6,17 +6,18 @@ resampled with replacement (Efron 1979). Both solve all refits as one batch.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj.calibration.calibrate import calibrate, locate
+from diffproj.calibration.calibrate import calibrate
+from diffproj.calibration.locate import locate
+from diffproj.calibration.options import CalibrationOptions
 from diffproj.calibration.result import Calibration, CalibrationError
-from diffproj.geometry.back_projection import back_project
-from diffproj.geometry.plane import Plane
 from diffproj.lens.models import LensModel
+from diffproj.targets.residuals import projected_minus_seen, put_back_minus_known
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
@@ -52,7 +53,11 @@ class CrossValidation:
 
 
 def cross_validate(
-    views: Views, board: Target, distortion: LensModel = "brown5", folds: int = 5, **options: Any
+    views: Views,
+    target: Target,
+    distortion: LensModel = "brown5",
+    folds: int = 5,
+    **options: Unpack[CalibrationOptions],
 ) -> CrossValidation:
     """Refit without each of k folds of the views, and evaluate on the held-out fold.
 
@@ -61,7 +66,7 @@ def cross_validate(
 
     Args:
         views: corners `(V, N, 2)` of one camera; view i is left out of fit i mod k.
-        board: anything with `.points (N, 3)` on z = 0.
+        target: anything with `.points (N, 3)` on z = 0.
         distortion: the lens.
         folds: k.
         options: as `calibrate` takes them.
@@ -86,12 +91,12 @@ def cross_validate(
         -1
     )
     every = _repeated(views, folds)
-    fits = calibrate(every.hiding(out.unsqueeze(-1).expand(every.visible.shape)), board, distortion, **options)
+    fits = calibrate(every.hiding(out.unsqueeze(-1).expand(every.visible.shape)), target, distortion, **options)
     held_out = every.hiding(~out.unsqueeze(-1).expand(every.visible.shape))
     second = torch.arange(views.pixels.shape[-2], device=views.device) % 2 == 1
     errors = []
     for posing in (second, ~second):
-        located = locate(held_out.hiding(posing), board, fits.camera)
+        located = locate(held_out.hiding(posing), target, fits.camera)
         errors.append(_squared_errors(located, held_out.hiding(~posing)))
     px, world = (_rms([error[i] for error in errors], [error[2] for error in errors]) for i in range(2))
     in_sample = _squared_errors(fits, Views.unchecked(every.pixels, fits.used, every.names, every.size))
@@ -100,11 +105,11 @@ def cross_validate(
 
 def bootstrap(
     views: Views,
-    board: Target,
+    target: Target,
     distortion: LensModel = "brown5",
     draws: int = 200,
     seed: int = 0,
-    **options: Any,
+    **options: Unpack[CalibrationOptions],
 ) -> Mapping[str, Float[Tensor, ""]]:
     """Standard deviations of the shared parameters over refits to views resampled with replacement.
 
@@ -112,7 +117,7 @@ def bootstrap(
 
     Args:
         views: corners `(V, N, 2)` of one camera.
-        board: anything with `.points (N, 3)` on z = 0.
+        target: anything with `.points (N, 3)` on z = 0.
         distortion: the lens.
         draws: number of refits.
         seed: of the random draws.
@@ -144,7 +149,7 @@ def bootstrap(
     every = _repeated(views, draws)
     hidden = (counts == 0).unsqueeze(-1).expand(every.visible.shape)
     options |= {"weights": counts.unsqueeze(-1), "throw": False}
-    found = calibrate(every.hiding(hidden), board, distortion, **options)
+    found = calibrate(every.hiding(hidden), target, distortion, **options)
     kept = found.converged
     if int(kept.sum()) < max(2, draws // 2):
         raise CalibrationError(f"bootstrap: {int(kept.sum())} of {draws} draws determine the camera; add views", found)
@@ -159,12 +164,11 @@ def _repeated(views: Views, count: int) -> Views:
 
 def _squared_errors(calibration: Calibration, evaluated: Views) -> tuple[Tensor, Tensor, Tensor]:
     """Sums of squared errors `(k,)` in pixels and in world units over the evaluated corners, and their number."""
-    projected, valid = calibration.cameras.project(calibration.board_points.unsqueeze(-3))
-    pixels = evaluated.pixels.to(projected)
-    landed, on_plane = back_project(pixels, calibration.cameras, Plane.z(0.0))
-    counts = evaluated.visible & valid & on_plane
-    px = (projected - pixels).square().sum(-1)
-    world = (landed - calibration.points)[..., :2].square().sum(-1)
+    cameras, pixels = calibration.cameras, evaluated.pixels.to(calibration.points)
+    px, seen = projected_minus_seen(cameras, calibration.board_points.unsqueeze(-3), pixels, evaluated.visible)
+    world, on_plane = put_back_minus_known(cameras, calibration.points, pixels, evaluated.visible)
+    counts = seen & on_plane
+    px, world = px.square().sum(-1), world[..., :2].square().sum(-1)
     total = [torch.where(counts, part, 0.0).sum((-2, -1)) for part in (px, world)]
     return total[0], total[1], counts.sum((-2, -1))
 

@@ -4,7 +4,7 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
-from diffproj.calibration.calibrate import locate
+from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.inputs import find_corners, photographs
 from diffproj.cli.terminal import progress_bars

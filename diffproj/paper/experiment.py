@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj.calibration.calibrate import calibrate, locate
+from diffproj.calibration.calibrate import calibrate
+from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.plane import Plane

@@ -1,4 +1,7 @@
-"""What a camera leaves over of the views of a target: on the image, or on the plane."""
+"""What a camera leaves over of the views of a target: on the image, in pixels, or on the plane, in world units.
+
+The two functions at the end are the only places where "projected minus seen" and "put back minus known" are written.
+"""
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,14 +16,14 @@ from diffproj.targets.views import Views
 
 
 def image_residuals(
-    camera: Camera | PinholeCamera, views: Views, board: Target
+    camera: Camera | PinholeCamera, views: Views, target: Target
 ) -> tuple[Float[Tensor, "*batch v n 2"], Bool[Tensor, "*batch v n"]]:
-    """Projected minus seen corners in pixels, with gradients to camera, corners and board points.
+    """Projected minus seen corners in pixels, with gradients to camera, corners and the target's points.
 
     Args:
         camera: at the pose of each view, batch shape `(*B, V)`.
         views: corners `(*B, V, N, 2)`.
-        board: anything with `.points (N, 3)`.
+        target: anything with `.points (N, 3)`.
 
     Returns:
         Residuals `(*B, V, N, 2)`, zero with zero gradient where not valid; and `valid`: seen, and projected.
@@ -33,20 +36,18 @@ def image_residuals(
         True
     """
     camera = _posed(camera, views)
-    projected, valid = camera.project(_points(board, camera))
-    valid = valid & views.visible
-    return torch.where(valid.unsqueeze(-1), projected - views.pixels.to(projected), 0.0), valid
+    return projected_minus_seen(camera, target.points.to(camera.K), views.pixels.to(camera.K), views.visible)
 
 
 def plane_residuals(
-    camera: Camera | PinholeCamera, views: Views, board: Target
+    camera: Camera | PinholeCamera, views: Views, target: Target
 ) -> tuple[Float[Tensor, "*batch v n 3"], Bool[Tensor, "*batch v n"]]:
     """Corners put back on the board's plane z = 0, minus where the board has them, in world units.
 
     Args:
         camera: at the pose of each view, batch shape `(*B, V)`.
         views: corners `(*B, V, N, 2)`.
-        board: anything with `.points (N, 3)` on z = 0.
+        target: anything with `.points (N, 3)` on z = 0.
 
     Returns:
         Residuals `(*B, V, N, 3)`, zero with zero gradient where not valid; and `valid`: seen, and put back.
@@ -59,9 +60,44 @@ def plane_residuals(
         (True, True)
     """
     camera = _posed(camera, views)
-    points, valid = back_project(views.pixels.to(camera.K), camera, Plane.z(0.0))
-    valid = valid & views.visible
-    return torch.where(valid.unsqueeze(-1), points - _points(board, camera), 0.0), valid
+    return put_back_minus_known(camera, target.points.to(camera.K), views.pixels.to(camera.K), views.visible)
+
+
+def projected_minus_seen(
+    camera: Camera,
+    points: Float[Tensor, "*#batch n 3"],
+    pixels: Float[Tensor, "*#batch n 2"],
+    counts: Bool[Tensor, "*#batch n"],
+) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
+    """Reprojection errors `(*B, N, 2)` in pixels, zero with zero gradient where not valid.
+
+    Args:
+        camera: at its poses, batch shape `*B`.
+        points: world points `(*B, N, 3)`.
+        pixels: where they were seen `(*B, N, 2)`, finite.
+        counts: which of them count `(*B, N)`.
+
+    Returns:
+        The errors, and `valid`: those that count and that the camera projects.
+    """
+    projected, valid = camera.project(points)
+    valid = valid & counts
+    return torch.where(valid.unsqueeze(-1), projected - pixels, 0.0), valid
+
+
+def put_back_minus_known(
+    camera: Camera,
+    points: Float[Tensor, "*#batch n 3"],
+    pixels: Float[Tensor, "*#batch n 2"],
+    counts: Bool[Tensor, "*#batch n"],
+) -> tuple[Float[Tensor, "*out n 3"], Bool[Tensor, "*out n"]]:
+    """Errors on the plane z = 0 `(*B, N, 3)` in world units, zero with zero gradient where not valid.
+
+    Args and returns are those of `projected_minus_seen`, the points on z = 0.
+    """
+    landed, valid = back_project(pixels, camera, Plane.z(0.0))
+    valid = valid & counts
+    return torch.where(valid.unsqueeze(-1), landed - points, 0.0), valid
 
 
 def _posed(camera: Camera | PinholeCamera, views: Views) -> Camera:
@@ -72,7 +108,3 @@ def _posed(camera: Camera | PinholeCamera, views: Views) -> Camera:
             f"got {tuple(camera.batch_shape)}"
         )
     return camera
-
-
-def _points(board: Target, camera: Camera) -> Tensor:
-    return board.points.to(camera.K)

@@ -325,7 +325,7 @@ def test_refine_from_poor_starts() -> None:
     bad_t = truth.t + 0.1 * truth.t.norm(dim=-1, keepdim=True) * shift
     lens = dp.BrownConrady(torch.zeros(1000, 10, 5, dtype=D))
     start = dp.Camera(bad_K, turn @ truth.R, bad_t, lens, size=(640, 480))
-    found = dp.refine(start, views, BOARD, throw=False)
+    found = dp.refine(views, BOARD, start, throw=False)
     best = torch.tensor([by_opencv_from(truth[i], views.pixels[i]) for i in range(1000)], dtype=D)
     reached = found.rms <= best * (1 + 1e-9)
     assert reached.double().mean() >= 0.99
@@ -335,14 +335,14 @@ def test_refine_from_poor_starts() -> None:
 def test_refine_starts_from_a_camera_or_from_its_poses() -> None:
     truth, views = simulate(8)
     wanted = dp.calibrate(views, BOARD)
-    without = dp.refine(truth[0].without_pose(), views, BOARD)
-    with_poses = dp.refine(truth, views, BOARD)
+    without = dp.refine(views, BOARD, truth[0].without_pose())
+    with_poses = dp.refine(views, BOARD, truth)
     torch.testing.assert_close(without.camera.K, wanted.camera.K, rtol=0, atol=1e-4)
     torch.testing.assert_close(with_poses.camera.K, wanted.camera.K, rtol=0, atol=1e-4)
     assert with_poses.iterations <= wanted.iterations
     kornia = dp.Camera(K, size=(640, 480)).to_kornia()
     batch = dp.Views(views.pixels[None], size=views.size)
-    assert dp.refine(kornia, batch, BOARD).camera.distortion is None
+    assert dp.refine(batch, BOARD, kornia).camera.distortion is None
 
 
 def test_strong_lenses_are_started_well() -> None:
@@ -431,7 +431,7 @@ def test_fixed_and_tied_parameters() -> None:
     )  # fmt: skip
     np.testing.assert_allclose(dp.calibrate(in_float32(views), BOARD, tied_focal=True).camera.K, cv_K, atol=1e-4)
     start = dp.Camera(torch.tensor([[600.0, 0, 320], [0, 300, 240], [0, 0, 1]], dtype=D), size=(640, 480))
-    ratio = dp.refine(start, views, BOARD, tied_focal=True, throw=False).camera.K
+    ratio = dp.refine(views, BOARD, start, tied_focal=True, throw=False).camera.K
     assert ratio[0, 0] / ratio[1, 1] == pytest.approx(2.0, rel=1e-12)
 
 
@@ -798,7 +798,7 @@ def test_bad_input_is_refused_by_name() -> None:
         (ValueError, "views: want 40 corners .* got 54", lambda: dp.calibrate(views, dp.Chessboard(8, 5))),
         (ValueError, "views: want at least one, got none", lambda: dp.locate(views[[]], board, truth[0])),
         (ValueError, "views: want the photographs' size", lambda: dp.calibrate(dp.Views(views.pixels), board)),
-        (ValueError, "board: want finite points, all on z = 0", lambda: dp.calibrate(views, target(board.points + 1))),
+        (ValueError, "target: want finite points, all on z = 0", lambda: dp.calibrate(views, target(board.points + 1))),
         (ValueError, "all distinct, got 54 with 3 and 7 alike", lambda: dp.calibrate(views, target(same))),
         (ValueError, "do not lie on one line", lambda: dp.calibrate(views, target(line))),
         (
@@ -826,7 +826,7 @@ def test_bad_input_is_refused_by_name() -> None:
         (
             ValueError,
             "fixed: want both focal lengths or none",
-            lambda: dp.refine(truth[0], views, board, fixed=("f_x",), tied_focal=True),
+            lambda: dp.refine(views, board, truth[0], fixed=("f_x",), tied_focal=True),
         ),
         (TypeError, "priors: want a mapping", lambda: dp.calibrate(views, board, priors=[1])),
         (
@@ -847,19 +847,19 @@ def test_bad_input_is_refused_by_name() -> None:
             lambda: dp.calibrate(views, board, priors={"focal": 5.0}),
         ),
         (ValueError, "reject_outliers: want True or a number", lambda: dp.calibrate(views, board, reject_outliers=-1)),
-        (TypeError, "board: want dp.Chessboard or anything", lambda: dp.calibrate(views, board.points)),
+        (TypeError, "target: want dp.Chessboard or anything", lambda: dp.calibrate(views, board.points)),
         (TypeError, "loss: want one such as", lambda: dp.locate(views, board, truth[0], loss="huber")),
         (TypeError, "loss: want one such as", lambda: dp.calibrate(views, board, loss="huber")),
         (ValueError, "camera: want a batch shape that broadcasts", lambda: dp.locate(views, board, truth)),
-        (ValueError, "camera: want a batch shape that broadcasts", lambda: dp.refine(truth[:3], views, board)),
-        (ValueError, "camera: want no skew", lambda: dp.refine(skewed, views, board)),
-        (TypeError, "camera: want a pinhole", lambda: dp.refine(dp.Camera(K, distortion=other()), views, board)),
+        (ValueError, "camera: want a batch shape that broadcasts", lambda: dp.refine(views, board, truth[:3])),
+        (ValueError, "camera: want no skew", lambda: dp.refine(views, board, skewed)),
+        (TypeError, "camera: want a pinhole", lambda: dp.refine(views, board, dp.Camera(K, distortion=other()))),
         (
             ValueError,
             r"camera: want the size of the photographs, \(640, 480\)",
             lambda: dp.locate(views, board, dp.Camera(K, size=(320, 240))),
         ),
-        (TypeError, "camera: want dp.Camera", lambda: dp.refine("camera", batch, board)),
+        (TypeError, "camera: want dp.Camera", lambda: dp.refine(batch, board, "camera")),
     ]
     for kind, message, call in cases:
         with pytest.raises(kind, match=message):

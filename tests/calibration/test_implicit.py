@@ -79,9 +79,9 @@ def test_gradient_by_pixels(case: str) -> None:
     def solve(pixels: torch.Tensor, differentiable: bool) -> dp.Calibration:
         views = dp.Views(pixels, visible, size=(640, 480))
         return dp.refine(
-            camera,
             views,
             Target(points),
+            camera,
             differentiable=differentiable,
             tolerance=1e-17,
             max_iterations=2000,
@@ -97,7 +97,7 @@ def test_gradient_by_board_points() -> None:
 
     def solve(points: torch.Tensor, differentiable: bool) -> dp.Calibration:
         views = dp.Views(pixels, visible, size=(640, 480))
-        return dp.refine(camera, views, Target(points * in_plane), differentiable=differentiable, tolerance=1e-17)
+        return dp.refine(views, Target(points * in_plane), camera, differentiable=differentiable, tolerance=1e-17)
 
     check(solve, points, 5e-3)
 
@@ -110,7 +110,7 @@ def test_gradient_by_weights(loss: dp.Loss | None) -> None:
     def solve(weights: torch.Tensor, differentiable: bool) -> dp.Calibration:
         views = dp.Views(pixels, visible, size=(640, 480))
         options = {"weights": weights, "loss": loss, "tolerance": 1e-17, "max_iterations": 2000}
-        return dp.refine(camera, views, Target(points), differentiable=differentiable, **options)
+        return dp.refine(views, Target(points), camera, differentiable=differentiable, **options)
 
     check(solve, weights, 3e-5 if loss else 1e-3)
 
@@ -121,7 +121,7 @@ def test_gradient_by_priors() -> None:
     def solve(values: torch.Tensor, differentiable: bool) -> dp.Calibration:
         views = dp.Views(pixels, visible, size=(640, 480))
         priors = {"focal": (values[:2], values[2].abs()), "k2": values[3]}
-        return dp.refine(camera, views, Target(points), priors=priors, differentiable=differentiable, tolerance=1e-17)
+        return dp.refine(views, Target(points), camera, priors=priors, differentiable=differentiable, tolerance=1e-17)
 
     check(solve, torch.tensor([530.0, 540, 2.0, 0.05], dtype=D), 3e-4)
 
@@ -130,8 +130,8 @@ def test_values_are_those_of_the_solver_and_batches_keep_apart() -> None:
     camera, pixels, visible, points = situation()
     both = torch.stack([pixels, pixels + 0.1 * torch.randn_like(pixels)]).requires_grad_()
     views = dp.Views(both, visible.expand(2, -1, -1), size=(640, 480))
-    plain = dp.refine(camera, views, Target(points))
-    found = dp.refine(camera, views, Target(points), differentiable=True)
+    plain = dp.refine(views, Target(points), camera)
+    found = dp.refine(views, Target(points), camera, differentiable=True)
     assert torch.equal(found.camera.K.detach(), plain.camera.K)
     assert torch.equal(found.cameras.R.detach(), plain.cameras.R)
     assert not plain.camera.K.requires_grad

@@ -118,7 +118,7 @@ def run(
         error = noise(torch.Size((500, *exact.shape)), generator)
         pixels = exact + (error if scale is None else error * scale.unsqueeze(-1))
         views = dp.Views(pixels, visible, size=(640, 480))
-        found = dp.refine(cameras.at(cameras.R, cameras.t)[None].at(cameras.R, cameras.t), views, BOARD, **options)
+        found = dp.refine(views, BOARD, cameras.at(cameras.R, cameras.t)[None].at(cameras.R, cameras.t), **options)
         record(sample, found, cameras, 3, generator)
     return sample
 

@@ -45,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     del older["calibration"]["used"]
     (folder / "damaged.json").write_text(json.dumps(older))
     alike = dp.Views(views.pixels, views.visible, ["1.png"] * 10, views.size)
-    dp.save_camera(folder / "alike.json", dp.refine(calibration.camera, alike, dp.Chessboard(8, 5, 25.0)))
+    dp.save_camera(folder / "alike.json", dp.refine(alike, dp.Chessboard(8, 5, 25.0), calibration.camera))
     many = dp.Camera(torch.stack([calibration.camera.K] * 2), size=(640, 480))
     dp.save_camera(folder / "many.json", many)
     return folder

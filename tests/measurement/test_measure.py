@@ -28,7 +28,7 @@ def simulated(lens: str, views: int = 8) -> dp.Calibration:
     K = torch.tensor([[533.0, 0, 342], [0, 534, 235], [0, 0, 1]], dtype=D)
     truth = synthetic.random_cameras(dp.Camera(K, distortion=LENSES[lens], size=(640, 480)), BOARD, views)
     seen = synthetic.corner_views(truth, BOARD)
-    return dp.refine(truth, seen, BOARD, throw=False)
+    return dp.refine(seen, BOARD, truth, throw=False)
 
 
 def redone(

@@ -97,7 +97,7 @@ def _one_intrinsics(camera: dp.Camera) -> dp.Camera:
 
 def test_the_plane_objective_by_lbfgs() -> None:
     _, views, board, best = pinhole()
-    want = dp.refine(best.camera, views, board, objective="plane")
+    want = dp.refine(views, board, best.camera, objective="plane")
     learnable = dp.LearnableCamera(best.cameras)
     total = by_lbfgs(learnable, lambda: dp.plane_residuals(learnable(), views, board)[0].square().sum(), 1500)
     error, _ = dp.plane_residuals(want.cameras, views, board)

@@ -1,0 +1,64 @@
+"""`refine`: a camera that is known roughly, refined on the corners of a target; differentiable if asked."""
+
+from typing import Unpack
+
+from kornia.geometry.camera import PinholeCamera
+
+from diffproj.calibration import start
+from diffproj.calibration.data import Data
+from diffproj.calibration.implicit import differentiated
+from diffproj.calibration.options import CalibrationOptions, calibration_options
+from diffproj.calibration.outcome import minimised, outcome
+from diffproj.calibration.result import Calibration
+from diffproj.geometry.camera import Camera, as_camera
+from diffproj.targets.target import Target
+from diffproj.targets.views import Views
+
+
+def refine(
+    views: Views,
+    target: Target,
+    camera: Camera | PinholeCamera,
+    *,
+    differentiable: bool = False,
+    **options: Unpack[CalibrationOptions],
+) -> Calibration:
+    """Refine a camera on the corners of a target.
+
+    Args:
+        views: corners `(*B, V, N, 2)`.
+        target: anything with `.points (N, 3)` on z = 0.
+        camera: the start: its lens says which lens is fitted, and fixed parameters keep its values. With a batch shape
+            that broadcasts to `*B`, poses are found from the corners; with `(*B, V)`, its poses are the start, and its
+            intrinsics are those of the first view.
+        differentiable: carry gradients through the minimum: those of cameras and bow with respect to the views'
+            pixels, the target's points, the weights and tensors among the priors are those of the minimiser (implicit
+            function theorem, exact Hessian). To first order.
+        options: as in `calibrate`: see `CalibrationOptions`.
+
+    Returns:
+        The calibration, in float64.
+
+    Raises:
+        TypeError: views are no `dp.Views`, the camera has a lens of another library, or an option is unknown.
+        ValueError: views, target, camera and options do not fit together, or K has skew.
+        CalibrationError: a camera did not converge, or its views do not determine it.
+
+    Example:
+        >>> import torch, diffproj as dp
+        >>> views, board = dp.example_views("left"), dp.Chessboard()
+        >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+        >>> rough = dp.Camera(K, distortion=dp.BrownConrady(torch.zeros(5, dtype=torch.float64)), size=(640, 480))
+        >>> print(f"{dp.refine(views, board, rough).rms:.3f}")
+        0.177
+    """
+    if isinstance(views, Camera | PinholeCamera):
+        raise TypeError("refine: want (views, target, camera) in this order, got the camera first")
+    chosen = calibration_options("refine", options)
+    data = Data(views, target, chosen.weights)
+    camera = as_camera(camera)
+    shared, local, model = start.from_camera(camera, data, chosen.bow)
+    found, prior = minimised(data, chosen, model, shared, local, shared)
+    if differentiable:
+        found = differentiated(found, data, prior)
+    return outcome("refine", data, found, camera.size or views.size, chosen.throw)
