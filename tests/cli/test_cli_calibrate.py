@@ -1,0 +1,228 @@
+"""`diffproj calibrate` as a stranger meets it: what it prints and writes, its exit codes and its one-line errors."""
+
+import os
+import re
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import diffproj as dp
+from diffproj import cli
+from diffproj.cli import calibrate as calibrate_command
+
+PHOTOGRAPHS = Path(os.environ.get("DIFFPROJ_PHOTOS", "/usr/share/doc/opencv-doc/examples/data"))
+needs_photographs = pytest.mark.skipif(
+    not (PHOTOGRAPHS / "left01.jpg").exists(), reason="no photographs here; the README's last section brings them"
+)
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    try:
+        code = cli.main(["calibrate", *arguments])
+    except SystemExit as error:
+        code = int(error.code or 0)
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def calibrate(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    return run(capsys, *map(str, arguments), "--board", "8x5", "--square", "25")
+
+
+def one_line(err: str) -> str:
+    (line,) = err.strip().splitlines()
+    assert line.startswith("diffproj: ")
+    return line
+
+
+def test_calibrate_writes_the_whole_calibration(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "camera.json"
+    code, out, err = calibrate(capsys, photographs, "--distortion", "none", "-o", file)
+    assert code == 0
+    assert "5.png: found no board with 8 x 5 inner corners; photograph skipped" in one_line(err)
+    calibration = dp.load_calibration(file)
+    assert calibration.views.names == ("1.png", "2.png", "3.png", "4.png", "6.png")
+    f_x = calibration.camera.K[0, 0]
+    assert abs(f_x - 700) < 5 * calibration.covariance.deviations["f_x"]
+    assert re.search(rf"focal length f_x, px +│ +{f_x:.1f}\d* +│ +[\d.]+ +│", out)
+    assert re.search(rf"4.png +│ 40 of 40 +│ +{calibration.view_rms[3]:.4f} │\n", out)
+    assert f"RMS reprojection error {calibration.rms:.4f} px over 200 corners in 5 views" in out
+    assert f"Solver {calibration.message}" in out
+    assert f"Written to {file}\n" in out
+    assert "rejected" not in out
+    assert all(len(line) <= 80 for line in out.splitlines() if str(file) not in line)
+
+
+def test_calibrate_writes_what_opencv_reads(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "camera.yaml"
+    file.write_text("an older file")
+    code, out, _ = calibrate(capsys, photographs, photographs / "6.png", "--distortion", "brown4", "--output", file)
+    assert code == 0
+    assert "a .json file would hold the whole calibration" in out
+    assert "in 5 views" in out  # a photograph that was named twice counts once
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+    K, lens = storage.getNode("camera_matrix").mat(), storage.getNode("distortion_coefficients").mat()
+    assert storage.getNode("extrinsic_parameters").mat().shape == (5, 6)
+    storage.release()
+    assert lens.shape == (4, 1)
+    camera = dp.load_camera(file)
+    assert camera.size == (640, 480)
+    assert np.array_equal(camera.K.numpy(), K)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["camera.yaml"]
+
+
+def test_calibrate_fits_the_bow(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "camera.json"
+    code, out, _ = calibrate(capsys, photographs, "--distortion", "none", "--bow", "-o", file)
+    assert code == 0
+    assert "board's bow along x, unit of --square" in out
+    bow = dp.load_calibration(file).bow
+    assert bow is not None
+    assert bow.abs().max() < 0.5  # millimetres: the rendered board is flat
+
+
+def test_calibrate_names_rejected_corners(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, file = tmp_path / "photographs", tmp_path / "camera.json"
+    shutil.copytree(photographs, folder)
+    options = ("--distortion", "none", "--reject-outliers", "-o", file)
+    code, out, _ = calibrate(capsys, folder, *options)
+    assert code == 0
+    assert "No corner rejected as outlier" in out
+    corner = 11
+    u, v = dp.load_calibration(file).views.pixels[2, corner].round().int().tolist()
+    spoilt = cv2.imread(str(folder / "3.png"))
+    assert spoilt is not None
+    spoilt[v - 3 : v + 4, u + 2 : u + 6] = 20
+    cv2.imwrite(str(folder / "3.png"), spoilt)
+    code, out, _ = calibrate(capsys, folder, *options)
+    assert code == 0
+    assert "1 corner rejected as outlier\n" in out
+    assert re.search(rf"3.png +│ 39 of 40 │ +[\d.]+ │ {corner} \(\d+, \d+\)", out)
+    assert dp.load_calibration(file).rejected.nonzero().tolist() == [[2, corner]]
+
+
+@needs_photographs
+def test_calibrate_on_real_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "camera.yml"
+    files = [str(PHOTOGRAPHS / f"left0{i}.jpg") for i in range(1, 9)]
+    code, _, err = run(capsys, *files, "--board", "9x6", "--square", "25", "--bow", "-o", str(file))
+    assert (code, err) == (0, "")
+    assert abs(dp.load_camera(file).K[0, 0] - 533) < 3
+
+
+def test_calibrate_says_what_the_views_do_not_determine(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = calibrate(capsys, photographs / "1.png", "-o", tmp_path / "camera.json")
+    assert (code, out) == (1, "")
+    assert "the views do not determine" in one_line(err)
+    assert "add views tilted by 20 to 50 degrees" in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_calibrate_refuses_photographs_by_name(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "camera.json"
+    small, broken, empty = tmp_path / "small.png", tmp_path / "broken.png", tmp_path / "empty"
+    cv2.imwrite(str(small), np.full((240, 320), 90, np.uint8))
+    broken.write_text("no image")
+    empty.mkdir()
+    for photograph, message in {
+        small: r"want one size, got 640 x 480 px in .*1\.png and 320 x 240 px in .*small\.png; one camera",
+        broken: r"broken\.png: want an image",
+        empty: r"empty: want a folder with photographs \(\.bmp, .*\), found none in it",
+        tmp_path / "nowhere.png": r"no such file: .*nowhere\.png",
+        tmp_path / "*.jpg": r"want at least one, got none in '.*/\*\.jpg'",
+    }.items():
+        code, out, err = calibrate(capsys, photographs / "1.png", photograph, "-o", file)
+        assert (code, out) == (1, "")
+        assert re.search(message, one_line(err))
+    code, _, err = calibrate(capsys, photographs / "5.png", "-o", file)
+    assert code == 1
+    assert re.search(r"want a board with 8 x 5 inner corners, found none in .*5\.png\. Check", one_line(err))
+    assert not file.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--square", "25"], "the following arguments are required: --board"),
+        (["--board", "9x6"], "the following arguments are required: --square"),
+        (["--board", "9", "--square", "25"], "--board: want inner corners as COLUMNSxROWS, such as 9x6, got '9'"),
+        (["--board", "9x2", "--square", "25"], "--board: want at least 3x3 inner corners"),
+        (["--board", "9x6", "--square", "25mm"], "--square: want the side of a square as a positive number"),
+        (["--board", "9x6", "--square", "inf"], "--square: want the side of a square as a positive number"),
+        (["--board", "9x6", "--square", "25", "--distortion", "brown6"], "invalid choice: 'brown6'"),
+        (
+            ["--board", "9x6", "--square", "25", "-o", "camera.txt"],
+            "want a file ending in .json, .yaml, .yml, .xml, got 'camera.txt'",
+        ),
+    ],
+)
+def test_calibrate_checks_options_first(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = run(capsys, "nowhere.png", *arguments)
+    assert (code, out) == (2, "")
+    assert message in err
+
+
+def test_calibrate_checks_the_place_of_the_file_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, _, err = calibrate(capsys, "nowhere.png", "-o", tmp_path / "missing" / "camera.json")
+    assert code == 1
+    assert f"--output: no such folder: {tmp_path / 'missing'}; make it first" in one_line(err)
+    (tmp_path / "folder.json").mkdir()
+    code, _, err = calibrate(capsys, "nowhere.png", "-o", tmp_path / "folder.json")
+    assert code == 1
+    assert "--output: want a file, got a folder" in one_line(err)
+
+    def refuse(**_: Any) -> None:
+        raise PermissionError(13, "Permission denied", "somewhere")
+
+    # The superuser may write anywhere, so that no folder's mode makes this happen everywhere.
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    code, _, err = calibrate(capsys, "nowhere.png", "-o", tmp_path / "camera.json")
+    assert code == 1
+    assert f"--output: cannot write to the folder {tmp_path} (Permission denied); choose another" in one_line(err)
+
+
+def test_calibrate_keeps_the_older_file_where_writing_fails(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "camera.json"
+    file.write_text("an older file")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    code, out, err = calibrate(capsys, photographs, "--distortion", "none", "-o", file)
+    assert code == 1
+    assert "Solver converged" in out
+    assert f"--output: could not write {file} (No space left on device)" in err
+    assert file.read_text() == "an older file"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_interrupting_is_no_traceback(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(calibrate_command, "find_corners", interrupt)
+    code, _, err = calibrate(capsys, photographs, "-o", tmp_path / "camera.json")
+    assert (code, one_line(err)) == (130, "diffproj: interrupted")
+    assert not list(tmp_path.iterdir())
