@@ -1,4 +1,4 @@
-"""Pictures, drawn with matplotlib without a screen: the paper's Fig. 7, and maps of accuracy over the image."""
+"""Figures, drawn with matplotlib without a display: the paper's Fig. 7, and maps of accuracy over the image."""
 
 import io
 
@@ -16,12 +16,19 @@ EXACT, APPROXIMATED, ERROR = "#8a8f98", "#0b6bcb", "#d6336c"
 def fig7(experiment: Experiment, magnification: float = 50.0) -> Figure:
     """Exact and approximated corners of each test view, as the paper's Fig. 7.
 
-    The board is drawn as one looks at it: the paper's x points down, its y to the right. At the errors of interest both
-    marks fall on one spot, so the difference is drawn along, magnified.
+    The board is drawn as one looks at it: the paper's x points down, its y to the right. The errors are so small that
+    both marks fall on one spot, so each error is drawn as well, magnified.
 
     Args:
         experiment: what to draw.
-        magnification: how much longer than true the errors are drawn.
+        magnification: how many times as long as they are the errors are drawn.
+
+    Example:
+        >>> import diffproj as dp
+        >>> views = dp.example_views("left")
+        >>> figure = fig7(dp.run_experiment(views[:8], views[8:], dp.Chessboard(axes="paper")))
+        >>> figure.axes[0].get_title()
+        'left09.jpg: mean $E_x$ 0.047, $E_y$ 0.089'
     """
     views = experiment.test.views.names
     columns = min(3, len(views))
@@ -65,6 +72,13 @@ def accuracy(found: AccuracyMap, unit: str = "world units") -> Figure:
     Args:
         found: the map, from `AccuracyMap.over_image`.
         unit: of the world, for the labels.
+
+    Example:
+        >>> import diffproj as dp
+        >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+        >>> figure = accuracy(dp.AccuracyMap.over_image(calibration, step=80), unit="mm")
+        >>> figure.axes[2].get_title()  # the right panel; each is followed by its colour bar
+        'standard deviation of a point, mm'
     """
     figure = Figure(figsize=(9.6, 3.9), layout="constrained")
     u, v = (part.numpy() for part in found.pixels.cpu().unbind(-1))

@@ -131,6 +131,12 @@ class Covariance:
             KeyError: a field is missing.
             TypeError: a field holds something other than numbers.
             ValueError: a field's lists are not of equal lengths.
+
+        Example:
+            >>> import diffproj as dp
+            >>> covariance = dp.calibrate(dp.example_views("left"), dp.Chessboard()).covariance
+            >>> torch.equal(dp.Covariance.from_fields(covariance.to_fields()).full(), covariance.full())
+            True
         """
         undetermined, undetermined_views = (
             torch.tensor(fields[key], dtype=torch.bool) for key in ("undetermined", "undetermined_views")

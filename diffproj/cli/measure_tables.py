@@ -8,7 +8,8 @@ from diffproj.cli.scene import Scene
 from diffproj.cli.terminal import RESULTS, aligned, result, rounded
 
 EXACT = 1e-9
-"""Part of a coordinate below which its deviation is rounding: the plane alone says what the coordinate is."""
+"""Standard deviation, as a part of the point's largest coordinate, that is rounding error: the plane alone says what
+such a coordinate is."""
 
 
 def say(document: dict[str, Any], scene: Scene) -> None:
@@ -64,7 +65,7 @@ def _points_table(document: dict[str, Any], unit: str) -> Table:
 
 
 def coordinate(world: list[float], deviations: list[float | None], axis: int) -> tuple[str, str]:
-    """A coordinate and what follows it; bare where the plane alone says what it is."""
+    """A coordinate, and what follows it: its standard deviation, or nothing where the plane alone determines it."""
     value, deviation = world[axis], deviations[axis]
     scale = max(map(abs, world))
     if deviation is None:
@@ -87,7 +88,7 @@ def _lengths_table(lengths: list[dict[str, Any]]) -> Table:
 
 
 def shown(quantity: dict[str, Any]) -> tuple[str, str, str]:
-    """A quantity, its deviation and its interval, all to the deviation's second digit."""
+    """A quantity, its standard deviation and its interval, all to the second digit of the standard deviation."""
     value, deviation, interval = quantity["value"], quantity["deviation"], quantity["interval_95"]
     if value is None:
         return "none", "", ""

@@ -13,7 +13,7 @@ RESULTS = Console(highlight=False, emoji=False)
 NOTES = Console(stderr=True, highlight=False, emoji=False)
 
 HUGE = 1e5
-"""A deviation from which numbers are shown with a power of ten, such as those of points close to the horizon."""
+"""Standard deviation from which numbers are shown with a power of ten, as for points close to the horizon."""
 
 
 def note(text: str) -> None:
@@ -54,7 +54,7 @@ def progress_bars() -> Progress:
 
 
 def rounded(value: float, deviation: float) -> tuple[str, str]:
-    """A value and its standard deviation, both to the deviation's second digit."""
+    """A value and its standard deviation, both to the second digit of the standard deviation."""
     if not (math.isfinite(deviation) and deviation > 0):
         return f"{value:.6g}", "unknown"
     if deviation >= HUGE:

@@ -33,7 +33,7 @@ class Row:
         view: the view's name.
         corners: how many corners were measured.
         mean: means of E_x, E_y, E_z.
-        deviation: their standard deviations (of a sample: divided by the number less one).
+        deviation: their sample standard deviations (divided by the number of corners less one).
     """
 
     view: str
@@ -100,8 +100,8 @@ def run_experiment(
         test: views whose corners are measured; each has its own pose, found with the intrinsics held.
         board: the board, in either frame.
         distortion: which lens to fit; the paper neglects it (`"none"`).
-        strict: find each pose from every second corner and measure the others, so that no corner judges itself. (The
-            paper finds the pose from the same corners.)
+        strict: find each pose from every second corner and measure the others, so that no corner is measured with a
+            pose that it contributed to. (The paper finds the pose from the corners that it measures.)
 
     Returns:
         The outcome, in the board's unit.
@@ -137,8 +137,8 @@ def parse_split(text: str, count: int) -> tuple[list[int], list[int]]:
     """Read which views fit and which test.
 
     Args:
-        text: `"8"`, the first 8 fit and the others test; or numbers from 1 and ranges, as `"1-5,9/6-8"`: before the
-            slash those that fit, behind it those that test.
+        text: `"8"`, the first 8 fit and the others test; or numbers from 1 and ranges, as `"1-5,9/6-8"`: those that
+            fit before the slash, those that test after it.
         count: how many views there are.
 
     Returns:
@@ -179,7 +179,7 @@ def _positions(text: str) -> list[int]:
 
 def _row(name: str, errors: Float[Tensor, "n 3"]) -> Row:
     mean = errors.mean(dim=0).tolist()
-    # One corner alone has no deviation: NaN says so without a warning.
+    # One corner alone has no standard deviation: NaN says so without a warning.
     deviation = errors.std(dim=0).tolist() if len(errors) > 1 else [float("nan")] * 3
     return Row(name, len(errors), (mean[0], mean[1], mean[2]), (deviation[0], deviation[1], deviation[2]))
 

@@ -1,9 +1,9 @@
 """The paper's own route from a pixel to a plane, equation by equation: the readable reference beside the kernel.
 
 Siswantoro, Prabuwono and Abdullah (2013), Eq. 3-14. The pixel is first moved into the world as a point of the image
-plane, then joined with the centre of projection to a line, then the line is intersected with the plane. It subtracts
-large numbers twice (`R^-1 (p_c - T)`, then `- O_c`), which costs two digits: use it in float64, as the oracle that
-`back_project` is tested against.
+plane, then joined with the centre of projection to a line, then the line is intersected with the plane. Large numbers
+are subtracted twice (`R^-1 (p_c - T)`, then `- O_c`), and the cancellation costs two digits: use it in float64, as the
+reference that `back_project` is tested against.
 """
 
 import torch
@@ -19,7 +19,7 @@ from diffproj.geometry.plane import Plane
 def paper_route(
     pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane, focal_length: float = 1.0
 ) -> Float[Tensor, "*#batch n 3"]:
-    """Back-project pixels by the letter of the paper, which knows no lens and no invalid ray.
+    """Back-project pixels exactly as the paper does, which has neither a lens nor invalid rays.
 
     Args:
         pixels: `(*B, N, 2)`.

@@ -13,7 +13,7 @@ TEST_VIEWS = ("a", "b", "c", "d", "e")
 """The paper's test views: from above at three distances, tilted by 45 degrees about x, and about y."""
 
 
-# psi, phi, theta in degrees, then the board centre's place in the camera: right, down, forward in millimetres.
+# psi, phi, theta in degrees, then the board centre's position in the camera's frame: right, down, forward in mm.
 _FIT_POSES = (
     (0, 0, 3, 0, 0, 380),
     (30, 0, 5, 20, -10, 400),
@@ -79,7 +79,7 @@ def paper_setup(distortion: Lens | None = None) -> PaperSetup:
 
 
 def _at_poses(camera: Camera, board: Chessboard, poses: tuple[tuple[float, ...], ...]) -> Camera:
-    """The camera with the board's centre at a place in its frame, the board turned by Euler angles about it."""
+    """The camera at poses: the board's centre at a position in its frame, the board turned about it by Euler angles."""
     table = torch.tensor(poses, dtype=camera.dtype)
     psi, phi, theta = table[:, :3].deg2rad().unbind(-1)
     # Straight from above the paper's x points down in the image, its y to the right and its z towards the camera.
