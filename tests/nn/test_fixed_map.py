@@ -180,13 +180,14 @@ def test_the_map_is_built_again_in_the_precision_that_it_moves_to(
 
 
 def test_built_and_moved_in_inference_mode_it_trains_afterwards(lens_camera: dp.Camera, pixels: torch.Tensor) -> None:
+    learnable = dp.PlaneProjector(lens_camera.to(torch.float32), dp.Plane.z(0.0), ("focal", "pose", "plane"))
     with torch.inference_mode():
         built = dp.PlaneProjector(lens_camera.to(torch.float32), dp.Plane.z(0.0))
-        moved = copy.deepcopy(built).to(D)
-    for projector, inputs in ((built, pixels.float()), (moved, pixels)):
+        moved, learnable = copy.deepcopy(built).to(D), learnable.to(D)
+    for projector, inputs in ((built, pixels.float()), (moved, pixels), (learnable, pixels)):
         inputs = inputs.clone().requires_grad_()
         projector(inputs)[0].sum().backward()
-        assert inputs.grad.isfinite().all()
+        assert all(value.grad.isfinite().all() for value in (inputs, *projector.parameters()))
 
 
 def test_the_callers_tensors_are_neither_kept_nor_learned(lens_camera: dp.Camera, pixels: torch.Tensor) -> None:
