@@ -114,8 +114,10 @@ class LearnableCamera(GeometryModule):
         K = K.expand(*self.batch_shape, 3, 3)
         R = turned(self.R_0, learned(self, "rotation"))
         t = self.t_0 + self.reach * learned(self, "translation")
-        lens = self._model.lens(self.coefficients_0 + learned(self, "distortion"))
-        lens = None if lens is None else lens.expand(*self.batch_shape)
+        lens = None
+        if self._model.kind is not None:
+            coefficients = self.coefficients_0 + learned(self, "distortion")
+            lens = self._model.kind.unchecked(coefficients).expand(*self.batch_shape)
         return Camera.unchecked(K, R, t, lens, self.size)
 
     def extra_repr(self) -> str:
