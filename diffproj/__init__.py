@@ -16,6 +16,29 @@ Conventions, which hold everywhere:
   tensor is never written.
 * What fails for one element is reported in `valid`; a mistake of the caller raises `TypeError` or `ValueError`.
 * The world's unit is whatever the board's square is given in. RMS is OpenCV's: `sqrt(sum |e|^2 / number of points)`.
+
+Glossary:
+
+* Target: what is photographed in order to calibrate, with points that are known in the world. A `Chessboard` has its
+  inner corners, those where four squares meet.
+* View: where one photograph shows the points of the target. `Views` holds many.
+* Intrinsics `K`: focal lengths `f_x`, `f_y` and principal point `c_x`, `c_y`, in pixels.
+* Pose, or extrinsics: rotation `R` and translation `t`, where the world lies as the camera sees it.
+* Normalised plane: the plane `z = 1` of the camera frame. `K` takes its points to pixels.
+* Lens, or distortion: how the glass moves points of the normalised plane. Its domain is the disc on which the model is
+  one-to-one, so that it can be undone.
+* Projection: from a point of the world to its pixel. Back-projection: from a pixel along its viewing ray to the point
+  where the ray meets a plane.
+* Rectification: an image resampled to look straight down on a plane, to scale. Rendering: the way back.
+* Residual: projected minus measured pixels, or found minus true points of the plane; the docstring says which.
+* Deviation: standard deviation, one sigma. Covariance: deviations of many quantities with their correlations.
+* Ground resolution: how many world units a pixel covers on a plane. It does not tell how well a point is measured.
+* Bow: how far a board is from flat, as a paraboloid. Held out: not used to calibrate, so that it can test.
+
+The names of this page stay. They live in rooms, whose own pages say more: `diffproj.lens` and `diffproj.geometry` for
+cameras and planes, `diffproj.targets` and `diffproj.calibration` for calibrating, `diffproj.measurement`,
+`diffproj.nn`, `diffproj.files` and `diffproj.paper` for the uses. `diffproj.figures` draws, and `diffproj.synthetic`,
+which lives in `diffproj.targets.synthetic`, renders photographs with known truth.
 """
 
 from importlib import import_module

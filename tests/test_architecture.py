@@ -3,57 +3,92 @@
 import ast
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import diffproj
 
 PACKAGE = Path(diffproj.__file__).parent
-
-LEVELS = (
-    ("_core",),
-    ("lens",),
-    ("geometry",),
-    ("targets",),
-    ("calibration",),
-    ("files", "measurement", "nn", "paper"),
-    ("figures",),
-    ("cli",),
-    ("__main__",),
-)
-LEVEL = {module: level for level, modules in enumerate(LEVELS) for module in modules}
-
-
-def imported_modules(path: Path) -> set[str]:
-    """The package's own modules, or folders of modules, that a file imports."""
-    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            targets = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            base = ".".join((*parts[: len(parts) - node.level], node.module or "")) if node.level else node.module or ""
-            targets = [f"{base.rstrip('.')}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        names = [target.split(".") for target in targets]
-        found |= {name[1] for name in names if name[0] == "diffproj" and len(name) > 1}
-    return found
-
-
-def test_every_module_has_a_level() -> None:
-    modules = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in PACKAGE.rglob("*.py")}
-    assert modules - {"__init__"} == set(LEVEL)
+ROOT = Path(__file__).parent.parent
 
 
 def test_imports_run_downward_only() -> None:
-    wrong = []
-    for path in PACKAGE.rglob("*.py"):
-        module = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        if module == "__init__":
-            continue
-        sideways = [name for name in imported_modules(path) if name != module and LEVEL.get(name, -1) >= LEVEL[module]]
-        wrong += [f"{path.relative_to(PACKAGE)} imports {name}" for name in sideways]
-    assert not wrong
+    """Between rooms and inside them, as `[tool.importlinter]` in pyproject.toml draws the house."""
+    command = "from importlinter.cli import lint_imports_command; lint_imports_command()"
+    done = subprocess.run([sys.executable, "-c", command, "--no-cache"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_folder_has_a_contract() -> None:
+    """Whose layers then have to name every file: the contracts are exhaustive."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
+        "contracts"
+    ]
+    assert all(contract["type"] == "layers" and contract["exhaustive"] for contract in contracts)
+    folders = {".".join(("diffproj", *path.parent.relative_to(PACKAGE).parts)) for path in PACKAGE.rglob("*.py")}
+    assert folders == {container for contract in contracts for container in contract["containers"]}
+
+
+def room(path: Path) -> str:
+    """The folder of the package in which a file lies; a file beside the folders is a room of its own."""
+    return path.relative_to(PACKAGE).parts[0]
+
+
+def private(name: str) -> bool:
+    return name.startswith("_") and not name.startswith("__") and name != "_"
+
+
+def private_names(tree: ast.Module) -> tuple[set[str], dict[str, int]]:
+    """The private names that a file makes, and those that it takes from elsewhere, each with its first line."""
+    made, taken = set(), {}
+    for node in ast.walk(tree):
+        match node:
+            case (
+                ast.FunctionDef(name=name)
+                | ast.AsyncFunctionDef(name=name)
+                | ast.ClassDef(name=name)
+                | ast.arg(arg=name)
+            ):
+                made.add(name)
+            case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
+                made.add(name)
+            case ast.Call(func=ast.Attribute(attr="__setattr__") | ast.Name(id="setattr"), args=[*_]):
+                made |= {
+                    part.value for part in node.args if isinstance(part, ast.Constant) and isinstance(part.value, str)
+                }
+            case ast.Attribute(attr=name) if private(name):
+                taken.setdefault(name, node.lineno)
+            case ast.ImportFrom(names=names):
+                taken |= {alias.name: node.lineno for alias in names if private(alias.name)}
+            case _:
+                pass
+    return {name for name in made if private(name)}, taken
+
+
+def test_private_members_stay_in_their_room() -> None:
+    """What a file uses under a name with an underscore is not made in another room alone.
+
+    Private names of libraries are not meant here: nothing in the package makes them.
+    """
+    files = {path: private_names(ast.parse(path.read_text(encoding="utf-8"))) for path in sorted(PACKAGE.rglob("*.py"))}
+    made: dict[str, set[str]] = {}
+    for path, (names, _) in files.items():
+        made.setdefault(room(path), set()).update(names)
+    wrong = [
+        f"{path.relative_to(PACKAGE)}:{line} uses {name} of {', '.join(sorted(owners))}"
+        for path, (_, taken) in files.items()
+        for name, line in taken.items()
+        if name not in made[room(path)] and (owners := {other for other, names in made.items() if name in names})
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_file_is_longer_than_400_lines() -> None:
+    lengths = {
+        path.relative_to(PACKAGE): len(path.read_text(encoding="utf-8").splitlines()) for path in PACKAGE.rglob("*.py")
+    }
+    wrong = [f"{path} has {length} lines" for path, length in sorted(lengths.items()) if length > 400]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_public_names_are_documented_and_sorted() -> None:

@@ -40,7 +40,7 @@ class LocateOptions(TypedDict, total=False):
     throw: bool
 
 
-class CalibrationOptions(LocateOptions, total=False):
+class CalibrationOptions(LocateOptions, TypedDict, total=False):
     """The options of `calibrate` and `refine`: those of `LocateOptions`, and these.
 
     Attributes:

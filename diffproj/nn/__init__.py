@@ -1,7 +1,8 @@
-"""Parts for a training pipeline: pixels of a network in, points on a plane out, and a loss in world units.
+"""Modules for training: pixels from a network in, points on a plane out, and a loss in world units.
 
     network -> pixels -> PlaneProjector -> points, valid -> PlaneLoss -> millimetres
 
-The projector's camera and plane may be learned along, whole or in parts; `CalibrationPrior` keeps them where the
-calibration says they are, as firmly as it knows. Geometry runs in the camera's own precision, under autocast too.
+Camera and plane can be learned along with the network, whole or in parts, in a `PlaneProjector` or on their own as
+`LearnableCamera` and `LearnablePlane`; `CalibrationPrior` adds what a calibration knows about the camera to the loss.
+Geometry keeps its precision under autocast and when a network is converted to half precision.
 """

@@ -1,17 +1,19 @@
-"""`LearnableCamera`: a camera whose parameters a PyTorch optimiser moves, and the residuals that it moves them by.
+"""`LearnableCamera`: a camera whose parameters a PyTorch optimiser moves.
 
 The parameters are chosen so that steps of one size mean much the same for each of them, and none can leave its range:
 
 * focal lengths through their logarithm, `f = f_0 exp(log_focal)`, which scales the columns of `F` in general;
 * the principal point in units of the focal length, `c = c_0 + F_0 principal_point`;
-* the lens's coefficients as they are, `k = k_0 + distortion`;
-* poses on their manifold, `R = Q(rotation) R_0`, and `t = t_0 + |t_0| translation` (in world units where t_0 is 0).
+* the coefficients of the lens by addition, `k = k_0 + distortion`;
+* rotations by `R = Q(rotation) R_0`, where `Q(w)` turns about the axis w by `2 atan(|w| / 2)` (Cayley's map, which
+  agrees with the rotation vector to second order; see `diffproj.geometry.cayley`);
+* translations in units of their length, `t = t_0 + |t_0| translation` (in world units where t_0 is 0).
 
-`Q(w)` turns about the axis w by `2 atan(|w| / 2)`: Cayley's map, which agrees with the rotation vector to second order
-and is rational, so that it costs little and all its derivatives are exact at 0.
-
-All are zero at first: the camera that the module was made from. What is not learned is a buffer, saved and moved along.
+All parameters are zero at first, which gives the camera that the module was made from. Parts that are not learned are
+buffers, which are saved and moved along.
 """
+
+from typing import Any
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -19,9 +21,8 @@ from torch import Tensor, nn
 
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.cayley import turned
-from diffproj.lens.coefficients import CoefficientLens
-from diffproj.lens.models import coefficients_of
-from diffproj.nn.partial import PARTS, GeometryModule, Learn, learned, learned_parts, own
+from diffproj.lens.models import coefficients_of, model_of
+from diffproj.nn.partial import PARTS, GeometryModule, Learn, add_parameter, learned, learned_parts
 
 _PARAMETERS = {
     "focal": ("log_focal",),
@@ -32,23 +33,26 @@ _PARAMETERS = {
 
 
 class LearnableCamera(GeometryModule):
-    """A camera, or a batch of them, as a module: calling it gives a `Camera` that carries gradients.
+    """A camera, or a batch of cameras, as a module: calling it gives a `Camera` that carries gradients.
 
-    Intrinsics and lens of a batch of poses of one camera, as `Calibration.cameras` is, are one parameter.
+    The poses of one camera, such as `Calibration.cameras`, share one K and one lens: these are one parameter, and stay
+    one however long they are trained. Such intrinsics are tied. Whether they are is decided once, in construction, by
+    the values that the camera starts with, and not by how its tensors lie in memory.
 
     Args:
-        camera: the start. Its tensors are copied; its dtype and device are the module's.
-        learn: which parts are learned, of `"focal"`, `"principal_point"`, `"distortion"` and `"pose"`; all that the
-            camera has if left out. A mapping says it for each camera of a batch: from a part to booleans that
-            broadcast to the batch shape.
-        tied_intrinsics: whether the cameras along a batch axis are one camera at several poses, with one K and one lens
-            to learn. If left out, they are where all start with the same values. True demands it of the last axis;
-            with False each camera learns its own, however they start.
+        camera: the starting camera, of batch shape `*B`, or Kornia's `PinholeCamera`. Its tensors are copied; its dtype
+            and device are the module's.
+        learn: the parts to learn, of `"focal"`, `"principal_point"`, `"distortion"` and `"pose"`; all that the camera
+            has if left out. A mapping also says for which cameras of the batch: from the part to True, False, or
+            booleans that broadcast to the batch shape.
+        tied_intrinsics: whether the cameras along a batch axis share one K and one lens. If left out, they do along
+            every axis along which all start with the same values of both. True does the same and refuses cameras that
+            differ along the last axis; False gives each camera its own K and lens, also where they start alike.
 
     Raises:
-        TypeError: no camera, or one with a lens of another library.
-        ValueError: an unknown part, `"distortion"` of a pinhole, booleans that do not fit or that part what is one
-            parameter, or `tied_intrinsics` of different ones.
+        TypeError: not a camera, or one whose lens is of another package.
+        ValueError: an unknown part; `"distortion"` of a pinhole; booleans that do not broadcast to the batch shape, or
+            that differ between cameras with tied intrinsics; or `tied_intrinsics=True` for cameras that differ.
 
     Example:
         >>> import diffproj as dp
@@ -72,16 +76,12 @@ class LearnableCamera(GeometryModule):
     ) -> None:
         super().__init__()
         camera = as_camera(camera).detach()
-        lens = camera.distortion
-        if lens is not None and not isinstance(lens, CoefficientLens):
-            raise TypeError(f"camera: want a lens of diffproj, got {type(lens).__name__}")
-        available = [part for part in PARTS if lens is not None or part != "distortion"]
+        self._model = model_of(camera.distortion)
+        available = [part for part in PARTS if self._model.count or part != "distortion"]
         chosen = learned_parts(available if learn is None else learn, available)
         self.learn, self.size, self.batch_shape = tuple(chosen), camera.size, camera.batch_shape
-        self._lens = None if lens is None else type(lens)
-        coefficients = coefficients_of(lens, camera.t).expand(*self.batch_shape, -1)
-        tied = _tied_axes(camera.K, coefficients, tied_intrinsics)
-        K, coefficients = (_first_along(tied, part) for part in (camera.K, coefficients))
+        axes = tied_axes(camera, tied_intrinsics)
+        K, coefficients = (_first_along(axes, part) for part in _intrinsics(camera))
         focal = K[..., 0, :2]
         self.register_buffer("K_0", K.clone())
         self.register_buffer("R_0", camera.R.clone())
@@ -92,7 +92,8 @@ class LearnableCamera(GeometryModule):
         likes = {"focal": focal, "principal_point": focal, "distortion": coefficients, "pose": camera.t}
         for part, names in _PARAMETERS.items():
             for name in names:
-                own(self, name, likes[part], chosen.get(part, False), self.batch_shape)
+                add_parameter(self, name, likes[part], chosen.get(part, False), self.batch_shape)
+        self.register_load_state_dict_pre_hook(_explain_other_tying)
 
     K_0: Tensor
     R_0: Tensor
@@ -106,7 +107,7 @@ class LearnableCamera(GeometryModule):
     translation: Tensor
 
     def forward(self) -> Camera:
-        """The camera as it is now, with the batch shape of the one it was made from."""
+        """The camera with the current values of the parameters, of the batch shape of the starting camera."""
         scale = nn.functional.pad(learned(self, "log_focal").exp(), (0, 1), value=1.0)
         shift = (self.K_0[..., :2] * learned(self, "principal_point").unsqueeze(-2)).sum(-1, keepdim=True)
         K = self.K_0 * scale.unsqueeze(-2) + nn.functional.pad(shift, (2, 0))
@@ -114,28 +115,40 @@ class LearnableCamera(GeometryModule):
         R = turned(self.R_0, learned(self, "rotation"))
         t = self.t_0 + self.reach * learned(self, "translation")
         lens = None
-        if self._lens is not None:
-            lens = self._lens(self.coefficients_0 + learned(self, "distortion")).expand(*self.batch_shape)
+        if self._model.kind is not None:
+            coefficients = self.coefficients_0 + learned(self, "distortion")
+            lens = self._model.kind.unchecked(coefficients).expand(*self.batch_shape)
         return Camera.unchecked(K, R, t, lens, self.size)
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""
-        lens = "pinhole" if self._lens is None else self._lens.__name__
-        return f"batch_shape={tuple(self.batch_shape)}, {lens}, learn={self.learn}"
+        return f"batch_shape={tuple(self.batch_shape)}, lens={self._model.name}, learn={self.learn}"
 
 
-def _tied_axes(K: Tensor, coefficients: Tensor, tied: bool | None) -> list[int]:
-    """The batch axes along which K `(*B, 3, 3)` and lens `(*B, k)` are those of one camera."""
+def tied_axes(camera: Camera, tied: bool | None) -> list[int]:
+    """The batch axes along which the cameras share one K and one lens; see `tied_intrinsics` of `LearnableCamera`.
+
+    Raises:
+        TypeError: the lens is of another package.
+        ValueError: `tied` is true, and the cameras differ along the last axis.
+    """
+    parts = _intrinsics(camera)
     if tied is False:
         return []
-    batch = K.ndim - 2
-    axes = [axis for axis in range(batch) if all(_alike_along(axis, part) for part in (K, coefficients))]
-    if tied and batch and batch - 1 not in axes:
+    batch = camera.batch_shape
+    axes = [axis for axis in range(len(batch)) if batch[axis] and all(_is_constant(part, axis) for part in parts)]
+    if tied and batch and len(batch) - 1 not in axes:
         raise ValueError("tied_intrinsics: want one K and one lens for all poses, got different ones")
     return axes
 
 
-def _alike_along(axis: int, tensor: Tensor) -> bool:
+def _intrinsics(camera: Camera) -> tuple[Tensor, Tensor]:
+    """K `(*B, 3, 3)` and the coefficients of the lens `(*B, k)`, none for a pinhole."""
+    return camera.K, coefficients_of(camera.distortion, camera.t).expand(*camera.batch_shape, -1)
+
+
+def _is_constant(tensor: Tensor, axis: int) -> bool:
+    """Whether all values along an axis are the same."""
     return bool((tensor == tensor.narrow(axis, 0, 1)).all())
 
 
@@ -144,3 +157,19 @@ def _first_along(axes: list[int], tensor: Tensor) -> Tensor:
     for axis in axes:
         tensor = tensor.narrow(axis, 0, 1)
     return tensor
+
+
+def _explain_other_tying(learnable: LearnableCamera, state: dict[str, Any], prefix: str, *rest: Any) -> None:
+    """Called before `load_state_dict`: name the cause where intrinsics are tied in one of the two and not in the other.
+
+    PyTorch then adds its own lines about the shapes that differ, and raises.
+    """
+    errors: list[str] = rest[-1]
+    K, t = state.get(f"{prefix}K_0"), state.get(f"{prefix}t_0")
+    if K is None or t is None or t.shape != learnable.t_0.shape or K.shape == learnable.K_0.shape:
+        return
+    errors.append(
+        f"{prefix}K_0: want K of shape {tuple(learnable.K_0.shape)}, got {tuple(K.shape)} for the same "
+        "batch of cameras: intrinsics are tied in one of the two modules and not in the other; build this one with "
+        "tied_intrinsics as the saved one was, or from cameras that start alike where those of the saved one did"
+    )

@@ -9,13 +9,17 @@ from diffproj.calibration.losses import Loss
 
 
 class PlaneLoss(nn.Module):
-    """Squared or robust distance between points in world units, over those that are valid.
+    """Mean squared or robust distance between points, in world units, to which invalid points add nothing.
 
-    The sum is divided by the number of all points, valid or not: then a point that becomes invalid takes nothing from
-    the others and changes no gradient of theirs.
+    The sum over the valid points is divided by the number of all points, valid or not. So when a point becomes invalid,
+    its own term goes, and neither the terms nor the gradients of the others change.
 
     Args:
-        loss: a robust loss, its scale in world units (in pixels with `resolution`); squared distances if left out.
+        loss: a robust loss such as `dp.Huber(5.0)`, its scale in world units (in pixels with `resolution`); squared
+            distances if left out.
+
+    Raises:
+        TypeError: `loss` is not a robust loss (`diffproj.calibration.losses.Loss`).
 
     Example:
         >>> points = torch.tensor([[3.0, 4.0, 0.0], [9.0, 9.0, 9.0]])
@@ -37,15 +41,20 @@ class PlaneLoss(nn.Module):
         weights: Float[Tensor, "*#batch n"] | None = None,
         resolution: Float[Tensor, "*#batch n"] | None = None,
     ) -> Float[Tensor, ""]:
-        """The loss, a number.
+        """The loss, a tensor without axes, in squared world units (in squared pixels with `resolution`).
 
         Args:
             points: `(*B, N, 3)`, in world units.
-            target: where they should be.
-            valid: which count; all if left out.
-            weights: of the points.
-            resolution: world units a pixel at each point (`ground_resolution`): distances are divided by it, so that
-                far points, which a pixel moves further, count as much as near ones.
+            target: where they should be; it broadcasts to `points`.
+            valid: which points count `(*B, N)`; all if left out. Points that do not count may be NaN or infinite.
+            weights: a factor for each point `(*B, N)`; 1 if left out.
+            resolution: world units per pixel at each point `(*B, N)`, as `ground_resolution` gives it: distances are
+                divided by it, so that far points, which one pixel moves further, count as much as near ones. No
+                gradient flows through it.
+
+        Raises:
+            TypeError: points or target that are no floating-point tensors.
+            ValueError: points or target without three coordinates.
         """
         points, target = check_tensor("points", points, "N", 3), check_tensor("target", target, "N", 3)
         counts = torch.ones_like(points[..., 0], dtype=torch.bool) if valid is None else valid

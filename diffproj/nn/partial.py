@@ -1,40 +1,56 @@
-"""Modules of geometry whose parameters are learned for all, some or none of a batch."""
+"""What the learnable modules share: their precision, and parameters learned for all, some or none of a batch."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 PARTS = ("focal", "principal_point", "distortion", "pose")
-"""What may be learned."""
+"""The parts of a camera that can be learned."""
 
 
 Learn = Sequence[str] | Mapping[str, Any]
-"""Parts to learn, or for each part the cameras whose it is, as booleans that broadcast to the batch shape."""
+"""Names of the parts to learn; or a mapping from each name to the elements of the batch for which the part is learned:
+True, False, or booleans that broadcast to the batch shape."""
 
 
 class GeometryModule(nn.Module):
-    """A module of geometry: `network.half()` and `.bfloat16()` pass it by, moves and other dtypes do not.
+    """Base of modules that hold geometry, which half precision would spoil.
+
+    `network.half()` and `network.bfloat16()` move the rest of a network and leave the tensors of these modules in the
+    precision that they have; `.to(device)`, `.float()` and `.double()` work as for any module.
 
     Attributes:
-        partly: names of the parameters that are not learned everywhere; see `own`.
+        lowest_precision: a conversion to a dtype with fewer bits than this one changes nothing but the device.
+        masked: names of the parameters that are learned for a part of the batch only; see `add_parameter`.
     """
+
+    lowest_precision: ClassVar[torch.dtype] = torch.float32
 
     def __init__(self) -> None:
         super().__init__()
-        self.partly: set[str] = set()
+        self.masked: set[str] = set()
 
     def _apply(self, fn, recurse: bool = True):  # type: ignore[override]
-        def lifting(tensor: Tensor) -> Tensor:
-            moved = fn(tensor)
-            return tensor.to(moved.device) if moved.dtype in (torch.float16, torch.bfloat16) else moved
+        least = torch.finfo(self.lowest_precision).bits
 
-        return super()._apply(lifting, recurse)
+        def convert(tensor: Tensor) -> Tensor:
+            moved = fn(tensor)
+            if moved.is_floating_point() and torch.finfo(moved.dtype).bits < least:
+                return tensor.to(moved.device)
+            return moved
+
+        with torch.inference_mode(False):  # a module that is moved in inference mode can still be trained afterwards
+            return super()._apply(convert, recurse)
 
 
 def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
-    """From part to whether, or for which cameras, it is learned; parts that are learned nowhere are left out.
+    """From each part that is learned to True, or to the booleans that say for which elements of the batch.
+
+    Args:
+        learn: what the user asked for.
+        available: the parts that there are.
 
     Raises:
         ValueError: a part that is not available.
@@ -47,18 +63,21 @@ def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
     return {part: where for part, where in wanted.items() if bool(torch.as_tensor(where).any())}
 
 
-def own(module: GeometryModule, name: str, like: Tensor, where: Any, batch: torch.Size) -> None:
-    """Give a module zeros `(*B, k)` of a name: a parameter if it is learned, with a mask if not everywhere.
+def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, batch: torch.Size) -> None:
+    """Add zeros of shape `(*B, k)` to a module: a parameter if they are learned, otherwise a buffer.
+
+    A parameter that is learned for a part of the batch comes with a mask, the buffer `NAME_learned`.
 
     Args:
-        module: whose they are.
-        name: of the parameter or buffer; that of the mask is `NAME_learned`.
-        like: of the shape, dtype and device that it has; an axis of the batch along which it is one has length 1.
-        where: whether it is learned, or for which of the batch.
-        batch: the batch shape.
+        module: the module.
+        name: of the parameter or buffer.
+        like: a tensor with the shape, dtype and device to use. An axis of the batch along which all elements share one
+            value has length 1.
+        where: True or False, or booleans that broadcast to the batch shape: the elements for which it is learned.
+        batch: the batch shape `*B`.
 
     Raises:
-        ValueError: `where` does not broadcast to the batch, or differs along an axis along which this is one.
+        ValueError: `where` does not broadcast to the batch shape, or differs along an axis with one shared value.
     """
     zero = torch.zeros_like(like, memory_format=torch.contiguous_format)
     mask = torch.as_tensor(where, device=like.device)
@@ -78,13 +97,16 @@ def own(module: GeometryModule, name: str, like: Tensor, where: Any, batch: torc
         if length < mask.shape[axis]:
             first = mask.narrow(axis, 0, 1)
             if not bool((mask == first).all()):
-                raise ValueError(f"learn: want the same for all poses of one camera, got {mask.tolist()} for {name}")
+                raise ValueError(
+                    f"learn: want the same for all poses of one camera, got {mask.tolist()} for {name}, which they "
+                    "share because they start with the same intrinsics; tied_intrinsics=False gives each its own"
+                )
             mask = first
-    module.partly.add(name)
+    module.masked.add(name)
     module.register_buffer(f"{name}_learned", mask.unsqueeze(-1).to(like.dtype))
 
 
 def learned(module: GeometryModule, name: str) -> Tensor:
-    """What `own` made, zero where it is not learned."""
+    """The value of what `add_parameter` added, zero for the elements of the batch for which it is not learned."""
     value: Tensor = getattr(module, name)
-    return value * getattr(module, f"{name}_learned") if name in module.partly else value
+    return value * getattr(module, f"{name}_learned") if name in module.masked else value

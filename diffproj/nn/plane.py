@@ -3,26 +3,28 @@
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from diffproj.geometry.plane import Plane
-from diffproj.nn.partial import GeometryModule, learned, own
+from diffproj.nn.partial import GeometryModule, add_parameter, learned
 
 
 class LearnablePlane(GeometryModule):
-    """A plane, or a batch of them, as a module: calling it gives a `Plane` that carries gradients.
+    """A plane, or a batch of planes, as a module: calling it gives a `Plane` that carries gradients.
 
-    The normal turns on the sphere, `n = |n_0| unit(n_0 / |n_0| + T tilt)` with T two directions of the plane, and the
-    plane moves along it, `d = |n_0| (d_0 / |n_0| + scale shift)`. Both parameters are zero at first.
+    With the starting plane `n_0 . X = d_0`, the normal tilts, `n = |n_0| unit(n_0 / |n_0| + T tilt)`, where the columns
+    of T are two unit vectors of the starting plane (`Plane.tangents`), and the plane moves along its normal,
+    `d = |n_0| (d_0 / |n_0| + scale shift)`. The parameters `tilt (*B, 2)` and `shift (*B, 1)` start at zero and have no
+    unit; a small tilt is an angle in radians.
 
     Args:
-        plane: the start.
-        scale: the distance in world units by which a shift of 1 moves the plane; as far as it is from the camera makes
-            steps of tilt and shift alike.
-        learn: whether it is learned, or which planes of the batch are: booleans that broadcast to its shape.
+        plane: the starting plane, of batch shape `*B`. Its tensors are copied; its dtype and device are the module's.
+        scale: the distance in world units by which a shift of 1 moves the plane. With the distance between camera and
+            plane here, equal steps of tilt and shift move the points about equally far.
+        learn: True, False, or booleans that broadcast to the batch shape: the planes that are learned.
 
     Raises:
-        ValueError: a plane for each point, or booleans that do not fit.
+        ValueError: one plane for each point (`Plane.per_point`), or booleans that do not broadcast.
 
     Example:
         >>> learnable = LearnablePlane(Plane(torch.tensor([0.0, 0.0, 2.0]), torch.tensor(8.0)))
@@ -40,24 +42,30 @@ class LearnablePlane(GeometryModule):
 
     def __init__(self, plane: Plane, scale: float = 1.0, learn: Any = True) -> None:
         super().__init__()
-        if plane.is_per_point:
-            raise ValueError("plane: want one plane for all points, got one for each (Plane.per_point)")
-        normal, offset = plane.normal.detach(), plane.offset.detach()
-        length = normal.norm(dim=-1)
-        self.register_buffer("scale", torch.as_tensor(scale).to(normal))
+        check_one_plane(plane)
+        plane = plane.detach()
+        length = plane.normal.norm(dim=-1)
+        self.register_buffer("scale", torch.as_tensor(scale).to(length))
         self.register_buffer("length_0", length)
-        self.register_buffer("unit_0", normal / length.unsqueeze(-1))
-        self.register_buffer("distance_0", offset / length)
-        smallest = nn.functional.one_hot(normal.abs().argmin(-1), 3).to(normal)
-        first = nn.functional.normalize(torch.linalg.cross(normal, smallest), dim=-1)
-        second = nn.functional.normalize(torch.linalg.cross(normal, first), dim=-1)
-        self.register_buffer("tangents", torch.stack([first, second], dim=-1))
-        own(self, "tilt", self.tangents[..., 0, :], learn, plane.batch_shape)
-        own(self, "shift", offset.unsqueeze(-1), learn, plane.batch_shape)
+        self.register_buffer("unit_0", plane.normal / length.unsqueeze(-1))
+        self.register_buffer("distance_0", plane.offset / length)
+        self.register_buffer("tangents", plane.tangents())
+        add_parameter(self, "tilt", self.tangents[..., 0, :], learn, plane.batch_shape)
+        add_parameter(self, "shift", self.distance_0.unsqueeze(-1), learn, plane.batch_shape)
 
     def forward(self) -> Plane:
-        """The plane as it is now."""
-        turned = self.unit_0 + (self.tangents * learned(self, "tilt").unsqueeze(-2)).sum(-1)
-        normal = turned * (self.length_0 / torch.linalg.vector_norm(turned, dim=-1)).unsqueeze(-1)
+        """The plane with the current values of the parameters, of the batch shape of the starting plane."""
+        tilted = self.unit_0 + (self.tangents * learned(self, "tilt").unsqueeze(-2)).sum(-1)
+        normal = tilted * (self.length_0 / torch.linalg.vector_norm(tilted, dim=-1)).unsqueeze(-1)
         distance = self.distance_0 + self.scale * learned(self, "shift").squeeze(-1)
         return Plane.unchecked(normal, self.length_0 * distance)
+
+
+def check_one_plane(plane: Plane) -> None:
+    """Check that a plane does not stand for one plane for each point.
+
+    Raises:
+        ValueError: it does.
+    """
+    if plane.is_per_point:
+        raise ValueError("plane: want one plane for all points, got one for each (Plane.per_point)")

@@ -1,92 +1,80 @@
 """`PlaneProjector`: pixels to points on a plane, as a layer."""
 
-from typing import Any
-
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
-from torch import Tensor
+from torch import Tensor, nn
 
-from diffproj._core.numerics import has_values
 from diffproj.geometry.back_projection import PlaneMap
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
-from diffproj.lens.coefficients import CoefficientLens
-from diffproj.nn.camera import LearnableCamera
-from diffproj.nn.partial import PARTS, GeometryModule, Learn, learned_parts
-from diffproj.nn.plane import LearnablePlane
-
-_FROZEN = ("_matrix", "_frozen_K", "_frozen_R", "_frozen_t", "_frozen_coefficients")
-"""What a frozen projector has ready."""
+from diffproj.nn.camera import tied_axes
+from diffproj.nn.fixed_map import FixedMap
+from diffproj.nn.learnable_map import LearnableMap
+from diffproj.nn.partial import PARTS, Learn, learned_parts
 
 
-class PlaneProjector(GeometryModule):
+class PlaneProjector(nn.Module):
     """Pixels to points on a plane, as a layer.
+
+    With nothing to learn the map is built once, in construction, and a forward pass costs what applying it costs. With
+    something to learn it is built anew in each forward pass, so that gradients reach the parameters.
 
     Args:
         camera: at its pose, of batch shape `*B`, or Kornia's `PinholeCamera`.
         plane: the plane, of batch shape `*B`.
-        learn: what is learned along: any of `"focal"`, `"principal_point"`, `"distortion"`, `"pose"` and `"plane"`;
-            nothing if left out, and then the map is built once. A mapping says it for each camera, or plane, of a
-            batch, as for `LearnableCamera`: `{"focal": True, "pose": torch.tensor([True, False])}`.
-        tied_intrinsics: whether the cameras of a batch learn one K and one lens, as for `LearnableCamera`: if left out,
-            where all start with the same.
+        learn: the parts to learn: any of `"focal"`, `"principal_point"`, `"distortion"`, `"pose"` and `"plane"`;
+            nothing if left out. A mapping also says for which cameras or planes of a batch, as for `LearnableCamera`:
+            `{"focal": True, "pose": torch.tensor([True, False])}`.
+        tied_intrinsics: whether the cameras of a batch share one K and one lens, as for `LearnableCamera`: if left out,
+            they do where all start with the same values.
+
+    Attributes:
+        learn: the parts that are learned; empty for a fixed map.
+        geometry: the module behind it: a `FixedMap`, or a `LearnableMap`, whose modules `camera` and `plane` hold the
+            parameters, for example for learning rates of their own.
 
     Raises:
-        TypeError: no camera or no plane, or different dtypes.
-        ValueError: an unknown part to learn, or batch shapes that do not broadcast.
+        TypeError: no camera or no plane, different dtypes, or a camera whose lens is of another package.
+        ValueError: an unknown part to learn, one plane for each point, batch shapes that do not broadcast, or what
+            `LearnableCamera` refuses.
 
     Example:
         >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
-        >>> projector = PlaneProjector(Camera(K, t=torch.tensor([0.0, 0, 1000])), Plane.z(0.0), learn=("focal", "pose"))
+        >>> projector = PlaneProjector(Camera(K, t=torch.tensor([0.0, 0, 1000])), Plane.z(0.0), learn="focal")
         >>> points, valid = projector(torch.tensor([[370.0, 240.0]]))
         >>> points.tolist(), [name for name, _ in projector.named_parameters()]
-        ([[100.0, 0.0, 0.0]], ['_camera.log_focal', '_camera.rotation', '_camera.translation'])
+        ([[100.0, 0.0, 0.0]], ['geometry.camera.log_focal'])
     """
 
-    _frozen_coefficients: Tensor
+    geometry: FixedMap | LearnableMap
 
     def __init__(
         self, camera: Camera | PinholeCamera, plane: Plane, learn: Learn = (), tied_intrinsics: bool | None = None
     ) -> None:
         super().__init__()
         camera = as_camera(camera).detach()
-        PlaneMap(camera, plane)  # checks that they fit together
-        plane = plane.like(camera.K)
         chosen = learned_parts(learn, (*PARTS, "plane"))
         self.learn = tuple(chosen)
-        whole = chosen.pop("plane", False)
-        self._camera = LearnableCamera(camera, chosen, tied_intrinsics)
-        away = ((plane.normal * camera.center).sum(-1) - plane.offset).abs() / plane.normal.norm(dim=-1)
-        self._plane = LearnablePlane(plane, float(away.mean()) or 1.0, whole)
-        # Buffers, so that whatever swaps or writes a module's state (DDP, functional_call) does so here, too.
-        for name in _FROZEN:
-            self.register_buffer(name, None, persistent=False)
-        self._lens: CoefficientLens | None = None
-        self._rebuild()
-        self.register_load_state_dict_post_hook(_rebuild)
+        if chosen:
+            self.geometry = LearnableMap(camera, plane, chosen, tied_intrinsics)
+        else:
+            tied_axes(camera, tied_intrinsics)  # refuses different cameras that are said to be one
+            self.geometry = FixedMap(camera, plane)
 
     @property
     def camera(self) -> Camera:
-        """The camera as it is now, with gradients to what is learned."""
-        return self._camera()
+        """The camera as it is now, with gradients to what is learned; with a fixed map it shares the buffers."""
+        return self.geometry.camera()
 
     @property
     def plane(self) -> Plane:
-        """The plane as it is now, with gradients if it is learned."""
-        return self._plane()
+        """The plane as it is now, with gradients if it is learned; with a fixed map it shares the buffers."""
+        return self.geometry.plane()
 
     def map(self) -> PlaneMap:
-        """The map as it is now; a frozen projector has it ready."""
-        if self.learn:
-            return PlaneMap(self._camera(), self._plane())
-        lens = self._lens
-        if lens is not None and (torch.compiler.is_compiling() or lens.coefficients is not self._frozen_coefficients):
-            lens = type(lens).unchecked(self._frozen_coefficients)
-            if has_values(self._frozen_coefficients):  # kept, for it remembers what it works out about itself
-                self._lens = lens
-        camera = Camera.unchecked(self._frozen_K, self._frozen_R, self._frozen_t, lens, self._camera.size)
-        return PlaneMap.unchecked(self._matrix, camera, False)
+        """The map as it is now: built here where something is learned; otherwise ready, and it shares the buffers."""
+        return self.geometry()
 
     def forward(
         self,
@@ -103,39 +91,18 @@ class PlaneProjector(GeometryModule):
             plane: of these samples, in place of the projector's own.
 
         Returns:
-            Points `(*B, N, 3)` and `valid (*B, N)`; see `back_project`.
+            Points `(*B, N, 3)` in world units and `valid (*B, N)`; see `back_project`.
 
         Raises:
             TypeError: no floating-point tensors, or others than the camera's dtype.
             ValueError: shapes or devices that do not fit, or a warp that `Camera.warped` refuses.
         """
-        with torch.autocast(self._camera.t_0.device.type, enabled=False):
+        with torch.autocast(self.geometry.device.type, enabled=False):
             if warp is None and plane is None:
-                return self.map()(pixels)
+                return self.geometry()(pixels)
             camera = self.camera if warp is None else self.camera.warped(warp)
             return PlaneMap(camera, self.plane if plane is None else plane)(pixels)
-
-    def _apply(self, fn, recurse: bool = True):  # type: ignore[override]
-        super()._apply(fn, recurse)
-        self._rebuild()  # in the new precision, not rounded from the old one
-        return self
-
-    def _rebuild(self) -> None:
-        if self.learn:
-            return
-        with torch.inference_mode(False), torch.no_grad():
-            camera = self._camera()
-            self._matrix = PlaneMap(camera, self._plane()).matrix
-            self._frozen_K, self._frozen_R, self._frozen_t = camera.K.clone(), camera.R.clone(), camera.t.clone()
-            if isinstance(camera.distortion, CoefficientLens):
-                self._frozen_coefficients = camera.distortion.coefficients.clone()
-                self._lens = type(camera.distortion).unchecked(self._frozen_coefficients)
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""
         return f"learn={self.learn}"
-
-
-def _rebuild(projector: PlaneProjector, _: Any) -> None:
-    """Called behind `load_state_dict`, of the projector itself or of a network that it is part of."""
-    projector._rebuild()

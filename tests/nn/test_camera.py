@@ -174,6 +174,53 @@ def test_training_in_float32_keeps_one_camera(rough: tuple[dp.Camera, dp.Views, 
     assert not torch.equal(now.K[0], camera.K[0].float())
 
 
+def test_tied_stays_tied_through_copies_and_conversions(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
+    learnable = dp.LearnableCamera(rough[2].cameras)
+    with torch.no_grad():
+        for parameter in learnable.parameters():
+            parameter += 0.01 * torch.rand_like(parameter)
+    single = copy.deepcopy(learnable).to(torch.float32)
+    again = dp.LearnableCamera(single())  # from a camera that training gave
+    back = copy.deepcopy(single).to(D)
+    for module in (single, again, back, pickle.loads(pickle.dumps(learnable))):  # noqa: S301
+        assert module.log_focal.shape == (1, 2)
+        assert (module().K[:1] == module().K).all()
+        assert (module().distortion.coefficients == module().distortion.coefficients[:1]).all()
+    again.load_state_dict(learnable.state_dict())
+    assert again().K.dtype == torch.float32
+
+
+@pytest.mark.parametrize("part", ["learnable", "projector"])
+def test_a_state_with_other_tying_is_refused_with_the_cause(
+    part: str, rough: tuple[dp.Camera, dp.Views, dp.Calibration]
+) -> None:
+    def module(tied: bool | None) -> torch.nn.Module:
+        if part == "learnable":
+            return dp.LearnableCamera(rough[2].cameras, tied_intrinsics=tied)
+        return torch.nn.ModuleDict({"p": dp.PlaneProjector(rough[2].cameras, dp.Plane.z(0.0), "pose", tied)})
+
+    name = "K_0" if part == "learnable" else "p.geometry.camera.K_0"
+    for mine, theirs in ((None, False), (False, None)):
+        with pytest.raises(RuntimeError, match=f"{name}: want K of shape .* for the same batch.*tied_intrinsics"):
+            module(mine).load_state_dict(module(theirs).state_dict())
+    with pytest.raises(RuntimeError) as other:  # another number of cameras is another matter
+        dp.LearnableCamera(rough[2].cameras[:3]).load_state_dict(dp.LearnableCamera(rough[2].cameras).state_dict())
+    assert "tied" not in str(other.value)
+
+
+def test_cameras_that_start_alike_may_still_be_different_ones(camera: dp.Camera) -> None:
+    two, which = camera.expand(2), {"focal": torch.tensor([True, False])}
+    for module in (dp.LearnableCamera, lambda *a: dp.PlaneProjector(a[0], dp.Plane.z(0.0), *a[1:])):
+        with pytest.raises(ValueError, match="learn: want the same for all poses.*tied_intrinsics=False"):
+            module(two, which)
+        parameters = list(module(two, which, False).parameters())
+        assert [tuple(p.shape) for p in parameters] == [(2, 2)]
+
+
+def test_a_batch_of_no_cameras(camera: dp.Camera) -> None:
+    assert dp.LearnableCamera(camera.expand(2)[:0])().K.shape == (0, 3, 3)
+
+
 def test_starts_as_the_camera_it_was_made_from(rough: tuple[dp.Camera, dp.Views, dp.Calibration]) -> None:
     camera, _, best = rough
     for given in (camera, best.cameras, best.camera, dp.Camera(camera.K[0])):

@@ -46,21 +46,6 @@ def test_gradients_are_finite_differences(lens_camera: dp.Camera, pixels: torch.
     assert torch.autograd.gradcheck(total, inputs, fast_mode=True)
 
 
-def test_the_plane_turns_and_moves(plane: dp.Plane) -> None:
-    learnable = dp.LearnablePlane(plane, scale=10.0)
-    now = learnable()
-    torch.testing.assert_close(now.normal, plane.normal)
-    torch.testing.assert_close(now.offset, plane.offset)
-    with torch.no_grad():
-        learnable.tilt.copy_(torch.tensor([0.3, -0.2]))
-        learnable.shift.fill_(0.5)
-    moved = learnable()
-    torch.testing.assert_close(moved.normal.norm(), plane.normal.norm())
-    cosine = (moved.normal * plane.normal).sum() / plane.normal.square().sum()
-    torch.testing.assert_close(cosine.acos().tan(), torch.tensor(0.13**0.5, dtype=D))
-    torch.testing.assert_close((moved.offset - plane.offset) / plane.normal.norm(), torch.tensor(5.0, dtype=D))
-
-
 @pytest.mark.parametrize("learn", [(), ("focal", "plane")])
 def test_saved_moved_and_copied(
     learn: tuple[str, ...], lens_camera: dp.Camera, pixels: torch.Tensor, plane: dp.Plane, tmp_path: Path
@@ -95,50 +80,6 @@ def test_samples_bring_planes_of_their_own(learn: tuple[str, ...], camera: dp.Ca
     assert torch.equal(valid, seen)
 
 
-def test_a_network_loads_its_frozen_projector(lens_camera: dp.Camera, pixels: torch.Tensor, plane: dp.Plane) -> None:
-    network, other = (
-        torch.nn.ModuleDict({"to_plane": dp.PlaneProjector(camera, plane)})
-        for camera in (lens_camera, lens_camera.at(lens_camera.R, lens_camera.t + 50))
-    )
-    other.load_state_dict(network.state_dict())
-    assert torch.equal(other["to_plane"](pixels)[0], network["to_plane"](pixels)[0])
-
-
-@pytest.mark.parametrize("behind_lens", [False, True])
-def test_a_frozen_projector_is_what_its_buffers_are(
-    behind_lens: bool, camera: dp.Camera, lens_camera: dp.Camera, pixels: torch.Tensor, plane: dp.Plane
-) -> None:
-    near = lens_camera if behind_lens else camera
-    far = near.at(near.R, near.t + 50)
-    projectors = [dp.PlaneProjector(camera, plane) for camera in (near, far)]
-    wants = [projector(pixels)[0] for projector in projectors]
-    assert not torch.equal(*wants)
-    swapped, _ = torch.func.functional_call(projectors[0], dict(projectors[1].named_buffers()), (pixels,))
-    assert torch.equal(swapped, wants[1])
-    assert torch.equal(projectors[0](pixels)[0], wants[0])
-    state = torch.func.stack_module_state(projectors)
-    base = copy.deepcopy(projectors[0])
-    together = torch.func.vmap(lambda *state: torch.func.functional_call(base, state, (pixels,))[0])(*state)
-    for points, want in zip(together, wants, strict=True):
-        torch.testing.assert_close(points, want, rtol=1e-10, atol=1e-10)
-    with torch.no_grad():  # as DistributedDataParallel does from the first process
-        for mine, theirs in zip(projectors[0].buffers(), projectors[1].buffers(), strict=True):
-            mine.copy_(theirs)
-    assert torch.equal(projectors[0](pixels)[0], wants[1])
-
-
-def test_planes_of_a_batch_learn_one_by_one(camera: dp.Camera, pixels: torch.Tensor) -> None:
-    planes = dp.Plane.z(torch.tensor([0.0, 30, 60], dtype=D))
-    projector = dp.PlaneProjector(camera, planes, {"plane": torch.tensor([False, True, False])})
-    points, _ = projector(pixels)
-    points.square().sum().backward()
-    with torch.no_grad():
-        for parameter in projector.parameters():
-            parameter -= 1e-9 * parameter.grad
-    moved = (projector(pixels)[0] != points).flatten(1).any(-1)
-    assert moved.tolist() == [False, True, False]
-
-
 def test_geometry_keeps_its_precision_under_autocast(lens_camera: dp.Camera, pixels: torch.Tensor) -> None:
     camera = lens_camera.to(torch.float32)
     for learn in ((), EVERY):
@@ -162,76 +103,6 @@ def test_vmap_over_cameras(camera: dp.Camera, pixels: torch.Tensor) -> None:
     together = torch.func.vmap(project)(several)
     for i in range(4):
         torch.testing.assert_close(together[i], project(several[i]), rtol=1e-10, atol=1e-10)
-
-
-def test_loss_counts_what_is_valid() -> None:
-    points, target = torch.randn(3, 8, 3, dtype=D), torch.randn(3, 8, 3, dtype=D)
-    valid, weights = torch.rand(3, 8) > 0.3, torch.rand(3, 8, dtype=D)
-    resolution = 0.5 + torch.rand(3, 8, dtype=D)
-    squared = (points - target).square().sum(-1)
-    got = dp.PlaneLoss()(points, target, valid, weights, resolution)
-    torch.testing.assert_close(got, (valid * weights * squared / resolution**2).sum() / 24)
-    robust = dp.PlaneLoss(dp.Huber(1.0))(points, target, valid)
-    torch.testing.assert_close(robust, (valid * dp.Huber(1.0).value(squared)).sum() / 24)
-    poisoned = torch.where(valid.unsqueeze(-1), points, torch.nan).requires_grad_()
-    value = dp.PlaneLoss(dp.Cauchy(1.0))(poisoned, target, valid, resolution=torch.where(valid, resolution, 0.0))
-    gradient = torch.autograd.grad(value, poisoned)[0]
-    assert gradient.isfinite().all()
-    assert (gradient[~valid] == 0).all()
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, D])
-@pytest.mark.parametrize("behind_lens", [False, True])
-def test_invalid_pixels_change_no_gradient_of_the_others(
-    behind_lens: bool, dtype: torch.dtype, camera: dp.Camera, lens_camera: dp.Camera, pixels: torch.Tensor
-) -> None:
-    projector = dp.PlaneProjector((lens_camera if behind_lens else camera).to(dtype), dp.Plane.z(0.0), "pose")
-    pixels = pixels.to(dtype)
-    target = torch.zeros(len(pixels), 3, dtype=dtype)
-    broken = torch.rand(len(pixels)) < 0.3
-    wrong = pixels.clone()
-    wrong[broken] = torch.tensor([torch.inf, 1e9], dtype=dtype)
-
-    def gradient(pixels: torch.Tensor) -> torch.Tensor:
-        pixels = pixels.clone().requires_grad_()
-        points, valid = projector(pixels)
-        return torch.autograd.grad(dp.PlaneLoss(dp.Huber(10.0))(points, target, valid), pixels)[0]
-
-    assert torch.equal(gradient(pixels)[~broken], gradient(wrong)[~broken])
-    assert (gradient(pixels)[broken] != 0).all()
-    assert (gradient(wrong)[broken] == 0).all()
-
-
-def test_ground_resolution_is_a_finite_difference(lens_camera: dp.Camera, pixels: torch.Tensor) -> None:
-    plane = dp.Plane.z(0.0)
-    got, valid = dp.ground_resolution(pixels, lens_camera, plane)
-    angle = torch.linspace(0, torch.pi, 361, dtype=D)
-    around = 1e-4 * torch.stack([angle.cos(), angle.sin()], dim=-1)
-    for i in range(0, 200, 40):
-        ahead, behind = (dp.back_project(pixels[i] + s * around, lens_camera, plane)[0] for s in (1, -1))
-        torch.testing.assert_close(got[i], (ahead - behind).norm(dim=-1).amax() / 2e-4, rtol=1e-4, atol=0)
-    assert valid.all()
-
-
-def test_prior_is_the_calibrations_own_cost() -> None:
-    calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-    prior = dp.CalibrationPrior(calibration, view=2)
-    start = calibration.cameras[2]
-    assert float(prior(start)) == 0
-    projector = dp.PlaneProjector(start, dp.Plane.z(0.0), EVERY[:4])
-    C = calibration.covariance.view(2)
-    off = torch.linalg.cholesky(C) @ torch.randn(len(C), dtype=D) * 0.1
-    K = start.K + torch.tensor([[off[0], 0, off[2]], [0, off[1], off[3]], [0, 0, 0]], dtype=D)
-    from kornia.geometry.conversions import axis_angle_to_rotation_matrix
-
-    R = axis_angle_to_rotation_matrix(off[None, 9:12])[0] @ start.R
-    lens = dp.BrownConrady(start.distortion.coefficients + off[4:9])
-    want = 0.5 * off @ torch.linalg.solve(C, off)
-    got = prior(dp.Camera(K, R, start.t + off[12:], lens))
-    torch.testing.assert_close(got, want, rtol=1e-5, atol=0)
-    gradients = torch.autograd.grad(prior(projector.camera), list(projector.parameters()), allow_unused=True)
-    assert all(g is not None and g.abs().max() < 1e-6 for g in gradients)
-    assert float(dp.CalibrationPrior(calibration)(calibration.camera)) == 0
 
 
 def test_joint_training_finds_the_camera() -> None:

@@ -1,0 +1,55 @@
+"""`LearnableMap`: the map of a camera and a plane of which something is learned."""
+
+from typing import Any
+
+import torch
+from torch import nn
+
+from diffproj.geometry.back_projection import PlaneMap
+from diffproj.geometry.camera import Camera
+from diffproj.geometry.plane import Plane
+from diffproj.nn.camera import LearnableCamera
+from diffproj.nn.plane import LearnablePlane
+
+
+class LearnableMap(nn.Module):
+    """A `LearnableCamera` and a `LearnablePlane`; calling it builds their `PlaneMap`, which carries gradients.
+
+    Args:
+        camera: the starting camera, of batch shape `*B`.
+        plane: the starting plane, of batch shape `*B`.
+        learn: from each part that is learned, the plane among them as `"plane"`, to True or to the elements of the
+            batch for which it is; see `LearnableCamera`.
+        tied_intrinsics: as for `LearnableCamera`.
+
+    Raises:
+        TypeError: not a plane, different dtypes, or what `LearnableCamera` refuses.
+        ValueError: batch shapes that do not broadcast, or what `LearnableCamera` and `LearnablePlane` refuse.
+
+    Example:
+        >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+        >>> learnable = LearnableMap(Camera(K, t=torch.tensor([0.0, 0, 1000])), Plane.z(0.0), {"plane": True})
+        >>> points, valid = learnable()(torch.tensor([[370.0, 240.0]]))
+        >>> points.tolist(), [name for name, _ in learnable.named_parameters()]
+        ([[100.0, 0.0, 0.0]], ['plane.tilt', 'plane.shift'])
+    """
+
+    def __init__(
+        self, camera: Camera, plane: Plane, learn: dict[str, Any], tied_intrinsics: bool | None = None
+    ) -> None:
+        super().__init__()
+        PlaneMap(camera, plane)  # checks that they fit together
+        plane = plane.like(camera.K)
+        distance = ((plane.normal * camera.center).sum(-1) - plane.offset).abs() / plane.normal.norm(dim=-1)
+        of_camera = {part: where for part, where in learn.items() if part != "plane"}
+        self.camera = LearnableCamera(camera, of_camera, tied_intrinsics)
+        self.plane = LearnablePlane(plane, float(distance.mean()) or 1.0, learn.get("plane", False))
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        return self.camera.t_0.device
+
+    def forward(self) -> PlaneMap:
+        """The map with the current values of the parameters."""
+        return PlaneMap(self.camera(), self.plane())

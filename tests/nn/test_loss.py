@@ -1,0 +1,57 @@
+"""`PlaneLoss`: its value, its gradients, and the ground resolution that it may divide by."""
+
+import pytest
+import torch
+
+import diffproj as dp
+
+D = torch.float64
+
+
+def test_loss_counts_what_is_valid() -> None:
+    points, target = torch.randn(3, 8, 3, dtype=D), torch.randn(3, 8, 3, dtype=D)
+    valid, weights = torch.rand(3, 8) > 0.3, torch.rand(3, 8, dtype=D)
+    resolution = 0.5 + torch.rand(3, 8, dtype=D)
+    squared = (points - target).square().sum(-1)
+    got = dp.PlaneLoss()(points, target, valid, weights, resolution)
+    torch.testing.assert_close(got, (valid * weights * squared / resolution**2).sum() / 24)
+    robust = dp.PlaneLoss(dp.Huber(1.0))(points, target, valid)
+    torch.testing.assert_close(robust, (valid * dp.Huber(1.0).value(squared)).sum() / 24)
+    poisoned = torch.where(valid.unsqueeze(-1), points, torch.nan).requires_grad_()
+    value = dp.PlaneLoss(dp.Cauchy(1.0))(poisoned, target, valid, resolution=torch.where(valid, resolution, 0.0))
+    gradient = torch.autograd.grad(value, poisoned)[0]
+    assert gradient.isfinite().all()
+    assert (gradient[~valid] == 0).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, D])
+@pytest.mark.parametrize("behind_lens", [False, True])
+def test_invalid_pixels_change_no_gradient_of_the_others(
+    behind_lens: bool, dtype: torch.dtype, camera: dp.Camera, lens_camera: dp.Camera, pixels: torch.Tensor
+) -> None:
+    projector = dp.PlaneProjector((lens_camera if behind_lens else camera).to(dtype), dp.Plane.z(0.0), "pose")
+    pixels = pixels.to(dtype)
+    target = torch.zeros(len(pixels), 3, dtype=dtype)
+    broken = torch.rand(len(pixels)) < 0.3
+    wrong = pixels.clone()
+    wrong[broken] = torch.tensor([torch.inf, 1e9], dtype=dtype)
+
+    def gradient(pixels: torch.Tensor) -> torch.Tensor:
+        pixels = pixels.clone().requires_grad_()
+        points, valid = projector(pixels)
+        return torch.autograd.grad(dp.PlaneLoss(dp.Huber(10.0))(points, target, valid), pixels)[0]
+
+    assert torch.equal(gradient(pixels)[~broken], gradient(wrong)[~broken])
+    assert (gradient(pixels)[broken] != 0).all()
+    assert (gradient(wrong)[broken] == 0).all()
+
+
+def test_ground_resolution_is_a_finite_difference(lens_camera: dp.Camera, pixels: torch.Tensor) -> None:
+    plane = dp.Plane.z(0.0)
+    got, valid = dp.ground_resolution(pixels, lens_camera, plane)
+    angle = torch.linspace(0, torch.pi, 361, dtype=D)
+    around = 1e-4 * torch.stack([angle.cos(), angle.sin()], dim=-1)
+    for i in range(0, 200, 40):
+        ahead, behind = (dp.back_project(pixels[i] + s * around, lens_camera, plane)[0] for s in (1, -1))
+        torch.testing.assert_close(got[i], (ahead - behind).norm(dim=-1).amax() / 2e-4, rtol=1e-4, atol=0)
+    assert valid.all()
