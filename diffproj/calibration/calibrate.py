@@ -13,6 +13,7 @@ from diffproj.calibration.data import Data
 from diffproj.calibration.options import CalibrationOptions, calibration_options
 from diffproj.calibration.outcome import minimised, outcome
 from diffproj.calibration.result import Calibration
+from diffproj.calibration.second_look import second_look
 from diffproj.lens.models import LensModel, model_named
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
@@ -51,7 +52,7 @@ def calibrate(
     data = Data(views, target, chosen.weights)
     if views.size is None:
         raise ValueError("views: want the photographs' size, got None; give Views(..., size=(width, height))")
-    shared, local = start.from_nothing(data, distortion, views.size, chosen.tied_focal, chosen.bow)
+    shared, local, straight = start.from_nothing(data, distortion, views.size, chosen.tied_focal, chosen.bow)
     # The start is a guess from the corners; what is held, or known, is not.
     reference = shared.clone()
     reference[:, :2], reference[:, 4:] = torch.nan, 0.0
@@ -66,4 +67,6 @@ def calibrate(
         near, _ = minimised(data, early, distortion, shared, local, reference)
         shared, local = near.solution.shared, near.solution.local
     found, _ = minimised(data, chosen, distortion, shared, local, reference)
+    limits = {"max_iterations": chosen.max_iterations, "tolerance": chosen.tolerance}
+    found = second_look(found, straight, reject=chosen.outlier_limit, **limits)
     return outcome("calibrate", data, found, views.size, chosen.throw)

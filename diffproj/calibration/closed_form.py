@@ -23,10 +23,10 @@ MAX_CORNERS = 24
 """Maximum number of corners per homography, spread evenly over the list of those used."""
 DIVISION_GRID, DIVISION_RANGE = (-0.3, -0.15, 0.0), (-0.45, 0.15)
 """Grid and limits of the division model's lambda: -0.3 moves the corner of the image inwards by 30 %."""
-SMALL_BATCH = 64
-"""Total number of views up to which run time is dominated by call overhead, not by the number of views."""
+FEW_VIEWS = 4
+"""Views of a camera up to which all of them take part in the estimate of lambda."""
 DIVISION_VIEWS = 4
-"""Views per camera from which lambda is estimated in larger batches: those that reach furthest out."""
+"""Views of a camera with more of them that lambda is estimated from: those that reach furthest out."""
 MAX_ANGLE = math.radians(75)
 """Fisheye: corners further from the axis than this are left out of homographies."""
 
@@ -63,7 +63,7 @@ def division(
     P, V = used.shape[:2]
     offset = torch.where(used.unsqueeze(-1), pixels - middle[:, None, None], 0.0)
     reach = offset.square().sum(-1).amax(-1)
-    every = P * V <= SMALL_BATCH
+    every = V <= FEW_VIEWS  # of one camera: what it gives must not depend on the others
     if not every:
         far = reach.topk(min(V, DIVISION_VIEWS), dim=1).indices
         chosen = torch.arange(P, device=far.device).unsqueeze(1), far
@@ -168,6 +168,37 @@ def poses(H: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     lowest = (R[..., 2, :2] @ points[:, :2].mT).amin(-1) + t[..., 2]
     near = 0.2 * (points - points.mean(0)).abs().amax()
     return R, t + torch.nn.functional.pad((near - lowest).clamp(min=0).unsqueeze(-1), (2, 0))
+
+
+def upright_poses(points: Tensor, xy: Tensor, used: Tensor) -> tuple[Tensor, Tensor]:
+    """Poses `(R, t)` of boards that face the camera, turned, scaled and placed as `xy (P, V, N, 2)` says.
+
+    The start of last resort: an affine map is determined by corners that determine no homography, and bears wrong ones
+    better. Of the map, the rotation within the image and the scale are kept.
+    """
+    count = used.sum(-1, keepdim=True).clamp(min=1).to(xy.dtype)
+    weight = used.unsqueeze(-1).to(xy.dtype)
+    board = points[:, :2] - points[:, :2].mean(0)
+    seen_board = (board * weight).sum(-2) / count
+    seen = torch.where(used.unsqueeze(-1), xy, 0.0)
+    middle = seen.sum(-2) / count
+    offset, place = (board - seen_board.unsqueeze(-2)) * weight, (seen - middle.unsqueeze(-2)) * weight
+    # The similarity that maps one to the other in the least-squares sense, as a complex number.
+    cosine = (offset * place).sum((-2, -1))
+    sine = (offset[..., 0] * place[..., 1] - offset[..., 1] * place[..., 0]).sum(-1)
+    flipped = (offset[..., 0] * place[..., 0] - offset[..., 1] * place[..., 1]).sum(-1)
+    flipped_sine = (offset[..., 0] * place[..., 1] + offset[..., 1] * place[..., 0]).sum(-1)
+    mirrored = torch.hypot(flipped, flipped_sine) > torch.hypot(cosine, sine)
+    cosine, sine = torch.where(mirrored, flipped, cosine), torch.where(mirrored, flipped_sine, sine)
+    size = offset.square().sum((-2, -1)).clamp(min=1e-300)
+    length = torch.hypot(cosine, sine).clamp(min=1e-300)
+    c, s = cosine / length, sine / length
+    handed = torch.where(mirrored, -1.0, 1.0).to(xy)
+    zero = torch.zeros_like(c)
+    R = torch.stack([c, -handed * s, zero, s, handed * c, zero, zero, zero, handed], dim=-1).unflatten(-1, (3, 3))
+    depth = (size / length).clamp(max=1e12)
+    centre = torch.nn.functional.pad(points[:, :2].mean(0) + seen_board, (0, 1)).unsqueeze(-1)
+    return R, torch.nn.functional.pad(middle, (0, 1), value=1.0) * depth.unsqueeze(-1) - (R @ centre).squeeze(-1)
 
 
 def other_pose(R: Tensor, t: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from diffproj._core.numerics import in_float64
-from diffproj.calibration.fit import Task
+from diffproj.calibration.task import Task
 from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views

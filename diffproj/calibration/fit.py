@@ -5,81 +5,22 @@ Everything here works on a batch of P cameras, with batch axes flattened. `Task`
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffproj.calibration import covariance as covariances
-from diffproj.calibration.board_error import BoardError
 from diffproj.calibration.covariance import Covariance, Scores
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.options import Progress
-from diffproj.calibration.parametrisation import POSE, Parametrisation
-from diffproj.calibration.reprojection import Reprojection
-from diffproj.calibration.result import Objective
-from diffproj.calibration.solver import Equations, Prior, Solution, select, solve
-from diffproj.lens.models import LensModel
+from diffproj.calibration.parametrisation import POSE
+from diffproj.calibration.solver import Equations, Solution, select
+from diffproj.calibration.task import Task
+from diffproj.calibration.two_poses import found_again, settled
 
-BLOCK_CORNERS = 24_000
-"""Corners per block on a CPU, about thirty cameras of 13 views: enough to hide call overhead, and few enough that a
-slowly converging camera delays few others."""
 MAX_REJECTION_ROUNDS = 10
 """Maximum number of rounds of outlier rejection."""
-NEGLIGIBLE_PX = 1e-11
-"""Size of residuals, in pixels, that is rounding error of pixel coordinates."""
-
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """A minimisation problem: P cameras of V views with N corners.
-
-    Attributes:
-        points: the board's points `(N, 3)`.
-        pixels: `(P, V, N, 2)`.
-        used: which corners count `(P, V, N)`.
-        lens, bow: the model.
-        objective: residuals on the image or on the board.
-        weights: of the corners `(P, V, N)`, or `None` for 1.
-        loss: a robust loss, or `None` for least squares.
-        prior: on the shared parameters.
-        basis: of the shared parameters' free directions `(P, s, q)`, or `None` for all.
-    """
-
-    points: Tensor
-    pixels: Tensor
-    used: Tensor
-    lens: LensModel
-    bow: bool = False
-    objective: Objective = "image"
-    weights: Tensor | None = None
-    loss: Loss | None = None
-    prior: Prior | None = None
-    basis: Tensor | None = None
-
-    @property
-    def parameters(self) -> Parametrisation:
-        """Which they are, and in which order."""
-        return Parametrisation(self.lens, self.bow)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the shared parameters."""
-        return self.parameters.names
-
-    @property
-    def problem(self) -> Reprojection:
-        """Residuals and Jacobians."""
-        kind = BoardError if self.objective == "plane" else Reprojection
-        return kind(self.points, self.pixels, self.used, self.lens, self.bow)
-
-    def part(self, where: slice) -> "Task":
-        """The task for a slice of the cameras."""
-        cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}
-        cut |= {name: None if (whole := getattr(self, name)) is None else whole[where] for name in ("weights", "basis")}
-        prior = None if self.prior is None else Prior(*(part[where] for part in self.prior))
-        return replace(self, **cut, prior=prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,26 +164,24 @@ def _fit(
     progress: Progress | None,
 ) -> Fit:
     given = inliers = task.used
-    options = {"max_iterations": max_iterations, "tolerance": tolerance}
-    blocks = _blocks(task)
-
-    tell = progress or _no_progress
     rounds = 1 if reject is None else 1 + MAX_REJECTION_ROUNDS
-    total = rounds * len(blocks) * max_iterations
+    total = rounds * max_iterations
 
     def attempt(task: Task, shared: Tensor, local: tuple[Tensor, ...], done: int) -> Solution:
-        parts = []
-        for number, where in enumerate(blocks):
-            report = partial(_report, tell, (done * len(blocks) + number) * max_iterations, total)
-            parts.append(_solve(task.part(where), shared[where], tuple(z[where] for z in local), report, **options))
-        return parts[0] if len(parts) == 1 else _joined(parts)
+        def tell(step: int, _: int) -> None:
+            if progress is not None:
+                progress(done * max_iterations + step, total)
+
+        return settled(task, shared, local, max_iterations=max_iterations, tolerance=tolerance, progress=tell)
 
     solution = attempt(task, shared, local, 0)
     iterations = solution.iterations
     if reject is not None:
         for done in range(1, rounds):
-            # Views left with fewer than four corners are no longer used, and keep their pose.
-            inliers = _inliers(replace(task, used=given), solution, reject)
+            # Views left with fewer than four corners are no longer used; their pose is sought anew, they may come back.
+            every = replace(task, used=given)
+            solution = found_again(every, solution, ~task.used.any(-1))
+            inliers = _inliers(every, solution, reject)
             kept = inliers & (inliers.sum(-1, keepdim=True) >= 4)
             changed = (kept != task.used).any(-1).any(-1)
             if not bool(changed.any()):
@@ -252,7 +191,8 @@ def _fit(
             # Cameras whose inliers did not change keep their solution to the bit.
             solution = select(changed.numpy(force=True), again, solution)
             iterations = iterations + torch.where(changed, again.iterations, 0)
-    tell(total, total)
+    if progress is not None:
+        progress(total, total)
     return Fit(task, solution._replace(iterations=iterations), given & ~inliers)
 
 
@@ -264,49 +204,6 @@ def normal_tensors(value: Any) -> Any:
         return replace(value, used=normal_tensors(value.used))
     parts = [normal_tensors(part) for part in value]
     return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
-
-
-def _no_progress(done: int, total: int) -> None:
-    pass
-
-
-def _report(tell: Progress, before: int, total: int, step: int, _: Tensor) -> None:
-    tell(before + step, total)
-
-
-def _solve(task: Task, shared: Tensor, local: tuple[Tensor, ...], report: Any, **options: Any) -> Solution:
-    size = task.used.sum((-2, -1)).amax().clamp(min=1).item()
-    unit = NEGLIGIBLE_PX if task.objective == "image" else 1e-13 * float(task.points.abs().amax())
-    return solve(
-        task.problem,
-        shared,
-        local,
-        local_size=POSE,
-        weights=task.weights,
-        loss=task.loss,
-        prior=task.prior,
-        basis=task.basis,
-        negligible=size * unit**2,
-        progress=report,
-        **options,
-    )
-
-
-def _blocks(task: Task) -> list[slice]:
-    P, V, N, _ = task.pixels.shape
-    length = P if task.pixels.device.type != "cpu" else max(1, min(P, BLOCK_CORNERS // max(1, V * N)))
-    return [slice(start, start + length) for start in range(0, P, length)]
-
-
-def _joined(parts: list[Solution]) -> Solution:
-    return Solution(
-        torch.cat([part.shared for part in parts]),
-        tuple(torch.cat(pieces) for pieces in zip(*(part.local for part in parts), strict=True)),
-        torch.cat([part.cost for part in parts]),
-        torch.cat([part.status for part in parts]),
-        torch.cat([part.iterations for part in parts]),
-        Equations(*(torch.cat(pieces) for pieces in zip(*(part.equations for part in parts), strict=True))),
-    )
 
 
 def _inliers(task: Task, solution: Solution, limit: float) -> Tensor:

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from diffproj.calibration.bow import bowed
 from diffproj.calibration.data import Data
-from diffproj.calibration.fit import Fit, Task
+from diffproj.calibration.fit import Fit
 from diffproj.calibration.parametrisation import POSE, moved
 from diffproj.calibration.solver import Prior
+from diffproj.calibration.task import Task
 from diffproj.targets.residuals import projected_minus_seen, put_back_minus_known
 
 

@@ -7,11 +7,12 @@ from kornia.geometry.camera import PinholeCamera
 
 from diffproj.calibration import closed_form, start
 from diffproj.calibration.data import Data
-from diffproj.calibration.fit import Fit, Task, fit
+from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.options import LocateOptions, locate_options
 from diffproj.calibration.outcome import outcome
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.solver import Solution, Status, select
+from diffproj.calibration.task import Task
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views

@@ -1,6 +1,7 @@
 """The solver's starting point: from a camera that is known roughly, or from nothing but the size of the image."""
 
 import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -8,7 +9,7 @@ from torch import Tensor
 from diffproj.calibration import closed_form
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import normal_tensors
-from diffproj.calibration.parametrisation import Parametrisation
+from diffproj.calibration.parametrisation import Parametrisation, Pose
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.intrinsics import check_no_skew
 from diffproj.lens.models import MODELS, LensModel
@@ -50,55 +51,116 @@ def from_camera(camera: Camera, data: Data, bow: bool) -> tuple[Tensor, tuple[Te
     return shared, closed_form.poses(H, data.points), parameters.lens
 
 
+@dataclass(frozen=True, eq=False)
+class Straightened:
+    """Corners as a first estimate of the lens straightens them, for starts at any focal length.
+
+    Attributes:
+        model: the lens that is to be fitted.
+        seen: the corners `(P, V, N, 2)` in px.
+        middle: the middle of the image `(P, 2)`, which stands for the principal point.
+        lam: the lens as the one number `(P,)` of the division model; 0 for a fisheye, which is taken as equidistant.
+        size: `(width, height)` of the image.
+    """
+
+    model: LensModel
+    seen: Tensor
+    middle: Tensor
+    lam: Tensor
+    size: tuple[int, int]
+
+    @property
+    def longer(self) -> float:
+        """The image's longer side in px."""
+        return float(max(self.size))
+
+    @property
+    def radius(self) -> float:
+        """Half the image's diagonal in px, the unit of `lam`."""
+        return 0.5 * math.hypot(*self.size)
+
+    @property
+    def lens(self) -> LensModel:
+        """The lens that the straightened corners are seen through."""
+        return "none" if MODELS[self.model].perspective else "fisheye"
+
+    @property
+    def pixels(self) -> Tensor:
+        """The straightened corners `(P, V, N, 2)` in px; of a fisheye, as they are."""
+        return closed_form.without_division(self.seen, self.middle, self.lam, self.radius)
+
+    def part(self, which: Tensor) -> "Straightened":
+        """That of some of the cameras `(n,)`."""
+        return replace(self, seen=self.seen[which], middle=self.middle[which], lam=self.lam[which])
+
+    def without_lens(self) -> "Straightened":
+        """The same with no lens estimated."""
+        return replace(self, lam=torch.zeros_like(self.lam))
+
+    def rays(self, f: Tensor) -> tuple[Tensor, Tensor]:
+        """Points `(P, V, N, 2)` of the normalised plane at focal lengths `(P,)`, and which are not too far out."""
+        if self.lens == "fisheye":
+            return closed_form.equidistant_rays(self.seen, self.middle, f)
+        xy = (self.pixels - self.middle[:, None, None]) / f[:, None, None, None]
+        return xy, torch.ones_like(xy[..., 0], dtype=torch.bool)
+
+    def held(self, f: Tensor) -> Tensor:
+        """Shared parameters of `lens` at focal lengths `(P, 2)` or `(P,)`: the camera of the straightened corners."""
+        f = f if f.ndim == 2 else f.unsqueeze(-1).expand(-1, 2)
+        return torch.cat([f, self.middle, f.new_zeros(len(f), MODELS[self.lens].count)], dim=-1)
+
+    def shared(self, f: Tensor, size: int) -> Tensor:
+        """Shared parameters `(P, size)` of the model, to start from, at focal lengths `(P, 2)` or `(P,)`."""
+        held = self.held(f)
+        start = torch.nn.functional.pad(held, (0, size - held.shape[-1]))
+        if MODELS[self.model].count and self.lens == "none":
+            # distorted = centred (1 + lambda |distorted|^2) = centred (1 + k1 r^2 + 2 k1^2 r^4 + ...)
+            k1 = self.lam * (held[:, :2].mean(-1) / self.radius).square()
+            start[:, 4], start[:, 5] = k1, 2 * k1.square()
+        return start
+
+
 def from_nothing(
     data: Data, model: LensModel, size: tuple[int, int], tied: bool, bow: bool
-) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+) -> tuple[Tensor, Pose, Straightened]:
     """Shared parameters and poses to start from, with nothing known but the size of the image."""
     with torch.inference_mode():
         middle = data.pixels.new_tensor([(size[0] - 1) / 2, (size[1] - 1) / 2]).expand(len(data.pixels), 2)
-        rest = middle.new_zeros(len(middle), MODELS[model].count + 2 * bow)
-        if model == "fisheye":
-            found = _fisheye(data, middle, rest, float(max(size)), bow)
+        straight = Straightened(model, data.pixels, middle, torch.zeros_like(middle[:, 0]), size)
+        count = Parametrisation(model, bow).size
+        if straight.lens == "fisheye":
+            shared, pose = _fisheye(data, straight, count, bow)
         else:
-            found = _perspective(data, middle, rest, size, tied, model != "none")
-    return normal_tensors(found)
+            shared, pose, straight = _perspective(data, straight, count, tied)
+    return (*normal_tensors((shared, pose)), straight)
 
 
-def _perspective(
-    data: Data, middle: Tensor, rest: Tensor, size: tuple[int, int], tied: bool, bent: bool
-) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+def _perspective(data: Data, straight: Straightened, count: int, tied: bool) -> tuple[Tensor, Pose, Straightened]:
     """Straighten the image with a lens of one number, then Zhang's equations."""
-    radius = 0.5 * math.hypot(*size)
-    lam, H = torch.zeros_like(middle[:, 0]), None
-    if bent:
-        lam, H = closed_form.division(data.points, data.pixels, data.used, middle, radius)
+    middle, H = straight.middle, None
+    if MODELS[straight.model].count:
+        lam, H = closed_form.division(data.points, data.pixels, data.used, middle, straight.radius)
+        straight = replace(straight, lam=lam)
     if H is None:
-        straight = closed_form.without_division(data.pixels, middle, lam, radius) if bent else data.pixels
-        H = closed_form.homographies(data.points, straight, data.used)
-    f = closed_form.focal_lengths(H, middle, float(max(size)), data.used.any(-1), tied)
+        H = closed_form.homographies(data.points, straight.pixels, data.used)
+    f = closed_form.focal_lengths(H, middle, straight.longer, data.used.any(-1), tied)
     upper = (H[..., :2, :] - middle[:, None, :, None] * H[..., 2:, :]) / f[:, None, :, None]
     pose = closed_form.poses(torch.cat([upper, H[..., 2:, :]], dim=-2), data.points)
-    if bent:
-        # distorted = centred (1 + lambda |distorted|^2) = centred (1 + k1 r^2 + 2 k1^2 r^4 + ...)
-        k1 = lam * (f.mean(-1) / radius).square()
-        rest = torch.cat([k1.unsqueeze(-1), 2 * k1.square().unsqueeze(-1), rest[:, 2:]], dim=-1)
-    return torch.cat([f, middle, rest], dim=-1), pose
+    return straight.shared(f, count), pose, straight
 
 
-def _fisheye(
-    data: Data, middle: Tensor, rest: Tensor, longer: float, bow: bool
-) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+def _fisheye(data: Data, straight: Straightened, count: int, bow: bool) -> tuple[Tensor, Pose]:
     """Of equidistant lenses with several focal lengths, the one whose poses explain the corners best."""
     problem = data.task("fisheye", bow=bow).problem
     tries = []
     for scale in closed_form.FISHEYE_SCALE:
-        f = middle.new_full((len(middle), 1), scale * longer / torch.pi)
-        xy, inside = closed_form.equidistant_rays(data.pixels, middle, f[:, 0])
+        f = straight.middle.new_full((len(straight.middle),), scale * straight.longer / torch.pi)
+        xy, inside = straight.rays(f)
         pose = closed_form.poses(closed_form.homographies(data.points, xy, data.used & inside), data.points)
-        shared = torch.cat([f, f, middle, rest], dim=-1)
+        shared = straight.shared(f, count)
         cost = problem.linearise(shared, pose)[:, :, -1].square().sum((1, 2, 3))
         tries.append((torch.where(cost.isfinite(), cost, torch.inf), shared, *pose))
     costs, *starts = (torch.stack(parts) for parts in zip(*tries, strict=True))
-    best = costs.argmin(0), torch.arange(len(middle), device=middle.device)
+    best = costs.argmin(0), torch.arange(len(costs[0]), device=costs.device)
     shared, R, t = (candidates[best] for candidates in starts)
     return shared, (R, t)

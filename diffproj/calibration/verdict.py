@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.closed_form import homographies
-from diffproj.calibration.fit import Fit, Task
+from diffproj.calibration.fit import Fit
 from diffproj.calibration.solver import Status
+from diffproj.calibration.task import Task
 from diffproj.targets.chessboard import Chessboard
 
 MAX_RELATIVE_STD = 0.1

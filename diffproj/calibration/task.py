@@ -1,0 +1,133 @@
+"""`Task`: what is minimised, for P cameras side by side; and the solver run over it, in blocks of cameras."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.board_error import BoardError
+from diffproj.calibration.losses import Loss
+from diffproj.calibration.options import Progress
+from diffproj.calibration.parametrisation import POSE, Parametrisation
+from diffproj.calibration.reprojection import Reprojection
+from diffproj.calibration.result import Objective
+from diffproj.calibration.solver import Equations, Prior, Solution, solve
+from diffproj.lens.models import LensModel
+
+BLOCK_CORNERS = 24_000
+"""Corners per block on a CPU, about thirty cameras of 13 views: enough to hide call overhead, and few enough that a
+slowly converging camera delays few others."""
+NEGLIGIBLE_PX = 1e-11
+"""Size of residuals, in pixels, that is rounding error of pixel coordinates."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A minimisation problem: P cameras of V views with N corners.
+
+    Attributes:
+        points: the board's points `(N, 3)`.
+        pixels: `(P, V, N, 2)`.
+        used: which corners count `(P, V, N)`.
+        lens, bow: the model.
+        objective: residuals on the image or on the board.
+        weights: of the corners `(P, V, N)`, or `None` for 1.
+        loss: a robust loss, or `None` for least squares.
+        prior: on the shared parameters.
+        basis: of the shared parameters' free directions `(P, s, q)`, or `None` for all.
+    """
+
+    points: Tensor
+    pixels: Tensor
+    used: Tensor
+    lens: LensModel
+    bow: bool = False
+    objective: Objective = "image"
+    weights: Tensor | None = None
+    loss: Loss | None = None
+    prior: Prior | None = None
+    basis: Tensor | None = None
+
+    @property
+    def parameters(self) -> Parametrisation:
+        """Which they are, and in which order."""
+        return Parametrisation(self.lens, self.bow)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the shared parameters."""
+        return self.parameters.names
+
+    @property
+    def problem(self) -> Reprojection:
+        """Residuals and Jacobians."""
+        kind = BoardError if self.objective == "plane" else Reprojection
+        return kind(self.points, self.pixels, self.used, self.lens, self.bow)
+
+    def part(self, where: slice) -> "Task":
+        """The task for a slice of the cameras."""
+        cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}
+        cut |= {name: None if (whole := getattr(self, name)) is None else whole[where] for name in ("weights", "basis")}
+        prior = None if self.prior is None else Prior(*(part[where] for part in self.prior))
+        return replace(self, **cut, prior=prior)
+
+
+def solved(
+    task: Task,
+    shared: Tensor,
+    local: tuple[Tensor, ...],
+    *,
+    max_iterations: int,
+    tolerance: float,
+    progress: Progress | None = None,
+) -> Solution:
+    """Run the solver from shared parameters `(P, s)` and poses `(P, V, ...)`, in blocks of cameras.
+
+    `progress` is told of the steps of each block in turn, as a part of `max_iterations`.
+    """
+    blocks, parts = _blocks(task), []
+    for number, where in enumerate(blocks):
+
+        def report(step: int, _: Tensor, number: int = number) -> None:
+            if progress is not None:
+                progress((number * max_iterations + step) // len(blocks), max_iterations)
+
+        block, start = task.part(where), tuple(z[where] for z in local)
+        options = {"max_iterations": max_iterations, "tolerance": tolerance, "progress": report}
+        parts.append(_solved(block, shared[where], start, **options))
+    return parts[0] if len(parts) == 1 else _joined(parts)
+
+
+def _solved(task: Task, shared: Tensor, local: tuple[Tensor, ...], **options: Any) -> Solution:
+    size = task.used.sum((-2, -1)).amax().clamp(min=1).item()
+    unit = NEGLIGIBLE_PX if task.objective == "image" else 1e-13 * float(task.points.abs().amax())
+    return solve(
+        task.problem,
+        shared,
+        local,
+        local_size=POSE,
+        weights=task.weights,
+        loss=task.loss,
+        prior=task.prior,
+        basis=task.basis,
+        negligible=size * unit**2,
+        **options,
+    )
+
+
+def _blocks(task: Task) -> list[slice]:
+    P, V, N, _ = task.pixels.shape
+    length = P if task.pixels.device.type != "cpu" else max(1, min(P, BLOCK_CORNERS // max(1, V * N)))
+    return [slice(start, start + length) for start in range(0, P, length)]
+
+
+def _joined(parts: list[Solution]) -> Solution:
+    return Solution(
+        torch.cat([part.shared for part in parts]),
+        tuple(torch.cat(pieces) for pieces in zip(*(part.local for part in parts), strict=True)),
+        torch.cat([part.cost for part in parts]),
+        torch.cat([part.status for part in parts]),
+        torch.cat([part.iterations for part in parts]),
+        Equations(*(torch.cat(pieces) for pieces in zip(*(part.equations for part in parts), strict=True))),
+    )

@@ -1,0 +1,255 @@
+"""Each view of a plane has two poses that look alike, and a solver ends in the one that it starts near.
+
+Seen from afar, a plane and its mirror image at the line of sight have the same outline; only the perspective within the
+view tells them apart (Schweighofer and Pinz 2006). So a minimum is one only when the other pose of no view is better:
+after each solve the other pose of each view is tried, where it is better it is taken, and the cameras concerned are
+solved once more, until none changes.
+
+Most views need no search to see this. Perspective moves the corners of a board of radius r, at a distance Z and tilted
+by theta, by about `d = 2 f (r / Z)^2 sin(theta)`, one way for the one pose and the other way for the other; where that
+is far more than the view's residuals, the other pose is no rival. For the views that are left, one linearisation at the
+other pose predicts the cost that its refinement can reach.
+"""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration import closed_form
+from diffproj.calibration.losses import Cauchy
+from diffproj.calibration.options import Progress
+from diffproj.calibration.parametrisation import POSE, Pose
+from diffproj.calibration.solver import Prior, Solution
+from diffproj.calibration.task import Task, solved
+from diffproj.geometry.cayley import turned
+
+PERSPECTIVE = 20.0
+"""Displacement by perspective, relative to the residuals, beyond which the other pose is no rival."""
+FACE_ON = 0.3
+"""Foreshortening, relative to the residuals, up to which a view's two poses are one."""
+RIVAL = 4.0
+"""Predicted cost of a view at its other pose, relative to its cost, up to which the other pose is refined."""
+MISFIT = 25.0
+"""Mean squared residual of a view, relative to the median of its camera's views, from which on it is sought anew."""
+FEW_CORNERS = 10
+"""Corners of a view up to which more than two poses may fit about as well (four points: up to four)."""
+TILT = math.radians(40)
+"""By which boards are tilted that a lost view's pose, or that of a few corners, is sought from."""
+MAX_ROUNDS = 8
+"""Maximum number of times that poses are exchanged and the cameras solved again."""
+BETTER = 1e-6
+"""Part of its cost by which a view must gain for an exchange."""
+
+
+def settled(
+    task: Task,
+    shared: Tensor,
+    local: Pose,
+    *,
+    max_iterations: int,
+    tolerance: float,
+    progress: Progress | None = None,
+) -> Solution:
+    """Minimise from shared parameters `(P, s)` and poses `(P, V, ...)`; the other pose of no view is then better."""
+    options: dict[str, Any] = {"max_iterations": max_iterations, "tolerance": tolerance}
+    solution = solved(task, shared, local, progress=progress, **options)
+    open_ = torch.ones(len(shared), dtype=torch.bool, device=shared.device)
+    for _ in range(MAX_ROUNDS):
+        poses, changed = better_poses(task, solution, open_)
+        if not bool(changed.any()):
+            break
+        which = changed.nonzero().flatten()
+        again = solved(chosen_cameras(task, which), solution.shared[which], tuple(z[which] for z in poses), **options)
+        gained = again.cost < solution.cost[which]
+        solution = replaced(solution, which[gained], again, gained)
+        open_ = torch.zeros_like(open_).index_fill(0, which[gained], True)
+    return solution
+
+
+def better_poses(task: Task, solution: Solution, cameras: Tensor) -> tuple[Pose, Tensor]:
+    """The poses of the views, exchanged where the other is better while the shared parameters are held.
+
+    Args:
+        task: what is minimised.
+        solution: its minimum for the present poses.
+        cameras: which are looked at `(P,)`.
+
+    Returns:
+        Poses `(P, V, ...)`, and whether a camera's poses changed `(P,)`.
+    """
+    poses = solution.local
+    here = solution.equations.c if task.loss is None else view_costs(task, solution.shared, poses)
+    seen = task.used.any(-1) & cameras.unsqueeze(-1)
+    rivals = seen & _weak_perspective(task, solution.shared, poses, here)
+    other = poses
+    if bool(rivals.any()):
+        other = closed_form.other_pose(poses[0], poses[1], task.points)
+        p, v = rivals.nonzero(as_tuple=True)
+        single, held, start = _single(task, solution.shared, other, p, v)
+        near = predicted_costs(single, held, start).squeeze(1) <= RIVAL * here[p, v]
+        rivals = torch.zeros_like(rivals).index_put((p, v), near)
+    poses, here, changed = _exchanged(task, solution.shared, poses, here, other, rivals)
+    lost = seen & (_misfit(task, here) | (task.used.sum(-1) <= FEW_CORNERS))
+    poses, more = _sought(task, solution.shared, poses, here, lost)
+    return poses, changed | more
+
+
+def found_again(task: Task, solution: Solution, lost: Tensor) -> Solution:
+    """The solution with the poses of lost views `(P, V)` sought anew, wrong corners among theirs borne."""
+    lost = lost & (task.used.sum(-1) >= 4)
+    if not bool(lost.any()):
+        return solution
+    residual = task.problem.linearise(solution.shared, solution.local)[:, :, -1]
+    level = torch.where((task.used & ~lost.unsqueeze(-1)).unsqueeze(2), residual.abs(), torch.nan).nanmedian()
+    unit = 1.0 if task.objective == "image" else 1e-3 * float(task.points.abs().amax())
+    least, scale = max(4 * float(level), 1e-9 * unit), max(4 * float(level), unit)
+    robust = replace(task, loss=task.loss or Cauchy(scale))
+    here = view_costs(robust, solution.shared, solution.local)
+    poses, _ = _sought(robust, solution.shared, solution.local, here, lost)
+    while task.loss is None and scale > least:  # the closer, the less wrong corners pull
+        scale = max(scale / 30, least)
+        robust = replace(task, loss=Cauchy(scale))
+        here = view_costs(robust, solution.shared, poses)
+        poses, _, _ = _exchanged(robust, solution.shared, poses, here, poses, lost)
+    return solution._replace(local=poses)
+
+
+def _sought(task: Task, shared: Tensor, poses: Pose, here: Tensor, lost: Tensor) -> tuple[Pose, Tensor]:
+    """Poses of lost views `(P, V)` sought from boards that face the camera and lean four ways; which changed `(P,)`."""
+    changed = torch.zeros_like(lost[:, 0])
+    if not bool(lost.any()):
+        return poses, changed
+    R, t = _upright(task, shared)
+    middle = task.points.mean(0)
+    for axis in ((0.0, 0, 0), (1.0, 0, 0), (-1.0, 0, 0), (0, 1.0, 0), (0, -1.0, 0)):
+        turn = turned(R, 2 * math.tan(TILT / 2) * R.new_tensor(axis).expand_as(t))
+        start = turn, t + (R - turn) @ middle
+        poses, here, more = _exchanged(task, shared, poses, here, start, lost)
+        changed = changed | more
+    return poses, changed
+
+
+def _exchanged(
+    task: Task, shared: Tensor, poses: Pose, here: Tensor, others: Pose, tried: Tensor
+) -> tuple[Pose, Tensor, Tensor]:
+    """Poses and their costs, exchanged where others, refined, are better; and whether a camera's changed `(P,)`."""
+    p, v = tried.nonzero(as_tuple=True)
+    changed = torch.zeros_like(tried[:, 0])
+    if len(p) == 0:
+        return poses, here, changed
+    refined = posed(task, shared, others, p, v)
+    better = ~(refined.cost >= here[p, v] * (1 - BETTER)) & refined.cost.isfinite()
+    p, v = p[better], v[better]
+    poses = tuple(z.index_put((p, v), new.squeeze(1)[better]) for z, new in zip(poses, refined.local, strict=True))
+    return poses, here.index_put((p, v), refined.cost[better]), changed.index_fill(0, p, True)
+
+
+def _misfit(task: Task, costs: Tensor) -> Tensor:
+    """Which views fit far worse than the others of their camera `(P, V)`."""
+    mean = mean_squares(task, costs)
+    median = mean.nanmedian(-1, keepdim=True).values
+    return ~(mean <= MISFIT * median.clamp(min=1e-18)) & task.used.any(-1)
+
+
+def mean_squares(task: Task, costs: Tensor) -> Tensor:
+    """The mean square of a residual's component in each view `(P, V)`, whatever the unit of the weights."""
+    weights = task.used.to(costs) if task.weights is None else torch.where(task.used, task.weights, 0.0)
+    total = weights.sum(-1)
+    return torch.where(total > 0, costs / torch.where(total > 0, total, 1.0), torch.nan)
+
+
+def _upright(task: Task, shared: Tensor) -> Pose:
+    """Poses `(P, V, ...)` of boards that face the camera, where the corners are."""
+    V = task.used.shape[1]
+    identity = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(len(shared), V, 3, 3)
+    camera = task.parameters.unpack(shared, (identity, torch.zeros_like(identity[..., 0])))
+    direction, valid = camera.directions(task.pixels)
+    ahead = valid & (direction[..., 2] > 0.1 * direction.norm(dim=-1))
+    xy = direction[..., :2] / torch.where(ahead, direction[..., 2], 1.0).unsqueeze(-1)
+    return closed_form.upright_poses(task.points, xy, task.used & ahead)
+
+
+def _weak_perspective(task: Task, shared: Tensor, poses: Pose, costs: Tensor) -> Tensor:
+    """In which views perspective moves the corners by no more than some residuals `(P, V)`."""
+    R, t = poses
+    middle = task.points.mean(0)
+    radius = (task.points - middle).square().sum(-1).mean().sqrt()
+    place = (R @ middle) + t
+    distance = place.square().sum(-1).clamp(min=1e-300)
+    cosine = (R[..., 2] * place).sum(-1).square() / distance
+    displacement = 2 * shared[:, None, :2].mean(-1) * radius**2 / distance * (1 - cosine).clamp(min=0).sqrt()
+    residual = mean_squares(task, costs).sqrt()
+    if task.objective != "image":  # from world units to pixels
+        residual = residual * shared[:, None, :2].mean(-1) / distance.sqrt()
+    # Seen face on the two poses are one: between them lies no hill that the corners could tell of.
+    foreshortening = shared[:, None, :2].mean(-1) * radius / distance.sqrt() * (1 - cosine.sqrt())
+    return (displacement <= PERSPECTIVE * residual) & (foreshortening > FACE_ON * residual)
+
+
+def posed(task: Task, shared: Tensor, poses: Pose, p: Tensor, v: Tensor) -> Solution:
+    """Poses of the views `(p, v)` alone refined from `poses (P, V, ...)`, the shared parameters `(P, s)` held."""
+    return solved(*_single(task, shared, poses, p, v), max_iterations=20, tolerance=1e-7)
+
+
+def _single(task: Task, shared: Tensor, poses: Pose, p: Tensor, v: Tensor) -> tuple[Task, Tensor, Pose]:
+    """Each of the views `(p, v)` as a camera of its own, with its shared parameters, which are held, and its pose."""
+    single = replace(
+        task,
+        pixels=task.pixels[p, v].unsqueeze(1),
+        used=task.used[p, v].unsqueeze(1),
+        weights=None if task.weights is None else task.weights[p, v].unsqueeze(1),
+        prior=None,
+        basis=shared.new_zeros(len(p), shared.shape[-1], 0),
+    )
+    return single, shared[p], tuple(z[p, v].unsqueeze(1) for z in poses)
+
+
+def view_costs(task: Task, shared: Tensor, poses: Pose) -> Tensor:
+    """The cost of each view `(P, V)`: half the weighted sum of its (robust) squared residuals."""
+    squared = task.problem.linearise(shared, poses)[:, :, -1].square().sum(2)
+    value = squared if task.loss is None else task.loss.value(squared)
+    return (value if task.weights is None else value * task.weights).sum(-1) / 2
+
+
+def predicted_costs(task: Task, shared: Tensor, poses: Pose) -> Tensor:
+    """The cost of each view `(P, V)` after a Gauss-Newton step of its pose, by the linearised residuals.
+
+    Infinite where the residuals have no value or the corners determine no pose.
+    """
+    panel = task.problem.linearise(shared, poses)
+    residual = panel[:, :, -1]
+    squared = residual.square().sum(2)
+    weights = torch.ones_like(squared) if task.weights is None else task.weights
+    if task.loss is not None:
+        weights = weights * task.loss.weight(squared)
+    rows = (panel[:, :, -POSE - 1 :] * weights.sqrt()[:, :, None, None]).flatten(-2)
+    gram = rows @ rows.mT
+    W, h, cost = gram[..., :-1, :-1], gram[..., :-1, -1:], gram[..., -1, -1] / 2
+    L, failed = torch.linalg.cholesky_ex(torch.where(W.isfinite(), W, 0.0))
+    y = torch.linalg.solve_triangular(L, h, upper=False)
+    predicted = cost - y.square().sum((-2, -1)) / 2
+    return torch.where((failed == 0) & predicted.isfinite(), predicted.clamp(min=0), torch.inf)
+
+
+def chosen_cameras(task: Task, which: Tensor) -> Task:
+    """The task of some of the cameras `(n,)`."""
+    parts = {name: getattr(task, name) for name in ("pixels", "used", "weights", "basis")}
+    cut = {name: None if whole is None else whole[which] for name, whole in parts.items()}
+    prior = None if task.prior is None else Prior(*(part[which] for part in task.prior))
+    return replace(task, **cut, prior=prior)
+
+
+def replaced(solution: Solution, which: Tensor, other: Solution, taken: Tensor) -> Solution:
+    """A solution with that of some cameras `(n,)` replaced, where `taken` says so; iterations add up."""
+
+    def put(whole: object, part: object) -> object:
+        if isinstance(whole, Tensor):
+            return whole.index_put((which,), part[taken])  # type: ignore[index]
+        parts = [put(a, b) for a, b in zip(whole, part, strict=True)]  # type: ignore[call-overload]
+        return type(whole)(*parts) if hasattr(whole, "_fields") else tuple(parts)
+
+    total = solution.iterations.index_add(0, which, other.iterations[taken])
+    return put(solution, other)._replace(iterations=total)  # type: ignore[attr-defined]
