@@ -11,6 +11,9 @@ from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
+OUTSIDE = 0.02
+"""Part of the image's size by which a corner may lie outside of it, by noise or a cut-off board."""
+
 
 class Data:
     """Views and board, checked, in float64, with the cameras' axes flattened to P.
@@ -66,19 +69,37 @@ class Data:
             visible = visible & (self.given_weights.detach() > 0)
         visible = visible.reshape(self.pixels.shape[:-1])
         self.used = visible & (visible.sum(-1, keepdim=True) >= 4)
+        _check_inside(views, self.pixels, self.used)
 
     def task(self, model: LensModel, **options: Any) -> Task:
         """What is to be minimised on these corners."""
         return Task(self.points, self.pixels, self.used, model, weights=self.weights, **options)
 
 
+def _check_inside(views: Views, pixels: Tensor, used: Tensor) -> None:
+    if views.size is None:
+        return
+    size = pixels.new_tensor(views.size)
+    outside = used & ((pixels < -OUTSIDE * size) | (pixels > (1 + OUTSIDE) * size)).any(-1)
+    if bool(outside.any()):
+        camera, view, corner = outside.nonzero()[0].tolist()
+        u, v = pixels[camera, view, corner].tolist()
+        raise ValueError(
+            f"views: want corners inside the photographs of {views.size[0]} x {views.size[1]} px, "
+            f"got ({u:.1f}, {v:.1f}) in {views.names[view]!r}; is size (width, height), and of these photographs?"
+        )
+
+
 def _check_points(points: Tensor) -> None:
     if not bool(points.isfinite().all()) or bool((points[:, 2] != 0).any()):
         raise ValueError("target: want finite points, all on z = 0")
+    if len(points) < 4:
+        raise ValueError(f"target: want at least 4 points, got {len(points)}")
+    points = points - points.mean(0)  # far from the origin squares of coordinates cancel
     apart = torch.cdist(points, points) + torch.eye(len(points), dtype=points.dtype, device=points.device).mul(1e300)
-    extent = (points - points.mean(0)).abs().amax()
-    if len(points) < 4 or bool(apart.amin() <= 1e-9 * extent):
-        i, j = divmod(int(apart.argmin()), len(points)) if len(points) > 1 else (0, 0)
-        raise ValueError(f"target: want at least 4 points, all distinct, got {len(points)} with {i} and {j} alike")
-    if float(torch.linalg.svdvals(points[:, :2] - points[:, :2].mean(0))[1]) <= 1e-9 * float(extent):
+    extent = points.abs().amax()
+    if bool(apart.amin() <= 1e-9 * extent):
+        i, j = divmod(int(apart.argmin()), len(points))
+        raise ValueError(f"target: want distinct points, got {i} and {j} alike")
+    if float(torch.linalg.svdvals(points[:, :2])[1]) <= 1e-9 * float(extent):
         raise ValueError("target: want points that do not lie on one line")

@@ -9,6 +9,7 @@ from diffproj.calibration.closed_form import homographies
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
+from diffproj.calibration.two_poses import mean_squares
 from diffproj.targets.chessboard import Chessboard
 
 MAX_RELATIVE_STD = 0.1
@@ -88,14 +89,24 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
 
 
 def _relative_error(found: Fit) -> Tensor:
-    """Reweighted RMS residual of each view, over the RMS distance of its corners from their centroid, `(P, V)`."""
+    """RMS residual of each view, over the RMS distance of its corners from their centroid, `(P, V)`.
+
+    With weights their mean by weight, whatever their unit; under a robust loss the robust std of the residuals as they
+    are, for the loss would hide a view that fits nowhere.
+    """
     task = found.task
     count = task.used.sum(-1).clamp(min=1)
     seen = task.pixels if task.objective == "image" else task.points[:, :2].expand_as(task.pixels)
     seen = torch.where(task.used.unsqueeze(-1), seen, 0.0)
     middle = seen.sum(-2) / count.unsqueeze(-1)
     spread = torch.where(task.used.unsqueeze(-1), seen - middle.unsqueeze(-2), 0.0).square().sum((-2, -1)) / count
-    return (2 * found.solution.equations.c / count / spread.clamp(min=1e-30)).sqrt()
+    if task.loss is None:
+        squares = 2 * mean_squares(task, found.solution.equations.c)
+    else:
+        residual = task.problem.linearise(found.solution.shared, found.solution.local)[:, :, -1]
+        size = torch.where(task.used.unsqueeze(2), residual.abs(), torch.nan).flatten(2)
+        squares = 2 * (1.4826 * size.nanmedian(-1).values).square()
+    return (squares / spread.clamp(min=1e-30)).sqrt().nan_to_num(0.0)
 
 
 def _mirrored(R: Tensor, t: Tensor, points: Tensor, used: Tensor, board: object) -> Tensor:

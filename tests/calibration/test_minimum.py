@@ -283,3 +283,44 @@ def test_locate_along_rays_far_off_the_axis(
     found = dp.locate(dp.Views(pixels), Marker(), dp.Camera(K))
     assert found.rms < 1e-9
     torch.testing.assert_close(found.cameras.R, truth.R, rtol=0, atol=1e-9)
+
+
+# ---------------------------------------------------------------------------------------------------------- verdicts
+
+
+@pytest.mark.parametrize("unit", [1e-8, 1.0, 1e8])
+@pytest.mark.parametrize("objective", ["image", "plane"])
+def test_the_verdict_does_not_depend_on_the_unit_of_weights(unit: float, objective: str) -> None:
+    views = dp.example_views("left")
+    weights = torch.tensor(unit, dtype=D)
+    good = dp.calibrate(views, BOARD, weights=weights, objective=objective)  # type: ignore[arg-type]
+    assert good.rms == pytest.approx(0.1766, abs=2e-3)
+    mixed = views.pixels.clone()
+    mixed[4] = mixed[4].reshape(6, 9, 2).transpose(0, 1).reshape(54, 2)
+    with pytest.raises(dp.CalibrationError, match=r"left05\.jpg do not match the board"):
+        dp.calibrate(dp.Views(mixed, names=views.names, size=views.size), BOARD, weights=weights)
+
+
+def test_a_robust_loss_does_not_hide_a_view_that_fits_nowhere() -> None:
+    views = dp.example_views("left")
+    mixed = views.pixels.clone()
+    mixed[4] = mixed[4].reshape(6, 9, 2).transpose(0, 1).reshape(54, 2)
+    for loss in (dp.Huber(0.5), dp.Cauchy(1.0)):
+        with pytest.raises(dp.CalibrationError, match=r"left05\.jpg do not match the board"):
+            dp.calibrate(dp.Views(mixed, names=views.names, size=views.size), BOARD, loss=loss)
+
+
+@pytest.mark.parametrize("size", [(480, 640), (320, 240)])
+def test_corners_outside_the_photographs_are_refused(size: tuple[int, int]) -> None:
+    views = dp.example_views("left")
+    wrong = dp.Views(views.pixels, names=views.names, size=size)
+    with pytest.raises(ValueError, match=r"views: want corners inside the photographs of .* px, got .* in 'left"):
+        dp.calibrate(wrong, BOARD, fixed=("principal_point",))
+
+
+def test_targets_far_from_the_origin_and_with_too_few_points_are_told_apart() -> None:
+    class Three:
+        points = torch.eye(3, dtype=D) * torch.tensor([1.0, 1, 0], dtype=D)
+
+    with pytest.raises(ValueError, match="target: want at least 4 points, got 3"):
+        dp.locate(dp.Views(torch.rand(1, 3, 2, dtype=D)), Three(), dp.Camera(torch.eye(3, dtype=D)))
