@@ -77,20 +77,15 @@ class Batched:
         Raises:
             TypeError: the dtype is not of floating-point type.
         """
-
-        def convert(tensor: Tensor, _: int) -> Tensor:
-            if not tensor.is_floating_point():  # a mask moves, and stays a mask
-                return converted(tensor, self._rehearsed(*args, **kwargs).device)
-            return at_least_float32(converted(tensor, *args, **kwargs))
-
-        wanted = self._rehearsed(*args, **kwargs)
+        # An empty tensor shows what the arguments ask for.
+        wanted = at_least_float32(torch.empty(0, dtype=self.dtype, device=self.device).to(*args, **kwargs))
         if not wanted.is_floating_point():
             raise TypeError(f"dtype: want a floating-point one, got {wanted.dtype}")
-        return self._rearranged(convert, lambda part: part.to(*args, **kwargs))
 
-    def _rehearsed(self, *args: Any, **kwargs: Any) -> Tensor:
-        """An empty tensor of this dtype and device, converted: shows what the arguments of `to` ask for."""
-        return torch.empty(0, dtype=self.dtype, device=self.device).to(*args, **kwargs)
+        def convert(tensor: Tensor, _: int) -> Tensor:  # a mask moves, and stays a mask
+            return converted(tensor, wanted.device, wanted.dtype if tensor.is_floating_point() else tensor.dtype)
+
+        return self._rearranged(convert, lambda part: part.to(*args, **kwargs))
 
     def detach(self: B) -> B:
         """The same cut off from the graph."""

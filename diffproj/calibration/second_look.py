@@ -4,7 +4,7 @@ From one start in closed form the solver may end in a side valley: a focal lengt
 lens that stands for what the poses should explain. A camera is looked at again where its first minimum is doubtful:
 
 * the solver did not converge, or took many steps, as it does in narrow valleys, or
-* neighbouring corners are off in the same direction, as noise is not: the model leaves something over.
+* where outliers were rejected, neighbouring corners are off in the same direction, as noise is not.
 
 Then starts compete. For focal lengths on a grid each view takes the better of its two poses, as a step of Gauss and
 Newton predicts their costs; the grid's best focal lengths, with and without the lens's first estimate, are solved side
@@ -45,11 +45,12 @@ LOWER = 1e-9
 """Part of the cost by which another minimum must be lower to replace the first."""
 
 
-def doubtful(found: Fit, count_steps: bool) -> Tensor:
-    """Which minima deserve a second look `(P,)`; steps that were spent on rejecting outliers say nothing of that."""
+def doubtful(found: Fit, rejecting: bool) -> Tensor:
+    """Which minima deserve a second look `(P,)`."""
     solution = found.solution
-    slow = (solution.iterations > MANY_STEPS) & count_steps
-    return slow | (solution.status != Status.CONVERGED) | (correlation(found) > CORRELATED)
+    # Steps that were spent on rejecting outliers say nothing; what is left of the residuals does.
+    suspicious = correlation(found) > CORRELATED if rejecting else solution.iterations > MANY_STEPS
+    return suspicious | (solution.status != Status.CONVERGED)
 
 
 def correlation(found: Fit) -> Tensor:
@@ -82,7 +83,7 @@ def second_look(
         return found
     steps: dict[str, Any] = {"max_iterations": max_iterations, "tolerance": tolerance}
     with torch.inference_mode():
-        which = doubtful(found, count_steps=reject is None).nonzero().flatten()
+        which = doubtful(found, rejecting=reject is not None).nonzero().flatten()
         if len(which) == 0:
             return found
         task = chosen_cameras(replace(found.task, used=found.task.used | found.rejected), which)

@@ -63,7 +63,7 @@ def settled(
             break
         which = changed.nonzero().flatten()
         again = solved(chosen_cameras(task, which), solution.shared[which], tuple(z[which] for z in poses), **options)
-        gained = again.cost < solution.cost[which]
+        gained = again.cost.isfinite() & ~(again.cost >= solution.cost[which])  # a start may have had no cost at all
         solution = replaced(solution, which[gained], again, gained)
         open_ = torch.zeros_like(open_).index_fill(0, which[gained], True)
     return solution

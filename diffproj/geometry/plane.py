@@ -165,7 +165,9 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
 
     def like(self, tensor: Tensor) -> "Plane":
         """The plane ready to meet `tensor`: one made of Python numbers takes on its dtype and device."""
-        return self.to(tensor.device, tensor.dtype) if self.adopts else self
+        if not self.adopts:
+            return self
+        return self.unchecked(self.normal.to(tensor), self.offset.to(tensor), self.is_per_point)
 
     def __getitem__(self, index: Any) -> "Plane":
         """Planes picked from the batch, as one indexes a tensor of shape `*B`; one for each point is not indexed.
