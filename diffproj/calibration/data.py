@@ -100,6 +100,6 @@ def _check_points(points: Tensor) -> None:
     extent = points.abs().amax()
     if bool(apart.amin() <= 1e-9 * extent):
         i, j = divmod(int(apart.argmin()), len(points))
-        raise ValueError(f"target: want distinct points, got {i} and {j} alike")
+        raise ValueError(f"target: want points that are all distinct, got {len(points)} with {i} and {j} alike")
     if float(torch.linalg.svdvals(points[:, :2])[1]) <= 1e-9 * float(extent):
         raise ValueError("target: want points that do not lie on one line")

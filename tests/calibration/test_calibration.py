@@ -860,6 +860,14 @@ def test_bad_input_is_refused_by_name() -> None:
             lambda: dp.locate(views, board, dp.Camera(K, size=(320, 240))),
         ),
         (TypeError, "camera: want dp.Camera", lambda: dp.refine(batch, board, "camera")),
+        (TypeError, r"refine: want \(views, target, camera\) in this order", lambda: dp.refine(truth[0], views, board)),
+        (TypeError, r"locate: want \(views, target, camera\) in this order", lambda: dp.locate(truth[0], views, board)),
+        (
+            TypeError,
+            "calibrate: want options of weights, .*, got 'wieghts'",
+            lambda: dp.calibrate(views, board, wieghts=1),
+        ),
+        (TypeError, "locate: want options of .*, got 'bow'", lambda: dp.locate(views, board, truth[0], bow=True)),
     ]
     for kind, message, call in cases:
         with pytest.raises(kind, match=message):
