@@ -98,23 +98,31 @@ def better_poses(task: Task, solution: Solution, cameras: Tensor) -> tuple[Pose,
 
 
 def found_again(task: Task, solution: Solution, lost: Tensor) -> Solution:
-    """The solution with the poses of lost views `(P, V)` sought anew, wrong corners among theirs borne."""
+    """The solution with the poses of lost views `(P, V)` sought anew, robust against wrong corners among theirs."""
     lost = lost & (task.used.sum(-1) >= 4)
-    if not bool(lost.any()):
-        return solution
-    residual = task.problem.linearise(solution.shared, solution.local)[:, :, -1]
-    level = torch.where((task.used & ~lost.unsqueeze(-1)).unsqueeze(2), residual.abs(), torch.nan).nanmedian()
+    local = solution.local
+    for p in lost.any(-1).nonzero().flatten().tolist():  # few cameras, and each has a noise of its own
+        one = slice(p, p + 1)
+        poses = _found_again(task.part(one), solution.shared[one], tuple(z[one] for z in local), lost[one])
+        which = torch.tensor([p], device=lost.device)
+        local = tuple(z.index_copy(0, which, new) for z, new in zip(local, poses, strict=True))
+    return solution._replace(local=local)
+
+
+def _found_again(task: Task, shared: Tensor, poses: Pose, lost: Tensor) -> Pose:
+    """The same for one camera: poses under Cauchy's loss, its scale falling to that of the other views' residuals."""
+    residual = task.problem.linearise(shared, poses)[:, :, -1]
+    known = (task.used & ~lost.unsqueeze(-1)).unsqueeze(2)
+    level = 4 * float(torch.where(known, residual.abs(), torch.nan).nanmedian().nan_to_num(0.0))
     unit = 1.0 if task.objective == "image" else 1e-3 * float(task.points.abs().amax())
-    least, scale = max(4 * float(level), 1e-9 * unit), max(4 * float(level), unit)
+    least, scale = max(level, 1e-9 * unit), max(level, unit)
     robust = replace(task, loss=task.loss or Cauchy(scale))
-    here = view_costs(robust, solution.shared, solution.local)
-    poses, _ = _sought(robust, solution.shared, solution.local, here, lost)
-    while task.loss is None and scale > least:  # the closer, the less wrong corners pull
+    poses, _ = _sought(robust, shared, poses, view_costs(robust, shared, poses), lost)
+    while task.loss is None and scale > least:  # the smaller the scale, the less wrong corners pull
         scale = max(scale / 30, least)
         robust = replace(task, loss=Cauchy(scale))
-        here = view_costs(robust, solution.shared, poses)
-        poses, _, _ = _exchanged(robust, solution.shared, poses, here, poses, lost)
-    return solution._replace(local=poses)
+        poses, _, _ = _exchanged(robust, shared, poses, view_costs(robust, shared, poses), poses, lost)
+    return poses
 
 
 def _sought(task: Task, shared: Tensor, poses: Pose, here: Tensor, lost: Tensor) -> tuple[Pose, Tensor]:
