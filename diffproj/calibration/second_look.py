@@ -6,8 +6,8 @@ lens that stands for what the poses should explain. A camera is looked at again 
 * the solver did not converge, or took many steps, as it does in narrow valleys, or
 * where outliers were rejected, neighbouring corners are off in the same direction, as noise is not.
 
-Then starts compete. For focal lengths on a grid each view takes the better of its two poses, as a step of Gauss and
-Newton predicts their costs; the grid's best focal lengths, with and without the lens's first estimate, are solved side
+Then starts compete. For focal lengths on a grid each view takes the better of its two poses, as a Gauss-Newton step
+predicts their costs; the grid's best focal lengths, with and without the lens's first estimate, are solved side
 by side, and what ends lowest is kept. A minimum is only ever replaced by a lower one.
 """
 
@@ -24,7 +24,7 @@ from diffproj.calibration.parametrisation import Pose
 from diffproj.calibration.solver import Status
 from diffproj.calibration.start import Straightened
 from diffproj.calibration.task import Task
-from diffproj.calibration.two_poses import chosen_cameras, predicted_costs, replaced
+from diffproj.calibration.two_poses import predicted_costs, replaced
 
 FOCAL_GRID = tuple(0.3 * 1.5**i for i in range(14))
 """Focal lengths to look at, in units of the image's longer side: from a field of view of 118 degrees to one of 1."""
@@ -86,7 +86,7 @@ def second_look(
         which = doubtful(found, rejecting=reject is not None).nonzero().flatten()
         if len(which) == 0:
             return found
-        task = chosen_cameras(replace(found.task, used=found.task.used | found.rejected), which)
+        task = replace(found.task, used=found.task.used | found.rejected).part(which)
         first = found.solution.shared[which]
         lenses = [straight.part(which)]
         if bool(straight.lam.any()):
@@ -95,13 +95,13 @@ def second_look(
         every = torch.arange(len(which), device=which.device).repeat(len(starts))
         shared = torch.cat([shared for shared, _ in starts])
         poses = tuple(torch.cat(parts) for parts in zip(*(poses for _, poses in starts), strict=True))
-        poorer = _poorer(chosen_cameras(task, every))
+        poorer = _poorer(task.part(every))
     short: dict[str, Any] = steps | {"max_iterations": SHORT_FIT}
     if poorer is not None:
         near = fit(poorer, shared, poses, **short).solution
         shared, poses = near.shared, near.local
     # Side by side, as one batch: the time of few views is that of the calls. Only the best goes on to the end.
-    others = fit(chosen_cameras(task, every), shared, poses, reject=reject, **short)
+    others = fit(task.part(every), shared, poses, reject=reject, **short)
     rows = torch.arange(len(which), device=which.device)
     best = _part(others, rows)
     for rank in range(1, len(starts)):
@@ -132,7 +132,7 @@ def _part(found: Fit, rows: Tensor) -> Fit:
         parts = [cut(part) for part in whole]  # type: ignore[attr-defined]
         return type(whole)(*parts) if hasattr(whole, "_fields") else tuple(parts)
 
-    return Fit(chosen_cameras(found.task, rows), cut(found.solution), found.rejected[rows])  # type: ignore[arg-type]
+    return Fit(found.task.part(rows), cut(found.solution), found.rejected[rows])  # type: ignore[arg-type]
 
 
 def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Tensor, Pose]]:
@@ -215,7 +215,7 @@ def _lower(found: Fit, other: Fit, which: Tensor, reject: float | None) -> Fit:
 
 def _truncated(found: Fit, other: Fit, which: Tensor, reject: float) -> tuple[Tensor, Tensor]:
     """Costs `(n,)` of two fits that reject different corners: all corners count, each at most at the limit."""
-    given = chosen_cameras(replace(found.task, used=found.task.used | found.rejected), which)
+    given = replace(found.task, used=found.task.used | found.rejected).part(which)
     residuals = []
     for fitted, rows in ((found, which), (other, torch.arange(len(which), device=which.device))):
         shared, poses = fitted.solution.shared[rows], tuple(z[rows] for z in fitted.solution.local)

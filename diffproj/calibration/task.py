@@ -65,8 +65,8 @@ class Task:
         kind = BoardError if self.objective == "plane" else Reprojection
         return kind(self.points, self.pixels, self.used, self.lens, self.bow)
 
-    def part(self, where: slice) -> "Task":
-        """The task for a slice of the cameras."""
+    def part(self, where: slice | Tensor) -> "Task":
+        """The task of some of the cameras."""
         cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}
         cut |= {name: None if (whole := getattr(self, name)) is None else whole[where] for name in ("weights", "basis")}
         prior = None if self.prior is None else Prior(*(part[where] for part in self.prior))

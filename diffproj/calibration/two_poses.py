@@ -22,7 +22,7 @@ from diffproj.calibration import closed_form
 from diffproj.calibration.losses import Cauchy
 from diffproj.calibration.options import Progress
 from diffproj.calibration.parametrisation import POSE, Pose
-from diffproj.calibration.solver import Prior, Solution
+from diffproj.calibration.solver import Solution
 from diffproj.calibration.task import Task, solved
 from diffproj.geometry.cayley import turned
 
@@ -62,7 +62,7 @@ def settled(
         if not bool(changed.any()):
             break
         which = changed.nonzero().flatten()
-        again = solved(chosen_cameras(task, which), solution.shared[which], tuple(z[which] for z in poses), **options)
+        again = solved(task.part(which), solution.shared[which], tuple(z[which] for z in poses), **options)
         gained = again.cost.isfinite() & ~(again.cost >= solution.cost[which])  # a start may have had no cost at all
         solution = replaced(solution, which[gained], again, gained)
         open_ = torch.zeros_like(open_).index_fill(0, which[gained], True)
@@ -240,14 +240,6 @@ def predicted_costs(task: Task, shared: Tensor, poses: Pose) -> Tensor:
     y = torch.linalg.solve_triangular(L, h, upper=False)
     predicted = cost - y.square().sum((-2, -1)) / 2
     return torch.where((failed == 0) & predicted.isfinite(), predicted.clamp(min=0), torch.inf)
-
-
-def chosen_cameras(task: Task, which: Tensor) -> Task:
-    """The task of some of the cameras `(n,)`."""
-    parts = {name: getattr(task, name) for name in ("pixels", "used", "weights", "basis")}
-    cut = {name: None if whole is None else whole[which] for name, whole in parts.items()}
-    prior = None if task.prior is None else Prior(*(part[which] for part in task.prior))
-    return replace(task, **cut, prior=prior)
 
 
 def replaced(solution: Solution, which: Tensor, other: Solution, taken: Tensor) -> Solution:
