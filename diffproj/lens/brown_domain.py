@@ -30,6 +30,8 @@ MIN_DENOMINATOR = 2.0**-10
 """Least denominator, relative to the sum of its terms' magnitudes; below it rounding errors grow 1000-fold."""
 MIN_CLEARANCE = 0.125
 """The same for the depth `W` of the tilt; larger, because near its horizon the Jacobian changes within a degree."""
+MIN_FACING = 2.0**-10
+"""Least `cos(tau_x) cos(tau_y)`: a sensor seen edge-on has no image, and close to it rounding errors grow 1000-fold."""
 MAX_TABLE_RADIUS = 8.0
 """Largest radius of the table of the inverse: 83 degrees from the axis."""
 EDGE_DIRECTIONS = 360
@@ -121,11 +123,13 @@ class _Circles:
         determinant = (xx / size) * (yy / size) - (mixed / size) ** 2
         good = self._positive(determinant) if number else (determinant @ self.doubling > 0).all(-1)
         good &= (trace > 0).all(-1) & _away_from_pole(self.terms, radius * radius).all(-1)
-        if self.terms.tilt is None:
+        tilt = self.terms.tilt
+        if tilt is None:
             return good
         x, y = bend(self.terms, radius * self.cosine, radius * self.sine)
         x, y = (part @ self.doubling for part in (x, y))
-        return good & (self.terms.tilt.clearance(x, y) > MIN_CLEARANCE).all(-1)
+        facing = (tilt.cos_x * tilt.cos_y).squeeze(-1) > MIN_FACING
+        return good & facing & (tilt.clearance(x, y) > MIN_CLEARANCE).all(-1)
 
     def _positive(self, samples: Tensor) -> Tensor:
         """Whether trigonometric polynomials, given by their samples, are positive in all directions."""

@@ -115,6 +115,17 @@ def check_honest(lens: BrownConrady | KannalaBrandt) -> None:
     assert (gradient[~valid] == 0).all()
 
 
+@pytest.mark.parametrize("tau", [math.pi / 2, math.pi / 2 - 1e-5, -math.pi / 2])
+@pytest.mark.parametrize("bend", [0.0, 23663.0])
+def test_a_sensor_seen_edge_on_has_no_image(tau: float, bend: float) -> None:
+    coefficients = torch.zeros(2, 14, dtype=torch.float64)
+    coefficients[:, 2] = bend
+    coefficients[0, 12], coefficients[1, 13] = tau, tau
+    lens = BrownConrady(coefficients)
+    assert (lens.domain == 0).all()
+    assert not lens.undistort(torch.zeros(2, 1, 2, dtype=torch.float64) + 1e-17)[1].any()
+
+
 @pytest.mark.slow
 @settings(SETTINGS, max_examples=1500)
 @given(sane_lenses())
