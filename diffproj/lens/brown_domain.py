@@ -58,6 +58,15 @@ def length_scale(coefficients: Tensor) -> Tensor:
     return torch.where(strongest == 0, 1, 1 / strongest).clamp_max(1e12)
 
 
+def last_crossing(coefficients: Tensor) -> Tensor:
+    """Radius beyond which the term of highest order dominates all others, `(*B,)`; 0 if there is one term or none."""
+    powers = coefficients.new_tensor(RADIUS_POWERS[: coefficients.shape[-1]])
+    size = coefficients[..., : len(powers)].abs().log()
+    steps = powers.unsqueeze(-1) - powers  # from the power of the second term to that of the first
+    crossing = (size.unsqueeze(-2) - size.unsqueeze(-1)) / steps.clamp_min(1)
+    return torch.where((steps > 0) & crossing.isfinite(), crossing, -torch.inf).amax((-2, -1)).exp().clamp_max(1e12)
+
+
 def domain_radius(coefficients: Tensor) -> Tensor:
     """Radius of the disc `(*B,)` for coefficients `(*B, k)` in float64; 0 where they are not finite."""
     if coefficients.ndim > 1 and coefficients.shape[-1] > 8:
@@ -68,7 +77,7 @@ def domain_radius(coefficients: Tensor) -> Tensor:
 
 def _domain_radius(coefficients: Tensor) -> Tensor:
     scale = length_scale(coefficients)
-    grid = scale.unsqueeze(-1) * radius_grid(coefficients)
+    grid = radius_grid(scale, 10 * last_crossing(coefficients))
     if coefficients.shape[-1] <= 8:
         radius, failed = first_failure(_ClosedForm(coefficients), grid)
     else:

@@ -12,7 +12,7 @@ from torch import Tensor
 UNIFORM_END = 4.0
 """End of the grid's uniform part, in units of the lens's length scale; from there on it is geometric."""
 GRID_END = 1e6
-"""End of the grid, in the same unit: beyond, the term of highest order dominates."""
+"""End of the grid, in the same unit, at least: beyond, the term of highest order dominates."""
 UNIFORM_NODES, GEOMETRIC_NODES = 192, 192
 CELL_NODES, ROUNDS = 128, 6
 """Nodes of the finer grids, and the number of grids in all."""
@@ -20,11 +20,15 @@ CELL_NODES, ROUNDS = 128, 6
 Property = Callable[[Tensor, int], Tensor]
 
 
-def radius_grid(like: Tensor) -> Tensor:
-    """Radii from nearly 0 to `GRID_END`, in units of the lens's length scale."""
-    near = torch.linspace(UNIFORM_END / UNIFORM_NODES, UNIFORM_END, UNIFORM_NODES, dtype=like.dtype, device=like.device)
-    far = torch.linspace(0, 1, GEOMETRIC_NODES + 1, dtype=like.dtype, device=like.device)[1:]
-    return torch.cat([near, UNIFORM_END * (GRID_END / UNIFORM_END) ** far])
+def radius_grid(scale: Tensor, last: Tensor) -> Tensor:
+    """Radii `(*B, M)` from nearly 0 to `GRID_END` times the lens's length scale `(*B,)`, or to `last` if that is more."""
+    near = torch.linspace(
+        UNIFORM_END / UNIFORM_NODES, UNIFORM_END, UNIFORM_NODES, dtype=scale.dtype, device=scale.device
+    )
+    far = torch.linspace(0, 1, GEOMETRIC_NODES + 1, dtype=scale.dtype, device=scale.device)[1:]
+    end = (last / scale).clamp_min(GRID_END).unsqueeze(-1)
+    far = UNIFORM_END * (end / UNIFORM_END) ** far
+    return scale.unsqueeze(-1) * torch.cat([near.expand(*far.shape[:-1], UNIFORM_NODES), far], dim=-1)
 
 
 def first_failure(

@@ -126,6 +126,13 @@ def test_a_sensor_seen_edge_on_has_no_image(tau: float, bend: float) -> None:
     assert not lens.undistort(torch.zeros(2, 1, 2, dtype=torch.float64) + 1e-17)[1].any()
 
 
+def test_a_fold_far_beyond_the_strongest_terms_reach_is_seen() -> None:
+    strong, weak = 419828660842.0, -14366218744.0
+    lens = BrownConrady(torch.tensor([strong, 0, 0, 0, weak], dtype=torch.float64))
+    # 1 + 3 k1 r^2 + 7 k3 r^6 = 0
+    assert float(lens.domain) == pytest.approx((3 * strong / (7 * -weak)) ** 0.25, rel=1e-9)
+
+
 @pytest.mark.slow
 @settings(SETTINGS, max_examples=1500)
 @given(sane_lenses())
