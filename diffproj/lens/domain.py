@@ -21,7 +21,7 @@ Property = Callable[[Tensor, int], Tensor]
 
 
 def radius_grid(scale: Tensor, last: Tensor) -> Tensor:
-    """Radii `(*B, M)` from nearly 0 to `GRID_END` times the lens's length scale `(*B,)`, or to `last` if that is more."""
+    """Radii `(*B, M)` from nearly 0 to `GRID_END` times the length scale `(*B,)`, or to `last` if that is more."""
     near = torch.linspace(
         UNIFORM_END / UNIFORM_NODES, UNIFORM_END, UNIFORM_NODES, dtype=scale.dtype, device=scale.device
     )
