@@ -9,10 +9,11 @@ scores, the gradients of the residuals' cost. To first order, the errors of the 
 so that a few small blocks per view give any entry of the full covariance, which for a thousand views would have 36
 million. Two forms:
 
-* least squares with equal weights: M is `sigma^2` times the normal matrix, with the residual variance
-  `sigma^2 = sum |e|^2 / (2 n - parameters)`;
-* with weights, a robust loss or the plane objective: the sandwich (robust) covariance, with M estimated from the
-  residuals (White 1980) and the second derivative of the loss in the normal matrix (Huber 1981).
+* M is a variance times the normal matrix, for least squares the residual variance
+  `sigma^2 = sum w |e|^2 / (2 n - parameters)`;
+* M is another matrix, as for the plane objective: the sandwich.
+
+What these variances and matrices are for each kind of fit, `uncertainty.py` says.
 
 A prior counts as a measurement with the prior's covariance.
 
@@ -21,7 +22,7 @@ A parameter that the corners do not determine has infinite variance, and covaria
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -45,12 +46,16 @@ class Covariance:
         shared: their covariance `(*B, s, s)`; rows of fixed parameters are 0.
         undetermined: which shared parameters the corners do not determine `(*B, s)`.
         undetermined_views: which poses they do not determine `(*B, V)`.
+        dispersion: how many times larger the variances are than they would be if all corners erred independently of
+            each other `(*B,)`, at least 1: how much more the views contradict each other than such corners would. The
+            square root divides a deviation for a comparison with tools that do not look for it.
     """
 
     names: tuple[str, ...]
     shared: Float[Tensor, "*batch s s"]
     undetermined: Bool[Tensor, "*batch s"]
     undetermined_views: Bool[Tensor, "*batch v"]
+    dispersion: Float[Tensor, "*batch"]
     _follow: Tensor  # F_v^T (*B, V, 6, s): minus the derivative of the pose by the shared parameters
     _mixed: Tensor  # Cov(W_v^-1 h_v, dx), (*B, V, 6, s)
     _alone: Tensor  # Cov(W_v^-1 h_v), (*B, V, 6, 6)
@@ -114,6 +119,7 @@ class Covariance:
     def to_fields(self) -> dict[str, Any]:
         """Everything in it as plain lists, for a file. An infinite variance is 0 here; the masks tell where."""
         tensors = {
+            "dispersion": self.dispersion,
             "shared": torch.where(self.shared.isfinite(), self.shared, 0.0),
             "follow": self._follow,
             "mixed": self._mixed,
@@ -144,8 +150,11 @@ class Covariance:
         shared, *blocks = (
             torch.tensor(fields[key], dtype=torch.float64) for key in ("shared", "follow", "mixed", "alone")
         )
+        dispersion = torch.ones_like(shared[..., 0, 0])  # a file of an earlier version has none
+        if "dispersion" in fields:
+            dispersion = torch.tensor(fields["dispersion"], dtype=torch.float64)
         infinite = torch.diag_embed(torch.where(undetermined, torch.inf, 0.0).to(shared))
-        return cls(tuple(fields["names"]), shared + infinite, undetermined, undetermined_views, *blocks)
+        return cls(tuple(fields["names"]), shared + infinite, undetermined, undetermined_views, dispersion, *blocks)
 
 
 def zero_where_infinite(covariance: Tensor) -> Tensor:
@@ -153,8 +162,7 @@ def zero_where_infinite(covariance: Tensor) -> Tensor:
     return torch.where(covariance.isinf(), 0.0, covariance)
 
 
-@dataclass(frozen=True, eq=False)
-class Scores:
+class Scores(NamedTuple):
     """Covariance of the scores per view: shared-shared `(P, V, s, s)`, shared-local, local-local."""
 
     U: Tensor
@@ -170,6 +178,7 @@ def covariance(
     basis: Tensor | None = None,
     precision: Tensor | None = None,
     scores: Scores | None = None,
+    dispersion: Tensor | None = None,
 ) -> Covariance:
     """The covariance of P calibrations, from their normal equations.
 
@@ -180,7 +189,10 @@ def covariance(
         basis: of the free directions of the shared parameters `(P, s, q)`; all if left out.
         precision: the prior's `(P, s, s)`.
         scores: covariance of the scores, for the sandwich form.
+        dispersion: factor on the covariance of the scores `(P,)`; 1 if left out.
     """
+    dispersion = torch.ones_like(equations.U[:, 0, 0]) if dispersion is None else dispersion
+    phi = dispersion[:, None, None]
     U, E, W = equations.U, equations.E, equations.W
     if basis is not None:
         T = basis.mT
@@ -188,17 +200,18 @@ def covariance(
         precision = None if precision is None else T @ precision @ basis
         if scores is not None:
             scores = Scores(T.unsqueeze(1) @ scores.U @ basis.unsqueeze(1), T.unsqueeze(1) @ scores.E, scores.W)
-    inverse_W, unknown_views = _local_inverse(W)
+    inverse_W, unknown_views = local_inverse(W)
     F = E @ inverse_W  # (P, V, q, 6)
     S = U - (F @ E.mT).sum(1)
     inverse_S, unknown = _inverse(S, U.diagonal(dim1=-2, dim2=-1))
     prior = torch.zeros_like(S) if precision is None else precision
     if scores is None:
-        v = variance[:, None, None]
+        v = variance[:, None, None] * phi
         middle = v * (S - prior) + prior
         mixed = torch.zeros_like(F.mT)
         alone = v.unsqueeze(1) * inverse_W
     else:
+        scores = Scores(*(phi.unsqueeze(1) * block for block in scores))
         leaning = F @ scores.E.mT
         middle = (scores.U - leaning - leaning.mT + F @ scores.W @ F.mT).sum(1) + prior
         mixed = inverse_W @ (scores.E.mT - scores.W @ F.mT) @ inverse_S.unsqueeze(1)
@@ -213,14 +226,14 @@ def covariance(
     shared = (shared + shared.mT) / 2
     shared = torch.where(unknown.unsqueeze(-1) | unknown.unsqueeze(-2), 0.0, shared)
     shared = shared + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(shared))
-    return Covariance(tuple(names), shared, unknown, unknown_views, follow, mixed, (alone + alone.mT) / 2)
+    return Covariance(tuple(names), shared, unknown, unknown_views, dispersion, follow, mixed, (alone + alone.mT) / 2)
 
 
 def reshaped(covariance: Covariance, batch: Sequence[int]) -> Covariance:
     """The covariance of `(P, ...)` problems with the batch shape `*B` in the place of P."""
     parts = {
         name: getattr(covariance, name).unflatten(0, batch) if batch else getattr(covariance, name).squeeze(0)
-        for name in ("shared", "undetermined", "undetermined_views", "_follow", "_mixed", "_alone")
+        for name in ("shared", "undetermined", "undetermined_views", "dispersion", "_follow", "_mixed", "_alone")
     }
     return Covariance(covariance.names, **parts)
 
@@ -239,7 +252,7 @@ def _inverse(S: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
     return inverse * scale.unsqueeze(-1) * scale.unsqueeze(-2), unknown
 
 
-def _local_inverse(W: Tensor) -> tuple[Tensor, Tensor]:
+def local_inverse(W: Tensor) -> tuple[Tensor, Tensor]:
     """The inverses of the poses' blocks `(P, V, 6, 6)`, 0 for a singular block, and which blocks are singular."""
     size = W.diagonal(dim1=-2, dim2=-1)
     scale = torch.where((size > 0) & size.isfinite(), size, 1.0).rsqrt()

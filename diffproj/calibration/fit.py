@@ -1,4 +1,4 @@
-"""From initial estimates to a fit: solve, reject outliers, solve again; and the covariance of the result.
+"""From initial estimates to a fit: solve, reject outliers, solve again.
 
 Everything here works on a batch of P cameras, with batch axes flattened. `Task` defines the minimisation problem;
 `fit` runs the solver over it in blocks of cameras.
@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration import covariance as covariances
-from diffproj.calibration.covariance import Covariance, Scores
-from diffproj.calibration.losses import Loss
+from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.options import Progress
 from diffproj.calibration.parametrisation import POSE
-from diffproj.calibration.solver import Equations, Solution, select
+from diffproj.calibration.solver import Solution, select
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import found_again, settled
 
@@ -64,7 +63,7 @@ class Fit:
         return 2 * used.sum((-2, -1)) - len(shared) - POSE * used.any(-1).sum(-1)
 
     def plain_covariance(self) -> Covariance:
-        """The covariance for least squares with equal weights."""
+        """The covariance for least squares, whatever the loss and the objective: what verdicts go by."""
         prior = self.task.prior
         return covariances.covariance(
             self.solution.equations,
@@ -73,65 +72,6 @@ class Fit:
             basis=self.task.basis,
             precision=None if prior is None else prior.precision,
         )
-
-    def covariance(self) -> Covariance:
-        """The covariance, in the sandwich form where the task needs it: see `diffproj.calibration.covariance`."""
-        task = self.task
-        if task.weights is None and task.loss is None and task.objective == "image":
-            return self.plain_covariance()
-        shared, local = self.solution.shared.detach(), tuple(z.detach() for z in self.solution.local)
-        panel = task.problem.linearise(shared, local)
-        rows, residual = panel[:, :, :-1], panel[:, :, -1]
-        score = (rows * residual.unsqueeze(2)).sum(3)  # (P, V, s + 6, N): per corner, unweighted
-        squared = residual.square().sum(2)
-        weight = torch.ones_like(squared) if task.weights is None else task.weights
-        slope, bend = _derivatives(task.loss, squared)
-        flat = rows.flatten(-2)
-        both = (weight * slope).unsqueeze(2)
-        H = (flat * both.repeat(1, 1, 1, 2)) @ flat.mT + (score * (2 * weight * bend).unsqueeze(2)) @ score.mT
-        kept = self._finite_sample_factor(weight, slope, bend, squared)[:, None, None, None]
-        M = (score * both.square()) @ score.mT / kept
-        s = len(task.names)
-        U = H[..., :s, :s].sum(1)
-        precision = None if task.prior is None else task.prior.precision
-        return covariances.covariance(
-            Equations(
-                U if precision is None else U + precision,
-                H[..., :s, s:],
-                H[..., s:, s:],
-                *self.solution.equations[3:],
-            ),
-            task.names,
-            torch.ones_like(U[:, 0, 0]),
-            basis=task.basis,
-            precision=precision,
-            scores=Scores(M[..., :s, :s], M[..., :s, s:], M[..., s:, s:]),
-        )
-
-    def _finite_sample_factor(self, weight: Tensor, slope: Tensor, bend: Tensor, squared: Tensor) -> Tensor:
-        """Finite-sample correction of the sandwich covariance: how much fitting shrinks squared scores, `(P,)`.
-
-        Fitting reduces a residual of leverage h by `h psi(e) / mean A`, with psi the score and A its derivative. To
-        first order in the mean leverage h (parameters over residual components), mean `psi^2` is reduced by the factor
-
-            1 - h (2 mean(psi A psi) / (mean(psi^2) mean A) - mean(A^2) / (mean A)^2)
-
-        which is 1 - h for least squares, and closer to 1 with outliers, whose bounded score hardly changes. The factor
-        is at least 0.1.
-        """
-        used = self.task.used.to(squared)
-        n = used.sum((-2, -1))
-        h = 1 - self.degrees_of_freedom() / (2 * n)
-
-        def mean(values: Tensor) -> Tensor:
-            return (values * used).sum((-2, -1)) / n
-
-        psi = (weight * slope).square() * squared
-        A = weight * (slope + bend * squared)
-        A_squared = weight.square() * (slope.square() + 2 * slope * bend * squared + 2 * (bend * squared).square())
-        psi_A_psi = weight * (slope + 2 * bend * squared) * psi
-        taken = 2 * mean(psi_A_psi) / (mean(psi) * mean(A)) - mean(A_squared) / mean(A).square()
-        return (1 - h * taken).clamp(min=0.1)
 
 
 def fit(
@@ -220,14 +160,3 @@ def _inliers(task: Task, solution: Solution, limit: float) -> Tensor:
 def _robust_sigma(residual: Tensor, used: Tensor) -> Tensor:
     """Robust std `(P,)`: 1.4826 times the median absolute component of residuals `(P, V, 2, N)`."""
     return 1.4826 * torch.where(used.unsqueeze(2), residual.abs(), torch.nan).flatten(1).nanmedian(-1).values
-
-
-def _derivatives(loss: Loss | None, squared: Tensor) -> tuple[Tensor, Tensor]:
-    """First and second derivative, rho' and rho'', of the loss by the squared residual."""
-    if loss is None:
-        return torch.ones_like(squared), torch.zeros_like(squared)
-    with torch.enable_grad():
-        e2 = squared.detach().requires_grad_()
-        slope = loss.weight(e2)
-        bend = torch.autograd.grad(slope.sum(), e2, allow_unused=True)[0] if slope.requires_grad else None
-    return slope.detach(), torch.zeros_like(squared) if bend is None else bend

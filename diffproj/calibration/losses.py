@@ -89,3 +89,14 @@ class Cauchy(_Scaled):
     def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`1 / (1 + e2 / scale^2)`."""
         return 1 / (1 + squared / self.scale**2)
+
+
+def slope_and_bend(loss: Loss | None, squared: Tensor) -> tuple[Tensor, Tensor]:
+    """First and second derivative, rho' and rho'', of a loss by the squared residual; least squares if `None`."""
+    if loss is None:
+        return torch.ones_like(squared), torch.zeros_like(squared)
+    with torch.inference_mode(False), torch.enable_grad():
+        e2 = squared.detach().clone().requires_grad_()
+        slope = loss.weight(e2)
+        bend = torch.autograd.grad(slope.sum(), e2, allow_unused=True)[0] if slope.requires_grad else None
+    return slope.detach(), torch.zeros_like(squared) if bend is None else bend

@@ -14,6 +14,7 @@ from diffproj.calibration.options import Options
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Prior, Status
+from diffproj.calibration.uncertainty import covariance_of
 from diffproj.calibration.verdict import verdicts
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import LensModel
@@ -99,5 +100,5 @@ def outcome(
 
 
 def _covariance(found: Fit, batch: tuple[int, ...], known: Covariance | None) -> Covariance:
-    own = reshaped(found.covariance(), batch)
+    own = reshaped(covariance_of(found), batch)
     return own if known is None else own.following(known)

@@ -1,0 +1,118 @@
+"""How much more the views contradict each other than independent corners would: the dispersion of a calibration.
+
+The residuals tell the noise of a corner. That is the whole error only where corners err independently. A board that is
+not flat, a corner detector misled by blur or a lens that the model does not reach give errors that go together within a
+view, and they shift the parameters far more than their share in the residuals says: on real photographs, two to three
+times as much.
+
+Each view says for itself where it wants the shared parameters: with its pose eliminated, its pull is u_v, and under
+independent corners the covariance of the pull is K_v. Over all views
+
+    phi = sum u_v^T K_v^+ u_v / (sum rank K_v - free parameters)
+
+is 1 if corners err independently (the analysis of variance: between views over within views), and the factor by which
+the variances of the parameters are too small if not. What it exceeds 1 by is taken for what it is where it stands out
+of chance, and shrunk where it does not; and it counts more where few views tell it, for it is an average over all
+directions of the parameters, of which one may be far worse: on random subsets of real sets of views, errors then are
+what they are said to be.
+"""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.covariance import local_inverse
+from diffproj.calibration.fit import Fit
+from diffproj.calibration.losses import slope_and_bend
+from diffproj.calibration.task import Task
+
+FEW_VIEWS = 2.5
+"""The excess counts `1 + FEW_VIEWS / (views - 1)` fold."""
+SINGULAR = 1e-9
+"""Eigenvalue of K_v, relative to the largest, below which the view says nothing in this direction."""
+
+
+def dispersion(found: Fit) -> Tensor:
+    """The factor `(P,)`, at least 1, on the covariance that independent corners would give.
+
+    1 where it is not known: with one view, or where no shared parameter is free.
+    """
+    task, solution = found.task, found.solution
+    shared, local = solution.shared.detach(), tuple(z.detach() for z in solution.local)
+    free = shared.shape[-1] if task.basis is None else task.basis.shape[-1]
+    if free == 0 or task.used.shape[1] < 2:
+        return torch.ones_like(shared[:, 0])
+    with torch.inference_mode():
+        phi, spare, views = _between_over_within(task, shared, local, found.degrees_of_freedom())
+        excess = (phi - 1).clamp(min=0)
+        excess = excess.pow(3) / (excess.square() + 2 / spare)  # 2 / spare: phi's own variance for independent corners
+        factor = 1 + excess * (1 + FEW_VIEWS / (views - 1).clamp(min=1))
+        factor = torch.where((spare >= 1) & factor.isfinite(), factor, 1.0)
+    return factor.clone()
+
+
+def _between_over_within(
+    task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Phi `(P,)`, its degrees of freedom, and how many views say something; `redundant (P,)` are those of the fit."""
+    rows, residual, pull_weight, variance = _weighted(task, shared, local, redundant)
+    s = shared.shape[-1]
+    if task.basis is not None:
+        rows = torch.cat([torch.einsum("psq,pvskn->pvqkn", task.basis, rows[:, :, :s]), rows[:, :, s:]], dim=2)
+        s = task.basis.shape[-1]
+
+    def products(weight: Tensor, columns: Tensor) -> Tensor:
+        return (rows * weight[:, :, None, None]).flatten(-2) @ columns.flatten(-2).mT
+
+    N = products(pull_weight, torch.cat([rows, residual.unsqueeze(2)], dim=2))
+    K = products(variance, rows)
+    F = N[..., :s, s:-1] @ local_inverse(N[..., s:, s:-1])[0]  # E_v W_v^-1: eliminates the pose
+    u = N[..., :s, -1] - (F @ N[..., s:, -1:]).squeeze(-1)
+    S = N[..., :s, :s] - F @ N[..., s:, :s]
+    leaning = F @ K[..., s:, :s]
+    K = K[..., :s, :s] - leaning - leaning.mT + F @ K[..., s:, s:] @ F.mT
+    sound = task.used.any(-1) & K.isfinite().all(-1).all(-1) & u.isfinite().all(-1)
+    u = torch.where(sound.unsqueeze(-1), u, 0.0)
+    S, K = (torch.where(sound[..., None, None], M, 0.0) for M in (S, K))
+
+    # Where the minimum is another's, the plane objective's say, the pulls do not sum to 0: they are taken from where
+    # they do. A prior's pull is among them, and what it determines costs no degree of freedom.
+    total, pull = S.sum(1), u.sum(1)
+    if task.prior is not None:
+        Q, off = task.prior.precision, (task.prior.precision @ (shared - task.prior.mean).unsqueeze(-1)).squeeze(-1)
+        T = torch.eye(len(Q[0]), dtype=Q.dtype, device=Q.device) if task.basis is None else task.basis
+        total, pull = total + T.mT @ Q @ T, pull + (T.mT @ off.unsqueeze(-1)).squeeze(-1)
+    inverse = torch.linalg.pinv(total, hermitian=True)
+    u = u - (S @ (inverse @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
+    spent = (inverse * S.sum(1).mT).sum((-2, -1))
+
+    scale = K.diagonal(dim1=-2, dim2=-1).sum(1, keepdim=True).clamp(min=1e-300).rsqrt()
+    values, vectors = torch.linalg.eigh(K * scale.unsqueeze(-1) * scale.unsqueeze(-2))
+    told = values > SINGULAR * values[..., -1:].clamp(min=1e-300)
+    along = (vectors.mT @ (u * scale).unsqueeze(-1)).squeeze(-1)
+    squares = torch.where(told, along.square() / torch.where(told, values, 1.0), 0.0).sum((-2, -1))
+    spare = told.sum((-2, -1)) - spent
+    return squares / spare.clamp(min=1e-9), spare.clamp(min=1e-9), told.any(-1).sum(-1).to(squares)
+
+
+def _weighted(
+    task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Derivatives `(P, V, s + 6, 2, N)` and residuals `(P, V, 2, N)` on the image, in pixels; and for each corner
+    `(P, V, N)` its weight in the pull of its view, and the variance of its part of it.
+    """
+    panel = replace(task, objective="image").problem.linearise(shared, local)
+    rows, residual = panel[:, :, :-1], panel[:, :, -1]
+    weight = torch.ones_like(residual[:, :, 0])
+    if task.weights is not None and task.objective == "image":
+        weight = task.weights
+    slope = weight
+    if task.loss is not None:
+        squared = residual.square().sum(2)
+        if task.objective == "plane":
+            squared = task.problem.linearise(shared, local)[:, :, -1].square().sum(2)
+        slope = weight * slope_and_bend(task.loss, squared)[0]
+    pulls = torch.where(weight > 0, slope.square() / torch.where(weight > 0, weight, 1.0), 0.0)
+    level = (pulls * residual.square().sum(2)).sum((-2, -1)) / redundant.clamp(min=1)
+    return rows, residual, slope, weight * level[:, None, None]
