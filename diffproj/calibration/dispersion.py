@@ -99,8 +99,11 @@ def _between_over_within(
 def _weighted(
     task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Derivatives `(P, V, s + 6, 2, N)` and residuals `(P, V, 2, N)` on the image, in pixels; and for each corner
-    `(P, V, N)` its weight in the pull of its view, and the variance of its part of it.
+    """What the pulls are made of.
+
+    Returns:
+        Derivatives `(P, V, s + 6, 2, N)` and residuals `(P, V, 2, N)` on the image, in pixels; and for each corner
+        `(P, V, N)` its weight in the pull of its view, and the variance of its part of it.
     """
     panel = replace(task, objective="image").problem.linearise(shared, local)
     rows, residual = panel[:, :, :-1], panel[:, :, -1]
