@@ -12,6 +12,7 @@ other pose predicts the cost that its refinement can reach.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -130,11 +131,7 @@ def _sought(task: Task, shared: Tensor, poses: Pose, here: Tensor, lost: Tensor)
     changed = torch.zeros_like(lost[:, 0])
     if not bool(lost.any()):
         return poses, changed
-    R, t = _upright(task, shared)
-    middle = task.points.mean(0)
-    for axis in ((0.0, 0, 0), (1.0, 0, 0), (-1.0, 0, 0), (0, 1.0, 0), (0, -1.0, 0)):
-        turn = turned(R, 2 * math.tan(TILT / 2) * R.new_tensor(axis).expand_as(t))
-        start = turn, t + (R - turn) @ middle
+    for start in tilted_poses(task, shared):
         poses, here, more = _exchanged(task, shared, poses, here, start, lost)
         changed = changed | more
     return poses, changed
@@ -169,15 +166,19 @@ def mean_squares(task: Task, costs: Tensor) -> Tensor:
     return torch.where(total > 0, costs / torch.where(total > 0, total, 1.0), torch.nan)
 
 
-def _upright(task: Task, shared: Tensor) -> Pose:
-    """Poses `(P, V, ...)` of boards that face the camera, where the corners are."""
+def tilted_poses(task: Task, shared: Tensor) -> Iterator[Pose]:
+    """Poses `(P, V, ...)` of boards where the corners are: one that faces the camera, then leaning in four ways."""
     V = task.used.shape[1]
     identity = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(len(shared), V, 3, 3)
     camera = task.parameters.unpack(shared, (identity, torch.zeros_like(identity[..., 0])))
     direction, valid = camera.directions(task.pixels)
-    ahead = valid & (direction[..., 2] > 0.1 * direction.norm(dim=-1))
-    xy = direction[..., :2] / torch.where(ahead, direction[..., 2], 1.0).unsqueeze(-1)
-    return closed_form.upright_poses(task.points, xy, task.used & ahead)
+    sight, xy, ahead = closed_form.turned_rays(direction, task.used & valid)
+    R, t = closed_form.upright_poses(task.points, xy, ahead)
+    R, t = sight @ R, (sight @ t.unsqueeze(-1)).squeeze(-1)
+    middle = task.points.mean(0)
+    for axis in ((0.0, 0, 0), (1.0, 0, 0), (-1.0, 0, 0), (0, 1.0, 0), (0, -1.0, 0)):
+        turn = turned(R, 2 * math.tan(TILT / 2) * (sight @ R.new_tensor(axis)))
+        yield turn, t + (R - turn) @ middle
 
 
 def _weak_perspective(task: Task, shared: Tensor, poses: Pose, costs: Tensor) -> Tensor:
