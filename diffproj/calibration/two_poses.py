@@ -84,7 +84,7 @@ def better_poses(task: Task, solution: Solution, cameras: Tensor) -> tuple[Pose,
     poses = solution.local
     here = solution.equations.c if task.loss is None else view_costs(task, solution.shared, poses)
     seen = task.used.any(-1) & cameras.unsqueeze(-1)
-    rivals = seen & _weak_perspective(task, solution.shared, poses, here)
+    rivals = seen & weak_perspective(task, solution.shared, poses, mean_squares(task, here))
     other = poses
     if bool(rivals.any()):
         other = closed_form.other_pose(poses[0], poses[1], task.points)
@@ -181,8 +181,8 @@ def tilted_poses(task: Task, shared: Tensor) -> Iterator[Pose]:
         yield turn, t + (R - turn) @ middle
 
 
-def _weak_perspective(task: Task, shared: Tensor, poses: Pose, costs: Tensor) -> Tensor:
-    """In which views perspective moves the corners by no more than some residuals `(P, V)`."""
+def weak_perspective(task: Task, shared: Tensor, poses: Pose, variance: Tensor) -> Tensor:
+    """In which views perspective moves the corners by no more than some residuals, of that variance `(P, V)`."""
     R, t = poses
     middle = task.points.mean(0)
     radius = (task.points - middle).square().sum(-1).mean().sqrt()
@@ -190,7 +190,7 @@ def _weak_perspective(task: Task, shared: Tensor, poses: Pose, costs: Tensor) ->
     distance = place.square().sum(-1).clamp(min=1e-300)
     cosine = (R[..., 2] * place).sum(-1).square() / distance
     displacement = 2 * shared[:, None, :2].mean(-1) * radius**2 / distance * (1 - cosine).clamp(min=0).sqrt()
-    residual = mean_squares(task, costs).sqrt()
+    residual = variance.sqrt()
     if task.objective != "image":  # from world units to pixels
         residual = residual * shared[:, None, :2].mean(-1) / distance.sqrt()
     # Seen face on the two poses are one: between them lies no hill that the corners could tell of.
@@ -198,9 +198,12 @@ def _weak_perspective(task: Task, shared: Tensor, poses: Pose, costs: Tensor) ->
     return (displacement <= PERSPECTIVE * residual) & (foreshortening > FACE_ON * residual)
 
 
-def posed(task: Task, shared: Tensor, poses: Pose, p: Tensor, v: Tensor) -> Solution:
+def posed(
+    task: Task, shared: Tensor, poses: Pose, p: Tensor, v: Tensor, max_iterations: int = 20, tolerance: float = 1e-7
+) -> Solution:
     """Poses of the views `(p, v)` alone refined from `poses (P, V, ...)`, the shared parameters `(P, s)` held."""
-    return solved(*_single(task, shared, poses, p, v), max_iterations=20, tolerance=1e-7)
+    single, held, start = _single(task, shared, poses, p, v)
+    return solved(single, held, start, max_iterations=max_iterations, tolerance=tolerance)
 
 
 def _single(task: Task, shared: Tensor, poses: Pose, p: Tensor, v: Tensor) -> tuple[Task, Tensor, Pose]:

@@ -1,0 +1,101 @@
+"""The search for the other pose of each view of a fit, and how likely it is."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration import closed_form
+from diffproj.calibration.ambiguity import OtherPoses, difference
+from diffproj.calibration.fit import Fit
+from diffproj.calibration.parametrisation import Pose
+from diffproj.calibration.two_poses import FEW_CORNERS, posed, tilted_poses, view_costs, weak_perspective
+
+APART = 3.0
+"""Distance of two poses, in standard deviations, up to which the kept one's error bar covers the other."""
+CONTRADICTION = 1e-3
+"""Chance of residuals as large as the fit's under the noise that was known, below which that does not hold here."""
+EXACT_PX = 1e-9
+"""Noise in pixels that is assumed at least: residuals below it are rounding errors, and no odds come of them."""
+
+
+class Noise(NamedTuple):
+    """The noise of corners, as residuals told it.
+
+    Attributes:
+        variance: of a coordinate in squared pixels `(P,)`; NaN where it is not known.
+        freedom: how many degrees of freedom that is from `(P,)`.
+    """
+
+    variance: Tensor
+    freedom: Tensor
+
+
+def other_poses(found: Fit, noise: Noise | None = None) -> OtherPoses:
+    """The best other pose of each view, the shared parameters held.
+
+    The mirrored pose is refined, and for few corners, which may have up to four poses, several tilts are. A view whose
+    perspective is far above its residuals has no other pose worth a search.
+
+    Args:
+        found: the fit of P cameras.
+        noise: what is known of it beforehand; it counts along with the fit's own residuals, unless they contradict it.
+    """
+    with torch.inference_mode():
+        R, t, ratio = _other_poses(found, *_pooled(found, noise))
+    return OtherPoses(R.clone(), t.clone(), ratio.clone())
+
+
+def _other_poses(found: Fit, variance: Tensor, freedom: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    task = found.task
+    shared, kept = found.solution.shared, found.solution.local
+    unit = EXACT_PX if task.objective == "image" else 1e-3 * EXACT_PX * float(task.points.abs().amax())
+    variance, freedom = variance.clamp(min=unit**2).unsqueeze(-1), freedom.unsqueeze(-1)
+    here = view_costs(task, shared, kept)
+    count = task.used.sum(-1)
+    sound = (count >= 4) & here.isfinite()
+    few = sound & (count <= FEW_CORNERS)
+    mirrored = closed_form.other_pose(kept[0], kept[1], task.points)
+    starts = [(mirrored, few | (sound & weak_perspective(task, shared, kept, variance.expand_as(here))))]
+    starts += [(start, few) for start in tilted_poses(task, shared)] if bool(few.any()) else []
+    best, cost = kept, torch.full_like(here, torch.inf)
+    for start, tried in starts:
+        p, v = tried.nonzero(as_tuple=True)
+        if len(p) == 0:
+            continue
+        ended = posed(task, shared, start, p, v, max_iterations=50, tolerance=1e-10)
+        pose = tuple(z.squeeze(1) for z in ended.local)
+        one = tuple(z[p, v] for z in kept)
+        step = difference(one, pose, task.points.mean(0))
+        apart = (step.unsqueeze(-2) @ found.solution.equations.W[p, v] @ step.unsqueeze(-1)).flatten()
+        lower = ended.cost < cost[p, v]  # not where it is not a number
+        taken = lower & (apart > APART**2 * variance.expand_as(here)[p, v]) & _faces_alike(one, pose, task.points)
+        p, v = p[taken], v[taken]
+        best = tuple(z.index_put((p, v), new[taken]) for z, new in zip(best, pose, strict=True))
+        cost = cost.index_put((p, v), ended.cost[taken])
+    excess = 2 * (cost - here).clamp(min=0) / (variance * freedom)
+    return best[0], best[1], (freedom / 2 * excess.log1p()).exp()
+
+
+def _pooled(found: Fit, noise: Noise | None) -> Noise:
+    """The noise that the residuals tell, and what was known of it before, where it can be the same."""
+    freedom = found.degrees_of_freedom().clamp(min=1).to(found.solution.cost)
+    variance = found.residual_variance()
+    variance = torch.where(variance.isfinite(), variance, 0.0)
+    if noise is None or found.task.weights is not None or found.task.objective != "image":
+        return Noise(variance, freedom)
+    squares = variance * freedom
+    usual = noise.variance > 0
+    chance = torch.special.gammaincc(freedom / 2, squares / (2 * torch.where(usual, noise.variance, 1.0)))
+    usual = usual & (chance > CONTRADICTION)
+    both = torch.where(usual, freedom + noise.freedom, freedom)
+    return Noise(torch.where(usual, squares + noise.variance * noise.freedom, squares) / both, both)
+
+
+def _faces_alike(one: Pose, other: Pose, points: Tensor) -> Tensor:
+    """Whether both poses show the same face of the target to the camera: it is printed on one."""
+
+    def towards(R: Tensor, t: Tensor) -> Tensor:
+        return (R[..., 2] * (R @ points.mean(0) + t)).sum(-1) > 0
+
+    return towards(*one) == towards(*other)
