@@ -55,24 +55,25 @@ def _other_poses(found: Fit, variance: Tensor, freedom: Tensor) -> tuple[Tensor,
     count = task.used.sum(-1)
     sound = (count >= 4) & here.isfinite()
     few = sound & (count <= FEW_CORNERS)
+    weak = sound & ~few & weak_perspective(task, shared, kept, variance.expand_as(here))
     mirrored = closed_form.other_pose(kept[0], kept[1], task.points)
-    starts = [(mirrored, few | (sound & weak_perspective(task, shared, kept, variance.expand_as(here))))]
-    starts += [(start, few) for start in tilted_poses(task, shared)] if bool(few.any()) else []
     best, cost = kept, torch.full_like(here, torch.inf)
-    for start, tried in starts:
+    for tried in (few, weak):
         p, v = tried.nonzero(as_tuple=True)
         if len(p) == 0:
             continue
-        ended = posed(task, shared, start, p, v, max_iterations=50, tolerance=1e-10)
-        pose = tuple(z.squeeze(1) for z in ended.local)
-        one = tuple(z[p, v] for z in kept)
-        step = difference(one, pose, task.points.mean(0))
-        apart = (step.unsqueeze(-2) @ found.solution.equations.W[p, v] @ step.unsqueeze(-1)).flatten()
-        lower = ended.cost < cost[p, v]  # not where it is not a number
-        taken = lower & (apart > APART**2 * variance.expand_as(here)[p, v]) & _faces_alike(one, pose, task.points)
-        p, v = p[taken], v[taken]
-        best = tuple(z.index_put((p, v), new[taken]) for z, new in zip(best, pose, strict=True))
-        cost = cost.index_put((p, v), ended.cost[taken])
+        starts = [mirrored, *tilted_poses(task, shared)] if tried is few else [mirrored]
+        poses, costs = posed(task, shared, starts, p, v, max_iterations=50, tolerance=1e-10)
+        one = tuple(z[p, v].expand(len(starts), *z[p, v].shape) for z in kept)
+        step = difference(one, poses, task.points.mean(0))
+        apart = (step.unsqueeze(-2) @ found.solution.equations.W[p, v] @ step.unsqueeze(-1)).squeeze(-1).squeeze(-1)
+        another = (apart > APART**2 * variance[p, 0]) & _faces_alike(one, poses, task.points) & costs.isfinite()
+        lowest, chosen = torch.where(another, costs, torch.inf).min(0)
+        taken = lowest.isfinite()
+        p, v, chosen = p[taken], v[taken], chosen[taken]
+        each = torch.arange(len(p), device=p.device)
+        best = tuple(z.index_put((p, v), new[:, taken][chosen, each]) for z, new in zip(best, poses, strict=True))
+        cost = cost.index_put((p, v), lowest[taken])
     excess = 2 * (cost - here).clamp(min=0) / (variance * freedom)
     return best[0], best[1], (freedom / 2 * excess.log1p()).exp()
 

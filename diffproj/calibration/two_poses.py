@@ -12,7 +12,7 @@ other pose predicts the cost that its refinement can reach.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -92,7 +92,7 @@ def better_poses(task: Task, solution: Solution, cameras: Tensor) -> tuple[Pose,
         single, held, start = _single(task, solution.shared, other, p, v)
         near = predicted_costs(single, held, start).squeeze(1) <= RIVAL * here[p, v]
         rivals = torch.zeros_like(rivals).index_put((p, v), near)
-    poses, here, changed = _exchanged(task, solution.shared, poses, here, other, rivals)
+    poses, here, changed = _exchanged(task, solution.shared, poses, here, [other], rivals)
     lost = seen & (_misfit(task, here) | (task.used.sum(-1) <= FEW_CORNERS))
     poses, more = _sought(task, solution.shared, poses, here, lost)
     return poses, changed | more
@@ -122,34 +122,35 @@ def _found_again(task: Task, shared: Tensor, poses: Pose, lost: Tensor) -> Pose:
     while task.loss is None and scale > least:  # the smaller the scale, the less wrong corners pull
         scale = max(scale / 30, least)
         robust = replace(task, loss=Cauchy(scale))
-        poses, _, _ = _exchanged(robust, shared, poses, view_costs(robust, shared, poses), poses, lost)
+        poses, _, _ = _exchanged(robust, shared, poses, view_costs(robust, shared, poses), [poses], lost)
     return poses
 
 
 def _sought(task: Task, shared: Tensor, poses: Pose, here: Tensor, lost: Tensor) -> tuple[Pose, Tensor]:
     """Poses of lost views `(P, V)` sought from boards that face the camera and lean four ways; which changed `(P,)`."""
-    changed = torch.zeros_like(lost[:, 0])
     if not bool(lost.any()):
-        return poses, changed
-    for start in tilted_poses(task, shared):
-        poses, here, more = _exchanged(task, shared, poses, here, start, lost)
-        changed = changed | more
+        return poses, torch.zeros_like(lost[:, 0])
+    poses, _, changed = _exchanged(task, shared, poses, here, tilted_poses(task, shared), lost)
     return poses, changed
 
 
 def _exchanged(
-    task: Task, shared: Tensor, poses: Pose, here: Tensor, others: Pose, tried: Tensor
+    task: Task, shared: Tensor, poses: Pose, here: Tensor, others: Sequence[Pose], tried: Tensor
 ) -> tuple[Pose, Tensor, Tensor]:
-    """Poses and their costs, exchanged where others, refined, are better; and whether a camera's changed `(P,)`."""
+    """Poses and their costs, exchanged where another, refined, is better; and whether a camera's changed `(P,)`."""
     p, v = tried.nonzero(as_tuple=True)
     changed = torch.zeros_like(tried[:, 0])
     if len(p) == 0:
         return poses, here, changed
-    refined = posed(task, shared, others, p, v)
-    better = ~(refined.cost >= here[p, v] * (1 - BETTER)) & refined.cost.isfinite()
-    p, v = p[better], v[better]
-    poses = tuple(z.index_put((p, v), new.squeeze(1)[better]) for z, new in zip(poses, refined.local, strict=True))
-    return poses, here.index_put((p, v), refined.cost[better]), changed.index_fill(0, p, True)
+    refined, costs = posed(task, shared, others, p, v)
+    cost, best = torch.where(costs.isfinite(), costs, torch.inf).min(0)
+    better = ~(cost >= here[p, v] * (1 - BETTER)) & cost.isfinite()
+    p, v, best = p[better], v[better], best[better]
+    poses = tuple(
+        z.index_put((p, v), new[:, better][best, torch.arange(len(p), device=p.device)])
+        for z, new in zip(poses, refined, strict=True)
+    )
+    return poses, here.index_put((p, v), cost[better]), changed.index_fill(0, p, True)
 
 
 def _misfit(task: Task, costs: Tensor) -> Tensor:
@@ -166,7 +167,7 @@ def mean_squares(task: Task, costs: Tensor) -> Tensor:
     return torch.where(total > 0, costs / torch.where(total > 0, total, 1.0), torch.nan)
 
 
-def tilted_poses(task: Task, shared: Tensor) -> Iterator[Pose]:
+def tilted_poses(task: Task, shared: Tensor) -> list[Pose]:
     """Poses `(P, V, ...)` of boards where the corners are: one that faces the camera, then leaning in four ways."""
     V = task.used.shape[1]
     identity = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(len(shared), V, 3, 3)
@@ -176,9 +177,9 @@ def tilted_poses(task: Task, shared: Tensor) -> Iterator[Pose]:
     R, t = closed_form.upright_poses(task.points, xy, ahead)
     R, t = sight @ R, (sight @ t.unsqueeze(-1)).squeeze(-1)
     middle = task.points.mean(0)
-    for axis in ((0.0, 0, 0), (1.0, 0, 0), (-1.0, 0, 0), (0, 1.0, 0), (0, -1.0, 0)):
-        turn = turned(R, 2 * math.tan(TILT / 2) * (sight @ R.new_tensor(axis)))
-        yield turn, t + (R - turn) @ middle
+    axes = R.new_tensor([(0.0, 0, 0), (1.0, 0, 0), (-1.0, 0, 0), (0, 1.0, 0), (0, -1.0, 0)])
+    turns = [turned(R, 2 * math.tan(TILT / 2) * (sight @ axis)) for axis in axes]
+    return [(turn, t + (R - turn) @ middle) for turn in turns]
 
 
 def weak_perspective(task: Task, shared: Tensor, poses: Pose, variance: Tensor) -> Tensor:
@@ -199,11 +200,26 @@ def weak_perspective(task: Task, shared: Tensor, poses: Pose, variance: Tensor) 
 
 
 def posed(
-    task: Task, shared: Tensor, poses: Pose, p: Tensor, v: Tensor, max_iterations: int = 20, tolerance: float = 1e-7
-) -> Solution:
-    """Poses of the views `(p, v)` alone refined from `poses (P, V, ...)`, the shared parameters `(P, s)` held."""
-    single, held, start = _single(task, shared, poses, p, v)
-    return solved(single, held, start, max_iterations=max_iterations, tolerance=tolerance)
+    task: Task,
+    shared: Tensor,
+    starts: Sequence[Pose],
+    p: Tensor,
+    v: Tensor,
+    max_iterations: int = 20,
+    tolerance: float = 1e-7,
+) -> tuple[Pose, Tensor]:
+    """The n views `(p, v)` alone refined from each of S starts, which are poses `(P, V, ...)`, side by side.
+
+    Returns:
+        Poses `(S, n, ...)`, and their costs `(S, n)`.
+    """
+    parts = [_single(task, shared, start, p, v) for start in starts]
+    single, held, _ = parts[0]
+    every = torch.arange(len(p), device=p.device).repeat(len(starts))
+    local = tuple(torch.cat(pieces) for pieces in zip(*(start for _, _, start in parts), strict=True))
+    ended = solved(single.part(every), held[every], local, max_iterations=max_iterations, tolerance=tolerance)
+    shape = len(starts), len(p)
+    return tuple(z.squeeze(1).unflatten(0, shape) for z in ended.local), ended.cost.unflatten(0, shape)
 
 
 def _single(task: Task, shared: Tensor, poses: Pose, p: Tensor, v: Tensor) -> tuple[Task, Tensor, Pose]:
