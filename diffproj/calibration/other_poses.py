@@ -15,6 +15,12 @@ APART = 3.0
 """Distance of two poses, in standard deviations, up to which the kept one's error bar covers the other."""
 CONTRADICTION = 1e-3
 """Chance of residuals as large as the fit's under the noise that was known, below which that does not hold here."""
+TYPICAL_PX, TYPICAL_FREEDOM = 0.3, 2
+"""Noise of corners in photographs, and for how many degrees of freedom it counts where nothing else is known of it.
+
+Four corners leave two degrees of freedom: their residuals may all be small by chance."""
+SYNTHETIC_PX = 1e-3
+"""Residuals below which corners are no photograph's, and tell their noise alone."""
 EXACT_PX = 1e-9
 """Noise in pixels that is assumed at least: residuals below it are rounding errors, and no odds come of them."""
 
@@ -39,7 +45,8 @@ def other_poses(found: Fit, noise: Noise | None = None) -> OtherPoses:
 
     Args:
         found: the fit of P cameras.
-        noise: what is known of it beforehand; it counts along with the fit's own residuals, unless they contradict it.
+        noise: what is known of the corners' noise beforehand. It counts along with their residuals, unless these
+            contradict it.
     """
     with torch.inference_mode():
         R, t, ratio = _other_poses(found, *_pooled(found, noise))
@@ -55,7 +62,9 @@ def _other_poses(found: Fit, variance: Tensor, freedom: Tensor) -> tuple[Tensor,
     count = task.used.sum(-1)
     sound = (count >= 4) & here.isfinite()
     few = sound & (count <= FEW_CORNERS)
-    weak = sound & ~few & weak_perspective(task, shared, kept, variance.expand_as(here))
+    each = count if task.weights is None else torch.where(task.used, task.weights, 0.0).sum(-1)
+    level = variance * count / torch.where(each > 0, each, 1.0)  # of a residual, whatever the unit of the weights
+    weak = sound & ~few & weak_perspective(task, shared, kept, level)
     mirrored = closed_form.other_pose(kept[0], kept[1], task.points)
     best, cost = kept, torch.full_like(here, torch.inf)
     for tried in (few, weak):
@@ -71,20 +80,23 @@ def _other_poses(found: Fit, variance: Tensor, freedom: Tensor) -> tuple[Tensor,
         lowest, chosen = torch.where(another, costs, torch.inf).min(0)
         taken = lowest.isfinite()
         p, v, chosen = p[taken], v[taken], chosen[taken]
-        each = torch.arange(len(p), device=p.device)
-        best = tuple(z.index_put((p, v), new[:, taken][chosen, each]) for z, new in zip(best, poses, strict=True))
+        number = torch.arange(len(p), device=p.device)
+        best = tuple(z.index_put((p, v), new[:, taken][chosen, number]) for z, new in zip(best, poses, strict=True))
         cost = cost.index_put((p, v), lowest[taken])
     excess = 2 * (cost - here).clamp(min=0) / (variance * freedom)
     return best[0], best[1], (freedom / 2 * excess.log1p()).exp()
 
 
 def _pooled(found: Fit, noise: Noise | None) -> Noise:
-    """The noise that the residuals tell, and what was known of it before, where it can be the same."""
+    """The noise that the residuals tell together with what was known of it before, where that can be the same."""
     freedom = found.degrees_of_freedom().clamp(min=1).to(found.solution.cost)
     variance = found.residual_variance()
     variance = torch.where(variance.isfinite(), variance, 0.0)
-    if noise is None or found.task.weights is not None or found.task.objective != "image":
+    if found.task.weights is not None or found.task.objective != "image":
         return Noise(variance, freedom)
+    if noise is None:
+        known = torch.where(variance > SYNTHETIC_PX**2, TYPICAL_PX**2, 0.0).to(variance)
+        noise = Noise(known, torch.full_like(freedom, TYPICAL_FREEDOM))
     squares = variance * freedom
     usual = noise.variance > 0
     chance = torch.special.gammaincc(freedom / 2, squares / (2 * torch.where(usual, noise.variance, 1.0)))

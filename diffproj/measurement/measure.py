@@ -14,9 +14,7 @@ with its correlations between intrinsics and pose, and the plane's where one is 
 has the variance `g^T C g`, g its gradient. This is first order: sampling agrees as long as standard deviations are
 small beside the distance. The covariance of all pairs of points is computed only where it is asked for (`joint`).
 
-Where a view's pose may be the wrong one of two, the other is too far away for that. The points are measured from it as
-well, and the mean square of their error gains `p Delta Delta^T`, with p the other's probability and Delta the
-difference of all points together.
+Where a view's pose may be the wrong one of two, the other is too far away for that: see `doubt.py`.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,11 +32,10 @@ from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
+from diffproj.measurement.doubt import of_the_pose
 
 SIGNIFICANT = 3.0
 """How many standard deviations a value has to be away from 0 to be told from it."""
-NO_DOUBT = 1e-12
-"""Probability of a view's other pose up to which it adds nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,10 +269,8 @@ def measure(
         blocks.append(lift.unsqueeze(-1) * with_offset.unsqueeze(-2))
         covariances.append(in_float64(plane_covariance))
     if isinstance(calibration, Calibration) and calibration.has_alternatives:
-        doubt = _doubt(pixels, calibration, view, plane, points, valid)
-        if doubt is not None:
-            blocks.append(doubt[0])
-            covariances.append(doubt[1])
+        doubt = of_the_pose(pixels, calibration, view_number(calibration, view), plane, points, valid)
+        blocks, covariances = [*blocks, doubt.columns], [*covariances, doubt.covariance]
     common = torch.where(valid[..., None, None], torch.cat(blocks, dim=-1), 0.0)
     own = sigma[..., None, None] * D
     includes_intrinsics = isinstance(calibration, Calibration) and known is not None and calibration.knows_intrinsics
@@ -309,31 +304,6 @@ def _at_view(calibration: Calibration, view: int | str) -> tuple[Camera, Tensor 
     known = calibration.covariance_of_kept_poses.view(number) if calibration.has_covariance else None
     level = None if calibration.pixel_sigma is None else calibration.pixel_sigma.unsqueeze(-1)
     return calibration.cameras[..., number], known, level
-
-
-def _doubt(
-    pixels: Tensor, calibration: Calibration, view: int | str, plane: Plane, points: Tensor, valid: Tensor
-) -> tuple[Tensor, Tensor] | None:
-    """What the other pose of a view adds, as columns `(*B, N, 3, 2)` and their covariance `(*B, 2, 2)`; or nothing.
-
-    The first column is where the other pose puts the points, the second says which have no place there.
-    """
-    number = view_number(calibration, view)
-    probability, ambiguous = calibration.other_poses.probability[..., number], calibration.ambiguous[..., number]
-    if not bool((probability > NO_DOUBT).any()):
-        return None
-    with torch.no_grad():
-        there, seen = back_project(pixels, calibration.alternatives[..., number].to(points.dtype), plane)
-        away = torch.where((valid & seen).unsqueeze(-1), there - points, 0.0)
-        lost = (valid & ~seen & ambiguous.unsqueeze(-1)).unsqueeze(-1) * _unlike(points)
-    infinite = torch.where(ambiguous, torch.inf, 0.0).to(probability)
-    return torch.stack([away, lost], dim=-1), torch.diag_embed(torch.stack([probability, infinite], dim=-1))
-
-
-def _unlike(points: Tensor) -> Tensor:
-    """Numbers `(N, 3)` of which no sum or difference that a quantity could take is 0."""
-    count = points.shape[-2] * 3
-    return (torch.arange(count, dtype=points.dtype, device=points.device).sin() + 2).reshape(-1, 3)
 
 
 def _expanded(pixel_sigma: float | Tensor | None, like: Tensor) -> Tensor:
