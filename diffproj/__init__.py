@@ -44,6 +44,7 @@ which lives in `diffproj.targets.synthetic`, renders photographs with known trut
 from importlib import import_module
 from typing import Any
 
+from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.locate import locate
@@ -85,6 +86,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "AccuracyMap",
+    "AmbiguousPoseWarning",
     "BoardNotFoundError",
     "BoardNotFoundWarning",
     "BrownConrady",

@@ -1,15 +1,19 @@
 """`locate`: where a known camera stood, from the corners of a target in each view."""
 
+import warnings
 from typing import Unpack
 
 import torch
 from kornia.geometry.camera import PinholeCamera
 
 from diffproj.calibration import closed_form, start
+from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.options import LocateOptions, locate_options
+from diffproj.calibration.other_poses import Noise
 from diffproj.calibration.outcome import outcome
+from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.solver import Solution, Status, select
 from diffproj.calibration.task import Task
@@ -17,20 +21,28 @@ from diffproj.geometry.camera import Camera, as_camera
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
+REMEDY = (
+    "see alternatives and likelihood_ratio. A target that is larger in the image, more tilted, or with more corners "
+    "tells them apart; a calibration in place of a camera brings the noise along, which few corners do not tell"
+)
+"""What to do about a view that is ambiguous."""
+
 
 def locate(
     views: Views, target: Target, camera: Camera | PinholeCamera | Calibration, **options: Unpack[LocateOptions]
 ) -> Calibration:
     """Find the pose of each view with intrinsics and lens held, from at least 4 corners a view.
 
-    A plane seen from afar has two poses that explain it almost equally well; both are refined and the better kept.
+    A plane seen from afar has two poses that explain it almost equally well; both are refined and the better kept. The
+    other is in `alternatives`, and the covariance holds the doubt; where it may well be the right one, the view is
+    `ambiguous`, and an `AmbiguousPoseWarning` names it.
     The board is taken to be flat, also where a calibration found a bow.
 
     Args:
         views: corners `(*B, V, N, 2)`.
         target: anything with `.points (N, 3)` on z = 0.
         camera: batch shape broadcasting to `*B`; its own pose does not matter. A calibration brings its uncertainty
-            along.
+            along, and the noise of its corners, which few corners do not tell.
         options: `weights`, `loss`, `max_iterations`, `tolerance`, `progress` and `throw`: see `LocateOptions`.
 
     Returns:
@@ -54,10 +66,10 @@ def locate(
     chosen = locate_options(options)
     loss = chosen.loss
     data = Data(views, target, chosen.weights)
-    known = None
+    calibration, known = None, None
     if isinstance(camera, Calibration):
-        known = camera.covariance if camera.has_covariance else None
-        camera = camera.camera
+        calibration, camera = camera, camera.camera
+        known = calibration.covariance_of_kept_poses if calibration.has_covariance else None
     camera = as_camera(camera)
     if len(camera.batch_shape) > len(data.batch):
         raise ValueError(
@@ -113,4 +125,18 @@ def locate(
         ),
     )
     found = Fit(task, joined, torch.zeros_like(data.used))
-    return outcome("locate", data, found, camera.size or views.size, chosen.throw, known)
+    noise = None if calibration is None else _noise(calibration, data)
+    located = outcome("locate", data, found, camera.size or views.size, chosen.throw, known, noise)
+    if bool(located.ambiguous.any()):
+        warnings.warn(f"locate: {located.doubts}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
+    return located
+
+
+def _noise(calibration: Calibration, data: Data) -> Noise | None:
+    """The noise of corners in that calibration, for each of the cameras of the data."""
+    if calibration.pixel_sigma is None:
+        return None
+    used = calibration.used
+    count = 2 * used.sum((-2, -1)) - POSE * used.any(-1).sum(-1) - calibration.shared.shape[-1]
+    sigma = calibration.pixel_sigma.detach().to(data.points)
+    return Noise(*(z.to(sigma).expand(data.batch).reshape(-1) for z in (sigma.square(), count.clamp(min=1))))

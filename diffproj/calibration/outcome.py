@@ -6,11 +6,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.constraints import free_basis, held_at, make_prior
 from diffproj.calibration.covariance import Covariance, reshaped
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.options import Options
+from diffproj.calibration.other_poses import Noise, other_poses
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Prior, Status
@@ -57,8 +59,9 @@ def outcome(
     size: tuple[int, int] | None,
     throw: bool,
     known: Covariance | None = None,
+    noise: Noise | None = None,
 ) -> Calibration:
-    """The calibration with the batch shape of the views."""
+    """The calibration with the batch shape of the views; `known` and `noise` of a calibration that held before."""
     task, solution, batch = found.task, found.solution, data.batch
     cameras = task.parameters.unpack(solution.shared, solution.local)
     status, causes = verdicts(found, data.views.names, data.target)
@@ -93,6 +96,7 @@ def outcome(
         causes,
         shaped(found.pixel_sigma()),
         partial(_covariance, found, tuple(batch), known),
+        partial(_others, found, tuple(batch), noise),
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)
@@ -102,3 +106,9 @@ def outcome(
 def _covariance(found: Fit, batch: tuple[int, ...], known: Covariance | None) -> Covariance:
     own = reshaped(covariance_of(found), batch)
     return own if known is None else own.following(known)
+
+
+def _others(found: Fit, batch: tuple[int, ...], noise: Noise | None) -> OtherPoses:
+    others = other_poses(found, noise)
+    R, t, ratio = (z.reshape(*batch, *z.shape[1:]) for z in (others.R, others.t, others.ratio))
+    return OtherPoses(R, t, ratio)

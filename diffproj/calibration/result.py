@@ -5,9 +5,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
 from diffproj.calibration.bow import bowed
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.parametrisation import BOW, Parametrisation
@@ -26,6 +28,9 @@ SENTENCES = {
     Status.DIVERGED: "found no step that lowers the error: look for mixed-up corners, or start closer",
     Status.DEGENERATE: "the views do not determine the camera",
 }
+
+MAX_NAMES = 10
+"""Names of ambiguous views in a message."""
 
 
 class CalibrationError(RuntimeError):
@@ -77,6 +82,7 @@ class Calibration:
     causes: tuple[str, ...] = ()
     pixel_sigma: Float[Tensor, "*batch"] | None = None
     _covariance: Callable[[], Covariance] | None = None
+    _others: Callable[[], OtherPoses] | None = None
 
     @property
     def board_points(self) -> Float[Tensor, "*batch n 3"]:
@@ -135,9 +141,29 @@ class Calibration:
             for cause, count in zip(causes, beyond, strict=True)
         ]
         if not self.views.batch_shape:
-            return causes[0]
+            return causes[0] if codes[0] or not self.doubts else f"{causes[0]}; {self.doubts}"
         failed = [f"camera {i}: {c}" for i, (s, c) in enumerate(zip(codes, causes, strict=True)) if s]
-        return "; ".join([f"{len(codes) - len(failed)} of {len(codes)} cameras converged", *failed])
+        return "; ".join(
+            [
+                f"{len(codes) - len(failed)} of {len(codes)} cameras converged",
+                *failed,
+                *([self.doubts] if self.doubts else []),
+            ]
+        )
+
+    @property
+    def doubts(self) -> str:
+        """Which views are ambiguous, in words; empty where none is, or where other poses are not known."""
+        if not self.has_alternatives:
+            return ""
+        doubtful = [
+            f"{self.views.names[view]}{f' of camera {tuple(camera)}' * bool(camera)}"
+            for *camera, view in self.ambiguous.nonzero().tolist()
+        ]
+        if not doubtful:
+            return ""
+        more = f" and {len(doubtful) - MAX_NAMES} more views" if len(doubtful) > MAX_NAMES else ""
+        return f"two poses fit {', '.join(doubtful[:MAX_NAMES])}{more}, and the one that was kept may be the wrong one"
 
     @property
     def has_covariance(self) -> bool:
@@ -149,12 +175,28 @@ class Calibration:
         """Whether the covariance holds that of the intrinsics: not where they were all held, as `locate` holds them."""
         if not self.has_covariance:
             return False
-        count = sum(not name.startswith("bow") for name in self.covariance.names)
-        return bool((self.covariance.shared[..., :count, :count] != 0).any())
+        known = self.covariance_of_kept_poses
+        count = sum(not name.startswith("bow") for name in known.names)
+        return bool((known.shared[..., :count, :count] != 0).any())
 
     @cached_property
     def covariance(self) -> Covariance:
         """The joint covariance of intrinsics, lens, bow and every pose; computed at the first call.
+
+        Where a view has another pose that may be the right one, that of its pose is the mean square of the error of the
+        pose that was kept: its own covariance, and the step to the other pose as often as that is the right one.
+
+        Raises:
+            ValueError: the calibration came from a file without one.
+        """
+        own = self.covariance_of_kept_poses
+        if not self.has_alternatives or not bool((self.other_poses.probability > 0).any()):
+            return own
+        return widened(own, (self.cameras.R, self.cameras.t), self.other_poses, self.points.mean(0))
+
+    @cached_property
+    def covariance_of_kept_poses(self) -> Covariance:
+        """The same as if no view had another pose: to be taken together with `alternatives` and `likelihood_ratio`.
 
         Raises:
             ValueError: the calibration came from a file without one.
@@ -162,6 +204,58 @@ class Calibration:
         if self._covariance is None:
             raise ValueError("covariance: want a calibration that was computed here, got one from a file without it")
         return self._covariance()
+
+    @property
+    def has_alternatives(self) -> bool:
+        """Whether other poses are known: not where the calibration came from a file of an earlier version."""
+        return self._others is not None
+
+    @cached_property
+    def other_poses(self) -> OtherPoses:
+        """The other pose of each view and its odds; searched for at the first call.
+
+        Raises:
+            ValueError: the calibration came from a file without them.
+        """
+        if self._others is None:
+            raise ValueError(
+                "alternatives: want a calibration that was computed here, got one from a file without them"
+            )
+        return self._others()
+
+    @property
+    def alternatives(self) -> Camera:
+        """The camera at the other pose of each view, batch shape `(*B, V)`.
+
+        Seen from afar, a plane has two poses that look alike. The one that fits better is in `cameras`, the other here.
+        Where there is no other, or none that comes near, both are the same, and `likelihood_ratio` is infinite. In
+        `calibrate` and `refine`, intrinsics and lens are held for it.
+
+        Raises:
+            ValueError: the calibration came from a file without them.
+        """
+        return self.cameras.at(self.other_poses.R, self.other_poses.t)
+
+    @property
+    def likelihood_ratio(self) -> Float[Tensor, "*batch v"]:
+        """How many times likelier the pose in `cameras` is than that in `alternatives` `(*B, V)`, from 1 to infinity.
+
+        The other one is right with the probability `1 / (1 + likelihood_ratio)`. Where the corners' noise is not known
+        but estimated from few of them, the ratio is smaller.
+
+        Raises:
+            ValueError: the calibration came from a file without them.
+        """
+        return self.other_poses.ratio
+
+    @property
+    def ambiguous(self) -> Bool[Tensor, "*batch v"]:
+        """Whether the pose of a view may well be the other one `(*B, V)`: with a probability above 1 %.
+
+        Raises:
+            ValueError: the calibration came from a file without the other poses.
+        """
+        return self.other_poses.ratio < SURE
 
     def summary(self) -> str:
         """One camera as a text for people: parameters with deviations, RMS of each view, how it ended.
@@ -188,9 +282,12 @@ class Calibration:
         lines.append(f"{'RMS':<16}{self.rms.item():10.4f} px over {int(self.used.sum())} corners")
         width = max(map(len, self.views.names), default=0)
         seen, used = self.views.visible.sum(-1).tolist(), self.used.sum(-1).tolist()
+        odds = self.likelihood_ratio.tolist() if self.has_alternatives else [torch.inf] * len(used)
         for view, (name, rms) in enumerate(zip(self.views.names, self.view_rms.tolist(), strict=True)):
             out = self.rejected[view].nonzero().flatten().tolist()
             remark = f"  without corners {', '.join(map(str, out))}" if out and used[view] else ""
+            if odds[view] < SURE:
+                remark += f"  another pose is {odds[view]:.2g} times less likely"
             text = f"{rms:.4f} px{remark}" if used[view] else f"left out: {seen[view] - len(out)} corners, 4 are needed"
             lines.append(f"  {name:<{width}}  {text}")
         return "\n".join([*lines, self.message])

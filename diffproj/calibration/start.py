@@ -45,10 +45,8 @@ def from_camera(camera: Camera, data: Data, bow: bool) -> tuple[Tensor, tuple[Te
     upright = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(*data.used.shape[:2], 3, 3)
     views = parameters.unpack(shared, (upright, torch.zeros_like(upright[..., 0])))
     direction, valid = views.directions(data.pixels)
-    ahead = valid & (direction[..., 2] > 0.25 * direction.norm(dim=-1))
-    xy = direction[..., :2] / torch.where(ahead, direction[..., 2], 1.0).unsqueeze(-1)
-    H = closed_form.homographies(data.points, xy, data.used & ahead)
-    return shared, closed_form.poses(H, data.points), parameters.lens
+    perspective = MODELS[parameters.lens].perspective
+    return shared, closed_form.poses_along(data.points, direction, data.used & valid, perspective), parameters.lens
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ other pose predicts the cost that its refinement can reach.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -83,7 +84,7 @@ def better_poses(task: Task, solution: Solution, cameras: Tensor) -> tuple[Pose,
     poses = solution.local
     here = solution.equations.c if task.loss is None else view_costs(task, solution.shared, poses)
     seen = task.used.any(-1) & cameras.unsqueeze(-1)
-    rivals = seen & _weak_perspective(task, solution.shared, poses, here)
+    rivals = seen & weak_perspective(task, solution.shared, poses, mean_squares(task, here))
     other = poses
     if bool(rivals.any()):
         other = closed_form.other_pose(poses[0], poses[1], task.points)
@@ -91,7 +92,7 @@ def better_poses(task: Task, solution: Solution, cameras: Tensor) -> tuple[Pose,
         single, held, start = _single(task, solution.shared, other, p, v)
         near = predicted_costs(single, held, start).squeeze(1) <= RIVAL * here[p, v]
         rivals = torch.zeros_like(rivals).index_put((p, v), near)
-    poses, here, changed = _exchanged(task, solution.shared, poses, here, other, rivals)
+    poses, here, changed = _exchanged(task, solution.shared, poses, here, [other], rivals)
     lost = seen & (_misfit(task, here) | (task.used.sum(-1) <= FEW_CORNERS))
     poses, more = _sought(task, solution.shared, poses, here, lost)
     return poses, changed | more
@@ -121,38 +122,35 @@ def _found_again(task: Task, shared: Tensor, poses: Pose, lost: Tensor) -> Pose:
     while task.loss is None and scale > least:  # the smaller the scale, the less wrong corners pull
         scale = max(scale / 30, least)
         robust = replace(task, loss=Cauchy(scale))
-        poses, _, _ = _exchanged(robust, shared, poses, view_costs(robust, shared, poses), poses, lost)
+        poses, _, _ = _exchanged(robust, shared, poses, view_costs(robust, shared, poses), [poses], lost)
     return poses
 
 
 def _sought(task: Task, shared: Tensor, poses: Pose, here: Tensor, lost: Tensor) -> tuple[Pose, Tensor]:
     """Poses of lost views `(P, V)` sought from boards that face the camera and lean four ways; which changed `(P,)`."""
-    changed = torch.zeros_like(lost[:, 0])
     if not bool(lost.any()):
-        return poses, changed
-    R, t = _upright(task, shared)
-    middle = task.points.mean(0)
-    for axis in ((0.0, 0, 0), (1.0, 0, 0), (-1.0, 0, 0), (0, 1.0, 0), (0, -1.0, 0)):
-        turn = turned(R, 2 * math.tan(TILT / 2) * R.new_tensor(axis).expand_as(t))
-        start = turn, t + (R - turn) @ middle
-        poses, here, more = _exchanged(task, shared, poses, here, start, lost)
-        changed = changed | more
+        return poses, torch.zeros_like(lost[:, 0])
+    poses, _, changed = _exchanged(task, shared, poses, here, tilted_poses(task, shared), lost)
     return poses, changed
 
 
 def _exchanged(
-    task: Task, shared: Tensor, poses: Pose, here: Tensor, others: Pose, tried: Tensor
+    task: Task, shared: Tensor, poses: Pose, here: Tensor, others: Sequence[Pose], tried: Tensor
 ) -> tuple[Pose, Tensor, Tensor]:
-    """Poses and their costs, exchanged where others, refined, are better; and whether a camera's changed `(P,)`."""
+    """Poses and their costs, exchanged where another, refined, is better; and whether a camera's changed `(P,)`."""
     p, v = tried.nonzero(as_tuple=True)
     changed = torch.zeros_like(tried[:, 0])
     if len(p) == 0:
         return poses, here, changed
-    refined = posed(task, shared, others, p, v)
-    better = ~(refined.cost >= here[p, v] * (1 - BETTER)) & refined.cost.isfinite()
-    p, v = p[better], v[better]
-    poses = tuple(z.index_put((p, v), new.squeeze(1)[better]) for z, new in zip(poses, refined.local, strict=True))
-    return poses, here.index_put((p, v), refined.cost[better]), changed.index_fill(0, p, True)
+    refined, costs = posed(task, shared, others, p, v)
+    cost, best = torch.where(costs.isfinite(), costs, torch.inf).min(0)
+    better = ~(cost >= here[p, v] * (1 - BETTER)) & cost.isfinite()
+    p, v, best = p[better], v[better], best[better]
+    poses = tuple(
+        z.index_put((p, v), new[:, better][best, torch.arange(len(p), device=p.device)])
+        for z, new in zip(poses, refined, strict=True)
+    )
+    return poses, here.index_put((p, v), cost[better]), changed.index_fill(0, p, True)
 
 
 def _misfit(task: Task, costs: Tensor) -> Tensor:
@@ -169,19 +167,23 @@ def mean_squares(task: Task, costs: Tensor) -> Tensor:
     return torch.where(total > 0, costs / torch.where(total > 0, total, 1.0), torch.nan)
 
 
-def _upright(task: Task, shared: Tensor) -> Pose:
-    """Poses `(P, V, ...)` of boards that face the camera, where the corners are."""
+def tilted_poses(task: Task, shared: Tensor) -> list[Pose]:
+    """Poses `(P, V, ...)` of boards where the corners are: one that faces the camera, then leaning in four ways."""
     V = task.used.shape[1]
     identity = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(len(shared), V, 3, 3)
     camera = task.parameters.unpack(shared, (identity, torch.zeros_like(identity[..., 0])))
     direction, valid = camera.directions(task.pixels)
-    ahead = valid & (direction[..., 2] > 0.1 * direction.norm(dim=-1))
-    xy = direction[..., :2] / torch.where(ahead, direction[..., 2], 1.0).unsqueeze(-1)
-    return closed_form.upright_poses(task.points, xy, task.used & ahead)
+    sight, xy, ahead = closed_form.turned_rays(direction, task.used & valid)
+    R, t = closed_form.upright_poses(task.points, xy, ahead)
+    R, t = sight @ R, (sight @ t.unsqueeze(-1)).squeeze(-1)
+    middle = task.points.mean(0)
+    axes = R.new_tensor([(0.0, 0, 0), (1.0, 0, 0), (-1.0, 0, 0), (0, 1.0, 0), (0, -1.0, 0)])
+    turns = [turned(R, 2 * math.tan(TILT / 2) * (sight @ axis)) for axis in axes]
+    return [(turn, t + (R - turn) @ middle) for turn in turns]
 
 
-def _weak_perspective(task: Task, shared: Tensor, poses: Pose, costs: Tensor) -> Tensor:
-    """In which views perspective moves the corners by no more than some residuals `(P, V)`."""
+def weak_perspective(task: Task, shared: Tensor, poses: Pose, variance: Tensor) -> Tensor:
+    """In which views perspective moves the corners by no more than some residuals, of that variance `(P, V)`."""
     R, t = poses
     middle = task.points.mean(0)
     radius = (task.points - middle).square().sum(-1).mean().sqrt()
@@ -189,7 +191,7 @@ def _weak_perspective(task: Task, shared: Tensor, poses: Pose, costs: Tensor) ->
     distance = place.square().sum(-1).clamp(min=1e-300)
     cosine = (R[..., 2] * place).sum(-1).square() / distance
     displacement = 2 * shared[:, None, :2].mean(-1) * radius**2 / distance * (1 - cosine).clamp(min=0).sqrt()
-    residual = mean_squares(task, costs).sqrt()
+    residual = variance.sqrt()
     if task.objective != "image":  # from world units to pixels
         residual = residual * shared[:, None, :2].mean(-1) / distance.sqrt()
     # Seen face on the two poses are one: between them lies no hill that the corners could tell of.
@@ -197,9 +199,27 @@ def _weak_perspective(task: Task, shared: Tensor, poses: Pose, costs: Tensor) ->
     return (displacement <= PERSPECTIVE * residual) & (foreshortening > FACE_ON * residual)
 
 
-def posed(task: Task, shared: Tensor, poses: Pose, p: Tensor, v: Tensor) -> Solution:
-    """Poses of the views `(p, v)` alone refined from `poses (P, V, ...)`, the shared parameters `(P, s)` held."""
-    return solved(*_single(task, shared, poses, p, v), max_iterations=20, tolerance=1e-7)
+def posed(
+    task: Task,
+    shared: Tensor,
+    starts: Sequence[Pose],
+    p: Tensor,
+    v: Tensor,
+    max_iterations: int = 20,
+    tolerance: float = 1e-7,
+) -> tuple[Pose, Tensor]:
+    """The n views `(p, v)` alone refined from each of S starts, which are poses `(P, V, ...)`, side by side.
+
+    Returns:
+        Poses `(S, n, ...)`, and their costs `(S, n)`.
+    """
+    parts = [_single(task, shared, start, p, v) for start in starts]
+    single, held, _ = parts[0]
+    every = torch.arange(len(p), device=p.device).repeat(len(starts))
+    local = tuple(torch.cat(pieces) for pieces in zip(*(start for _, _, start in parts), strict=True))
+    ended = solved(single.part(every), held[every], local, max_iterations=max_iterations, tolerance=tolerance)
+    shape = len(starts), len(p)
+    return tuple(z.squeeze(1).unflatten(0, shape) for z in ended.local), ended.cost.unflatten(0, shape)
 
 
 def _single(task: Task, shared: Tensor, poses: Pose, p: Tensor, v: Tensor) -> tuple[Task, Tensor, Pose]:

@@ -46,6 +46,12 @@ def document(
         remarks.append("The outline crosses itself, so its area means little: give the points in order around it.")
     elif area is not None and area["significant"] is False:
         remarks.append("The area is below three deviations: it cannot be told from 0.")
+    if scene.calibration.has_alternatives and bool(scene.calibration.ambiguous[scene.view]):
+        ratio = float(scene.calibration.likelihood_ratio[scene.view])
+        remarks.append(
+            f"The board's corners fit two poses, and the one taken is only {ratio:.2g} times likelier than the other; "
+            "the deviations hold the doubt. A photograph with the board larger or more tilted tells them apart."
+        )
     return {
         "camera": str(scene.camera_file),
         "photograph": None if scene.photograph is None else str(scene.photograph),

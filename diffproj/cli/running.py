@@ -3,6 +3,7 @@
 import argparse
 import warnings
 
+from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.result import CalibrationError
 from diffproj.cli.terminal import failure, note
 from diffproj.targets.detection import BoardNotFoundWarning
@@ -12,7 +13,8 @@ def run(options: argparse.Namespace) -> int:
     """Run the command that was understood; returns the exit code."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("always", BoardNotFoundWarning)
+            for kind in (AmbiguousPoseWarning, BoardNotFoundWarning):
+                warnings.simplefilter("always", kind)
             warnings.showwarning = lambda message, *_: note(str(message))
             return options.run(options)
     except (ValueError, OSError, CalibrationError) as error:

@@ -1,9 +1,11 @@
 """Where the camera stood: at a view that it was calibrated with, or before a board in a new photograph."""
 
 import argparse
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.inputs import find_corners, photographs
@@ -88,7 +90,9 @@ def new_photograph(options: argparse.Namespace) -> Scene:
             "it with the camera as it was calibrated, and do not resize or crop it"
         )
     try:
-        located = locate(views, board, camera if calibration is None else calibration)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", AmbiguousPoseWarning)  # a remark beside the results says it
+            located = locate(views, board, camera if calibration is None else calibration)
     except CalibrationError as error:
         raise ValueError(
             f"{options.photograph}: no pose of the board explains its corners; check --camera, --board and --square"

@@ -2,7 +2,7 @@
 
     {"format": "diffproj camera", "version": 1,
      "camera": {"dtype", "size", "K", "R", "t", "lens": {"model", "coefficients"}},
-     "calibration": {"R", "t", "points", "pixels", "visible", "used", ..., "covariance"}}
+     "calibration": {"R", "t", "points", "pixels", "visible", "used", ..., "covariance", "other_poses"}}
 
 `calibration` is there only where a whole calibration was saved. Numbers are written so that they come back exactly.
 JSON has neither NaN nor infinity: `null` stands for NaN.
@@ -13,11 +13,12 @@ import math
 import re
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera
@@ -25,6 +26,7 @@ from diffproj.lens.models import KINDS, coefficients_of
 from diffproj.targets.views import Views
 
 SUFFIXES: tuple[str, ...] = (".json",)
+Known = TypeVar("Known", Covariance, OtherPoses)
 KIND, VERSION = "diffproj camera", 1
 """What every file says of itself."""
 
@@ -73,6 +75,7 @@ def read_calibration(path: Path) -> Calibration | None:
         bow = None if found["bow"] is None else _tensor(found["bow"], torch.float64)
         posed = camera if not camera.batch_shape else camera[..., None]
         covariance = None if found["covariance"] is None else Covariance.from_fields(found["covariance"])
+        others = _other_poses(found.get("other_poses"))  # unknown in a file of an earlier version
         return Calibration(
             camera,
             posed.at(R, t),
@@ -87,6 +90,7 @@ def read_calibration(path: Path) -> Calibration | None:
             tuple(found["causes"]),
             None if found["pixel_sigma"] is None else _tensor(_with_nan(found["pixel_sigma"]), torch.float64),
             None if covariance is None else partial(_same, covariance),
+            None if others is None else partial(_same, others),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
@@ -126,13 +130,26 @@ def _calibration_fields(item: Calibration) -> dict[str, Any]:
         "rejected": item.rejected.tolist(),
         "causes": item.causes,
         "pixel_sigma": None if item.pixel_sigma is None else item.pixel_sigma.tolist(),
-        "covariance": item.covariance.to_fields() if item.has_covariance else None,
+        "covariance": item.covariance_of_kept_poses.to_fields() if item.has_covariance else None,
+        "other_poses": _other_fields(item.other_poses) if item.has_alternatives else None,
     }
 
 
-def _same(covariance: Covariance) -> Covariance:
-    """What a calibration calls for its covariance; a function of the module, so that it can be pickled."""
-    return covariance
+def _other_fields(others: OtherPoses) -> dict[str, Any]:
+    """The other poses, `null` for an infinite ratio."""
+    return {"likelihood_ratio": others.ratio.tolist(), "R": others.R.tolist(), "t": others.t.tolist()}
+
+
+def _other_poses(fields: dict[str, Any] | None) -> OtherPoses | None:
+    if fields is None:
+        return None
+    R, t, ratio = (_tensor(_with_nan(fields[key]), torch.float64) for key in ("R", "t", "likelihood_ratio"))
+    return OtherPoses(R, t, torch.where(ratio.isnan(), torch.inf, ratio))
+
+
+def _same(known: Known) -> Known:
+    """What a calibration calls for what it knows; a function of the module, so that it can be pickled."""
+    return known
 
 
 def _without_nan(value: Any) -> Any:

@@ -13,6 +13,8 @@ with `D = dX / d uv`, G the derivative by theta and by the plane, and Sigma thei
 with its correlations between intrinsics and pose, and the plane's where one is given. A quantity of some of the points
 has the variance `g^T C g`, g its gradient. This is first order: sampling agrees as long as standard deviations are
 small beside the distance. The covariance of all pairs of points is computed only where it is asked for (`joint`).
+
+Where a view's pose may be the wrong one of two, the other is too far away for that: see `doubt.py`.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,6 +32,7 @@ from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
+from diffproj.measurement.doubt import of_the_pose
 
 SIGNIFICANT = 3.0
 """How many standard deviations a value has to be away from 0 to be told from it."""
@@ -265,6 +268,9 @@ def measure(
         with_offset = torch.cat([-points, torch.ones_like(points[..., :1])], dim=-1)
         blocks.append(lift.unsqueeze(-1) * with_offset.unsqueeze(-2))
         covariances.append(in_float64(plane_covariance))
+    if isinstance(calibration, Calibration) and calibration.has_alternatives:
+        doubt = of_the_pose(pixels, calibration, view_number(calibration, view), plane, points, valid)
+        blocks, covariances = [*blocks, doubt.columns], [*covariances, doubt.covariance]
     common = torch.where(valid[..., None, None], torch.cat(blocks, dim=-1), 0.0)
     own = sigma[..., None, None] * D
     includes_intrinsics = isinstance(calibration, Calibration) and known is not None and calibration.knows_intrinsics
@@ -295,7 +301,7 @@ def _at_view(calibration: Calibration, view: int | str) -> tuple[Camera, Tensor 
     number = view_number(calibration, view)
     if not bool(calibration.used[..., number, :].any(-1).all()):
         raise ValueError(f"view: want one whose pose is known, got {view!r}, of which no corner was used")
-    known = calibration.covariance.view(number) if calibration.has_covariance else None
+    known = calibration.covariance_of_kept_poses.view(number) if calibration.has_covariance else None
     level = None if calibration.pixel_sigma is None else calibration.pixel_sigma.unsqueeze(-1)
     return calibration.cameras[..., number], known, level
 

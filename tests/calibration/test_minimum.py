@@ -249,7 +249,8 @@ def test_locate_finds_the_lower_of_two_poses() -> None:
     R = rotations(torch.tensor([0.3, 0.15, 0.8], dtype=D)).expand(200, 3, 3)
     pixels, _ = camera.at(R, torch.tensor([-250.0, 150, 3000], dtype=D)).project(BOARD.points)
     pixels = pixels + 0.2 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0), dtype=D)
-    found = dp.locate(dp.Views(pixels, size=(640, 480)), BOARD, camera, throw=False)
+    with pytest.warns(dp.AmbiguousPoseWarning):
+        found = dp.locate(dp.Views(pixels, size=(640, 480)), BOARD, camera, throw=False)
     costs = found.residuals.square().sum((-2, -1))
     points, matrix = BOARD.points.numpy(), K.numpy()
     for view, seen in enumerate(pixels.numpy()):

@@ -214,7 +214,7 @@ def test_what_is_not_determined_is_infinite() -> None:
     covariance = found.covariance
     assert covariance.undetermined.any()
     assert not covariance.undetermined.all()
-    assert covariance.deviations["f_x"].isinf()
+    assert covariance.deviations["f_y"].isinf()
     assert "not determined" in found.summary()
     full = covariance.full()
     assert not full.isnan().any()

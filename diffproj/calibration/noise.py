@@ -1,0 +1,40 @@
+"""The noise of corners: what the residuals of a fit tell of it, together with what a calibration before told."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.fit import Fit
+
+CONTRADICTION = 0.01
+"""Chance of residuals as large as the fit's under the noise that was known, below which that does not hold here."""
+
+
+class Noise(NamedTuple):
+    """The noise of corners, as residuals told it.
+
+    Attributes:
+        variance: of a coordinate in squared pixels `(P,)`; NaN where it is not known.
+        freedom: how many degrees of freedom that is from `(P,)`.
+    """
+
+    variance: Tensor
+    freedom: Tensor
+
+
+def own_noise(found: Fit) -> Noise:
+    """That of the residuals alone; variance 0 and one degree of freedom where there is none."""
+    variance = found.residual_variance().detach()
+    freedom = found.degrees_of_freedom().clamp(min=1).to(variance)
+    return Noise(torch.where(variance.isfinite(), variance, 0.0), freedom)
+
+
+def pooled(own: Noise, known: Noise) -> Noise:
+    """Both together, each by its degrees of freedom; the fit's own where they contradict what was known."""
+    squares = own.variance * own.freedom
+    usual = known.variance > 0
+    chance = torch.special.gammaincc(own.freedom / 2, squares / (2 * torch.where(usual, known.variance, 1.0)))
+    usual = usual & (chance > CONTRADICTION)
+    both = torch.where(usual, own.freedom + known.freedom, own.freedom)
+    return Noise(torch.where(usual, squares + known.variance * known.freedom, squares) / both, both)
