@@ -54,9 +54,9 @@ def locate(
     chosen = locate_options(options)
     loss = chosen.loss
     data = Data(views, target, chosen.weights)
-    known = None
+    known = lens_region = None
     if isinstance(camera, Calibration):
-        known = camera.covariance if camera.has_covariance else None
+        known, lens_region = camera.covariance if camera.has_covariance else None, camera.region
         camera = camera.camera
     camera = as_camera(camera)
     if len(camera.batch_shape) > len(data.batch):
@@ -113,4 +113,4 @@ def locate(
         ),
     )
     found = Fit(task, joined, torch.zeros_like(data.used))
-    return outcome("locate", data, found, camera.size or views.size, chosen.throw, known)
+    return outcome("locate", data, found, camera.size or views.size, chosen.throw, known, lens_region)

@@ -56,8 +56,12 @@ def outcome(
     size: tuple[int, int] | None,
     throw: bool,
     known: Covariance | None = None,
+    lens_region: Tensor | None = None,
 ) -> Calibration:
-    """The calibration with the batch shape of the views."""
+    """The calibration with the batch shape of the views.
+
+    `known` is the covariance of intrinsics that were held, and `lens_region` the part of the image where they are known.
+    """
     task, solution, batch = found.task, found.solution, data.batch
     cameras = task.parameters.unpack(solution.shared, solution.local)
     status, causes = verdicts(found, data.views.names, data.target)
@@ -92,6 +96,8 @@ def outcome(
         causes,
         shaped(found.pixel_sigma()),
         partial(_covariance, found, tuple(batch), known),
+        shaped(found.degrees_of_freedom().to(torch.float64)) if task.loss is None else None,
+        lens_region,
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)

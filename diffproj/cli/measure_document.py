@@ -10,7 +10,8 @@ from diffproj.cli.scene import Scene
 from diffproj.geometry.back_projection import Reason, explain
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
-from diffproj.measurement.measure import Measurement, Quantity
+from diffproj.measurement.measurement import Measurement
+from diffproj.measurement.quantity import Quantity
 
 REASONS = {
     Reason.NOT_FINITE: "the pixel is no number",

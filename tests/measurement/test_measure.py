@@ -66,18 +66,18 @@ def test_jacobians_are_autograds(lens: str, slanted: bool) -> None:
     size = found.covariance.view(3).shape[-1]
     by_theta = torch.func.jacfwd(lambda step: redone(found, 3, step, pixels, plane))(torch.zeros(size, dtype=D))
     scale = by_theta.abs().amax((0, 1))
-    assert ((measured._common[..., :size] - by_theta).abs().amax((0, 1)) <= 1e-8 * scale).all()
+    assert ((measured._noise.common[..., :size] - by_theta).abs().amax((0, 1)) <= 1e-8 * scale).all()
     by_pixel = torch.func.vmap(torch.func.jacfwd(lambda p: dp.back_project(p[None], found.cameras[3], plane)[0][0]))(
         pixels
     )
-    torch.testing.assert_close(measured._own, by_pixel, rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(measured._noise.own, by_pixel, rtol=1e-8, atol=1e-10)
 
     def by_coefficients(abcd: torch.Tensor) -> torch.Tensor:
         return dp.back_project(pixels, found.cameras[3], dp.Plane(abcd[:3], abcd[3]))[0]
 
     abcd = torch.cat([plane.to(D).normal, plane.to(D).offset[None]])
     by_plane = torch.func.jacfwd(by_coefficients)(abcd)
-    torch.testing.assert_close(measured._common[..., size:], by_plane, rtol=1e-7, atol=1e-7)
+    torch.testing.assert_close(measured._noise.common[..., size:], by_plane, rtol=1e-7, atol=1e-7)
 
 
 def test_joint_covariance_is_symmetric_and_positive(calibration: dp.Calibration) -> None:
