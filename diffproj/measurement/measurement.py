@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 from diffproj.calibration.covariance import zero_where_infinite
 from diffproj.calibration.region import in_region
 from diffproj.measurement.folded import longest_first, norm_variance
-from diffproj.measurement.intervals import curved_interval, norm_interval
+from diffproj.measurement.intervals import angle_interval, curved_interval, norm_interval
 from diffproj.measurement.propagation import Noise, Propagated, kink_variance
 from diffproj.measurement.quantity import Bounds, Quantity
 from diffproj.measurement.shapes import area_vector, difference, length, turn
@@ -143,7 +143,7 @@ class Measurement:
         spread = Propagated.of(self._noise, index, gradient.nan_to_num(0.0, 0.0, 0.0).unsqueeze(-3))
         with torch.no_grad():
             first = spread.covariance.squeeze(-1).squeeze(-1)
-            kink = kink_variance(function, spread.columns(), chosen, first)
+            kink = kink_variance(function, spread.steps(), chosen, first)
         return self._number(spread, function, value, kink)
 
     def lengths(self, pairs: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
@@ -153,11 +153,14 @@ class Measurement:
     def angles(self, triples: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
         """Angles at the second of three points in radians: of successive points, or of `triples (M, 3)`.
 
-        Where an arm has no length the deviation is infinite.
+        Where an arm has no length the deviation is infinite, and where an arm may have none any angle is possible.
         """
         index = self._successive(3) if triples is None else _sets("triples", triples, 3)
-        arms = self.points[..., self._numbers(index), :].diff(dim=-2)
-        return self._norms(turn, index, limit=torch.pi, undefined=(arms == 0).all(-1).any(-1))
+        index = self._numbers(index)
+        arms = [self._norms(difference, index[:, [1, end]]) for end in (0, 2)]
+        undefined = (arms[0].value == 0) | (arms[1].value == 0)
+        found = self._norms(turn, index, limit=torch.pi, undefined=undefined)
+        return replace(found, _bounds=partial(angle_interval, arms, found))
 
     def area(self, corners: Sequence[int] | None = None) -> Quantity:
         """The area of the polygon with these corners in order (all points if left out), in squared world units.

@@ -42,6 +42,15 @@ class Noise:
             lost = lost.unsqueeze(-2)
         return (rows.abs() * lost.unsqueeze(-2)).sum(-1, keepdim=True) > 0
 
+    @torch.no_grad()
+    def root(self) -> Tensor:
+        """A matrix L `(*B, Q, Q)` with `L L^T = sigma`, as if what is not determined were known."""
+        sigma = zero_where_infinite(self.sigma.detach())
+        scale = sigma.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+        unit = torch.where(scale > 0, scale, 1.0)
+        values, vectors = torch.linalg.eigh(sigma / unit.unsqueeze(-1) / unit.unsqueeze(-2))
+        return scale.unsqueeze(-1) * vectors * values.clamp(min=0).sqrt().unsqueeze(-2)
+
 
 @dataclass(frozen=True, eq=False)
 class Propagated:
@@ -90,34 +99,35 @@ class Propagated:
         freedom = self.noise.degrees_of_freedom.unsqueeze(-1).expand_as(share)
         return torch.where(share > 0, freedom / share.square().clamp(min=1e-300), torch.inf)
 
-    def moved(self, direction: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-        """The points after the step of all errors that changes the vectors most along a direction `(*B, M, r)`.
+    def rows(self) -> Tensor:
+        """The derivative of the vectors by independent errors of deviation 1, `(*B, M, r, E)`: see `points`."""
+        shared = self.common.detach() @ self.noise.root().unsqueeze(-3)
+        own = self.own.detach() * _firsts(self.index)[..., None, None]  # (*B, M, k, r, 2)
+        return torch.cat([shared, own.movedim(-3, -2).flatten(-2)], dim=-1)
+
+    def points(self, errors: Tensor) -> tuple[Tensor, Tensor]:
+        """The points where all errors are what is given, on the curve.
 
         Args:
-            direction: unit vectors.
-            reach: the size of the step in standard deviations `(*B, M)`.
+            errors: independent ones in standard deviations `(*B, M, E)`: Q for camera, pose and plane, then two for the
+                pixel of each of k points, whose errors count where the point is named first.
 
         Returns:
             The points `(*B, M, k, 3)`, and whether all of them are on the plane `(*B, M)`.
         """
-        common, own = self._along(direction)
-        sigma = zero_where_infinite(self.noise.sigma)
-        pixels = (own * own * _firsts(self.index).unsqueeze(-1)).sum((-2, -1))
-        size = (self._variance(common, sigma) + pixels).clamp(min=0).sqrt()
-        factor = torch.where(size > 0, reach / torch.where(size > 0, size, 1.0), 0.0)
-        theta = (common @ sigma) * factor.unsqueeze(-1)
-        points, valid = self.noise.sight.points(self.index, theta, own * factor[..., None, None])
+        Q, k = self.noise.sigma.shape[-1], self.index.shape[-1]
+        theta = errors[..., :Q] @ self.noise.root().mT
+        own = errors[..., Q:].unflatten(-1, (k, 2))
+        same = (self.index.unsqueeze(-1) == self.index.unsqueeze(-2)) & (_firsts(self.index) > 0).unsqueeze(-2)
+        points, valid = self.noise.sight.points(self.index, theta, same.to(own) @ own)
         return points, valid.all(-1)
 
-    def columns(self) -> Tensor:
-        """The steps `(*B, M, C, k, 3)` of each set of points by one deviation of each of C independent errors."""
+    def steps(self) -> Tensor:
+        """The steps `(*B, M, E, k, 3)` of the points by one deviation of each independent error, to first order."""
         noise, index = self.noise, self.index
-        shared = (noise.common @ _root(zero_where_infinite(noise.sigma)).unsqueeze(-3))[
-            ..., index, :, :
-        ]  # (M, k, 3, Q)
-        k = index.shape[-1]
-        same = (index.unsqueeze(-1) == index.unsqueeze(-2)).to(noise.own) * _firsts(index).unsqueeze(-2)
-        own = noise.own[..., index, :, None, :] * same[..., :, None, :, None]  # (M, k, 3, k, 2): of l by j
+        shared = (noise.common @ noise.root().unsqueeze(-3))[..., index, :, :]  # (*B, M, k, 3, Q)
+        same = (index.unsqueeze(-1) == index.unsqueeze(-2)) * _firsts(index).unsqueeze(-2)
+        own = noise.own[..., index, :, None, :] * same[..., :, None, :, None]  # (*B, M, k, 3, k, 2): of l by j
         return torch.cat([shared, own.flatten(-2)], dim=-1).movedim(-1, -3)
 
     def _along(self, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -167,11 +177,3 @@ def _firsts(index: Tensor) -> Tensor:
     """1 where a point is named the first time in its row of `(M, k)`, else 0."""
     same = (index.unsqueeze(-1) == index.unsqueeze(-2)).tril(-1)
     return (~same.any(-1)).to(torch.float64)
-
-
-def _root(sigma: Tensor) -> Tensor:
-    """A matrix L with `L L^T = sigma`."""
-    scale = sigma.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    unit = torch.where(scale > 0, scale, 1.0)
-    values, vectors = torch.linalg.eigh(sigma / unit.unsqueeze(-1) / unit.unsqueeze(-2))
-    return scale.unsqueeze(-1) * vectors * values.clamp(min=0).sqrt().unsqueeze(-2)
