@@ -60,7 +60,7 @@ def outcome(
 ) -> Calibration:
     """The calibration with the batch shape of the views.
 
-    `known` is the covariance of intrinsics that were held, and `lens_region` the part of the image where they are known.
+    `known` is the covariance of intrinsics that were held, `lens_region` the part of the image where they are known.
     """
     task, solution, batch = found.task, found.solution, data.batch
     cameras = task.parameters.unpack(solution.shared, solution.local)

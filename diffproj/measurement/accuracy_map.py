@@ -3,8 +3,8 @@
 Two figures for each place: the ground resolution, world units that one pixel covers along its worst direction, which is
 geometry; and the predicted standard deviation of a point measured there, along its worst direction, which adds what the
 calibration does not know. Places beyond the horizon or the lens's reach are not valid. `covered` tells the part of the
-image that the calibration's corners surround: outside of it a lens model extrapolates, and the standard deviation tells
-how far.
+image that the calibration's corners surround: outside of it, `extrapolated`, nothing tells the lens. The standard
+deviation grows there, but only as far as the lens model holds.
 """
 
 import math
@@ -47,7 +47,7 @@ class AccuracyMap:
 
     @property
     def extrapolated(self) -> Bool[Tensor, "h w"]:
-        """Where a point is measured outside of the corners `(H, W)`: nothing tells the lens there, nor its deviation."""
+        """Where a point is measured outside of the corners `(H, W)`: nothing tells the lens there."""
         return self.valid & ~self.covered
 
     @classmethod

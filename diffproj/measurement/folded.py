@@ -1,15 +1,15 @@
 """Lengths near zero: what an error bar means for the length of a vector that noise could have made.
 
 Let w be a measured vector with covariance C, D the length of its true value, and s the standard deviation of w along
-itself. Far from 0 its length r is normal about D with deviation s. Near 0 it is not: noise makes vectors longer, and the
-length of none is negative. Then
+itself. Far from 0 its length r is normal about D with deviation s. Near 0 it is not: noise makes vectors longer, and no
+length is negative. Then
 
 * the **deviation** is the root mean square error, which is s far off and `sqrt(tr C)` at 0;
-* the **interval** accepts a length D where r is no surprise: above `D - z s`, the plain lower bound, with a probability
-  beyond its upper bound that fills up to the level. Its lower end is then 0 for the stated part of measurements of 0, and
-  it goes over into `r -+ z s` away from 0;
-* across w the noise may be larger than along it, as of two points close to the horizon one behind the other; the upper
-  end is the length of the longest vector within z deviations of w.
+* the **lower bound** is the smallest D that r agrees with. Measurements of D are accepted from `D - z s` up, and so far
+  that they are accepted as often as the level says. So often a length of 0 has the lower bound 0, and away from 0 the
+  bound goes over into `r - z s`;
+* the **upper bound** is the length of the longest vector within z deviations of w: across w the noise may be larger
+  than along it, as between two points close to the horizon. Else it is `r + z s`.
 """
 
 import math

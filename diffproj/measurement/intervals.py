@@ -1,9 +1,9 @@
 """Intervals of measured quantities that follow the curve from pixels to the plane, and know that no length is negative.
 
-An upper bound is the largest value that a quantity takes where all errors together are as large as the level allows, so
-many standard deviations; a lower bound the smallest. For a linear map that is `value -+ reach * deviation`. For one that is
-bent, as the distance to a point near the horizon, it is the bound that the pixels tell, however bent it is on the plane
-(the profile likelihood's; for a ratio, Fieller's). Where such errors reach the horizon there is no bound on that side.
+Bounds are the smallest and the largest value that a quantity takes where all errors together are as many standard
+deviations as the level allows. For a linear map that is `value -+ reach * deviation`. For a bent one, as the distance
+to a point near the horizon, it is what the pixels tell (bounds of the profile likelihood; for a ratio, Fieller's).
+Where such errors reach the horizon, there is no bound on that side.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,8 +17,9 @@ from diffproj.measurement.quantity import Quantity
 from diffproj.measurement.shapes import length
 from diffproj.measurement.student import normal_reach
 
-ROUNDS = 8
-"""How often the direction of the errors that change a quantity most is sought anew where the last ones lead."""
+ROUNDS, TURNED = 8, 1e-5
+"""How often the direction of the errors that change a quantity most is sought anew where the last ones lead, and by how
+much less it has to turn for that to end: its error counts in square."""
 
 Function = Callable[[Tensor], Tensor]
 """Of M sets of points `(*B, M, k, 3)` to M numbers."""
@@ -26,7 +27,7 @@ Function = Callable[[Tensor], Tensor]
 
 @torch.no_grad()
 def curved_interval(
-    spread: Propagated, function: Function, value: Tensor, lost: Tensor, kink: Tensor, level: float, reach: Tensor
+    spread: Propagated, function: Function, value: Tensor, lost: Tensor, kink: Tensor, _level: float, reach: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Bounds of a function of points.
 
@@ -36,8 +37,7 @@ def curved_interval(
         value: where they were measured `(*B, M)`.
         lost: where the calibration does not determine it.
         kink: the standard deviation that its slope lacks.
-        level: of the interval.
-        reach: how many deviations that is `(*B, M)`.
+        reach: how many deviations the interval's level allows `(*B, M)`.
     """
 
     def every(points: Tensor) -> Tensor:
@@ -102,7 +102,7 @@ def norm_interval(
     return low.clamp(min=0), high.clamp(max=limit)
 
 
-def angle_interval(arms: Sequence[Quantity], angle: Quantity, level: float, _: Tensor) -> tuple[Tensor, Tensor]:
+def angle_interval(arms: Sequence[Quantity], angle: Quantity, level: float, _reach: Tensor) -> tuple[Tensor, Tensor]:
     """Bounds of an angle: all that there are where one of its arms may have no length, and so no direction."""
     low, high = angle.interval(level)
     unclear = (arms[0].interval(level)[0] == 0) | (arms[1].interval(level)[0] == 0)
@@ -116,6 +116,8 @@ def _extreme(
 
     Infinite where the plane is left on the way. Each round goes where the slope at the last place points.
     """
+    if value.numel() == 0:
+        return value, slopes
 
     def total(errors: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         points, valid = spread.points(errors)
@@ -131,14 +133,14 @@ def _extreme(
         best, where = torch.where(better, there, best), torch.where(better.unsqueeze(-1), direction, where)
         moves = (slope.abs().amax(-1, keepdim=True) > 0) & slope.isfinite().all(-1, keepdim=True)
         following = torch.where(moves, side * _unit(slope), direction)
-        if bool((following - direction).abs().amax() < 1e-9):
+        if bool(((following - direction).abs() < TURNED).all()):
             break
         direction = following
     return torch.where(bounded, best, side * torch.inf), where
 
 
 def _steps_to_zero(spread: Propagated, function: Function, value: Tensor, direction: Tensor, unit: Tensor) -> Tensor:
-    """How many steps of `unit` it takes from a positive value to zero `(*B, M)`; at least `folded.FAR` where it is far."""
+    """How many steps of `unit` it takes from a positive value to zero `(*B, M)`; `folded.FAR` where it is further."""
 
     def after(steps: Tensor) -> Tensor:
         points, valid = spread.points(direction * (steps * unit).unsqueeze(-1))

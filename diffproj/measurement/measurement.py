@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import torch
@@ -18,8 +18,8 @@ from diffproj.measurement.quantity import Bounds, Quantity
 from diffproj.measurement.shapes import area_vector, difference, length, turn
 
 EXTRAPOLATED = (
-    "Extrapolated: outside of the region that the calibration's corners covered, where nothing tells the lens; the truth "
-    "may lie many deviations off. Calibrate with the board there too."
+    "Extrapolated: outside of the region that the calibration's corners covered. Nothing tells the lens there, and the "
+    "truth may lie many deviations off: calibrate with the board there too."
 )
 NONLINEAR = "Nonlinear: close to the horizon or to zero, where the deviation misleads; take the interval."
 """What the summary says of points and lengths that it marks so."""
@@ -41,8 +41,8 @@ class Measurement:
     points: Float[Tensor, "*batch n 3"]
     valid: Bool[Tensor, "*batch n"]
     includes_intrinsics: bool
-    _noise: Noise
-    _region: Tensor | None = None
+    _noise: Noise = field(repr=False)
+    _region: Tensor | None = field(default=None, repr=False)
 
     @property
     def degrees_of_freedom(self) -> Float[Tensor, "*batch"]:

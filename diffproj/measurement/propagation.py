@@ -1,8 +1,8 @@
 """What makes measured points uncertain, and how that reaches the quantities that depend on them.
 
 All points share the errors of camera, pose and plane; each has those of its own pixel. `Noise` holds both. `Propagated`
-is what they do to M vectors of r components, each a function of k points with Jacobian J: to first order as a covariance,
-and as the step of all errors together that changes a component most, along which `Sight` follows the curve.
+is what they do to M vectors of r components, each a function of k points: to first order as a covariance, and as the
+points that given errors lead to, on the curve.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """`Quantity`: measured values, their standard deviations, and the intervals in which the truth lies."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,8 +9,8 @@ from torch import Tensor
 
 from diffproj.measurement.student import normal_reach, student_reach
 
-SIGNIFICANT = 3.0
-"""How many standard deviations a value has to be away from 0 to be told from it."""
+SIGNIFICANT = 0.9973
+"""The level of the interval that has to leave out 0 for a value to be told from it: three standard deviations'."""
 
 BENT = 0.1
 """By how much of its half width an interval has to differ from `value -+ reach * deviation` to be called nonlinear."""
@@ -35,7 +35,7 @@ class Quantity:
     value: Float[Tensor, "*shape"]
     deviation: Float[Tensor, "*shape"]
     degrees_of_freedom: Float[Tensor, "*shape"] | None = None
-    _bounds: Bounds | None = None
+    _bounds: Bounds | None = field(default=None, repr=False)
 
     def interval(self, level: float = 0.95) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
         """Lower and upper bounds between which the truth lies with that probability, for Gaussian noise.
@@ -56,8 +56,13 @@ class Quantity:
 
     @property
     def significant(self) -> Bool[Tensor, "*shape"]:
-        """Whether the value is at least three of its standard deviations from 0; false where both are 0."""
-        return (self.value.abs() >= SIGNIFICANT * self.deviation) & (self.value != 0)
+        """Whether the value is told from 0: at least three standard deviations away, or as much as makes it as sure.
+
+        It takes more where the deviation was estimated from few residuals, and for the length between two points, which
+        noise alone makes longer than 0. False where value and deviation are both 0.
+        """
+        low, high = self.interval(SIGNIFICANT)
+        return (low > 0) | (high < 0)
 
     @property
     def nonlinear(self) -> Bool[Tensor, "*shape"]:

@@ -1,8 +1,8 @@
 """Lengths, angles and areas as the lengths of vectors that are smooth where the numbers themselves have a kink.
 
-A length is that of the difference of two points; an area that of the outline's area vector; an angle that of the turn from
-one arm to the other, or, above a right angle, what the turn lacks to 180 degrees. At zero the vector has a derivative, and
-so a covariance, where its length has none.
+A length is that of the difference of two points; an area that of the outline's area vector; an angle that of the turn
+from one arm to the other, or, above a right angle, what it lacks to 180 degrees. At zero the vector has a derivative,
+and so a covariance, where its length has none.
 """
 
 import torch

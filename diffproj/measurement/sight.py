@@ -1,13 +1,12 @@
 """Where points come to lie when pixels, camera and plane move by their errors: on the curve, not on its tangent.
 
-A moved camera sees a point at another pixel, and to first order looking through it is looking at a shifted pixel with the
-camera as it is. Pixels bear that well, up to the horizon: the step from them to the plane, which is far from straight
-there, is the exact one.
+A moved camera sees a point at another pixel, and to first order looking through it is looking at a shifted pixel with
+the camera as it is. That is accurate up to the horizon, and the step from pixels to the plane, far from straight there,
+is the exact one. It is not where the lens is extrapolated.
 """
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from diffproj.geometry.back_projection import back_project

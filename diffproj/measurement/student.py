@@ -1,6 +1,6 @@
 """How many standard deviations an interval reaches: the normal distribution's quantile, and Student's t.
 
-Where a standard deviation was itself estimated from few residuals, it may be too small by chance, and an interval has to
+A standard deviation that was itself estimated from few residuals may be too small by chance, and an interval has to
 reach further: 4.3 deviations instead of 1.96 for 95 % with two degrees of freedom.
 """
 
@@ -41,12 +41,12 @@ def student_reach(level: float, degrees: Float[Tensor, "*shape"]) -> Float[Tenso
     """The number of estimated standard deviations within which an error lies with that probability.
 
     With `t = sqrt(n) tan(phi)` the probability is the integral of `cos(phi)^(n - 1)`, which Gauss's 64 nodes give to
-    rounding, and Newton's steps from 0 rise to the solution, for the integrand falls. From 1000 degrees of freedom on it
-    is Fisher's series (Abramowitz and Stegun 26.7.5).
+    rounding, and Newton's steps from 0 rise to the solution, for the integrand falls. From 1000 degrees of freedom on
+    Fisher's series is as exact (Abramowitz and Stegun 26.7.5).
 
     Args:
         level: the probability.
-        degrees: degrees of freedom, any positive number; infinity stands for a known standard deviation.
+        degrees: degrees of freedom, from 1 on, not only whole ones; infinity stands for a known standard deviation.
 
     Returns:
         The reach, infinite where there are no degrees of freedom.
