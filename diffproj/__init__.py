@@ -66,7 +66,9 @@ from diffproj.lens.kannala_brandt import KannalaBrandt
 from diffproj.lens.models import register_lens
 from diffproj.lens.protocol import Lens
 from diffproj.measurement.accuracy_map import AccuracyMap
-from diffproj.measurement.measure import Measurement, Quantity, measure
+from diffproj.measurement.measure import measure
+from diffproj.measurement.measurement import Measurement
+from diffproj.measurement.quantity import Quantity
 from diffproj.nn.camera import LearnableCamera
 from diffproj.nn.loss import PlaneLoss
 from diffproj.nn.plane import LearnablePlane

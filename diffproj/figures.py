@@ -11,6 +11,7 @@ from diffproj.measurement.accuracy_map import AccuracyMap
 from diffproj.paper.experiment import Experiment
 
 EXACT, APPROXIMATED, ERROR = "#8a8f98", "#0b6bcb", "#d6336c"
+HATCH = (1.0, 1.0, 1.0, 0.45)
 
 
 def fig7(experiment: Experiment, magnification: float = 50.0) -> Figure:
@@ -67,7 +68,10 @@ def fig7(experiment: Experiment, magnification: float = 50.0) -> Figure:
 
 
 def accuracy(found: AccuracyMap, unit: str = "world units") -> Figure:
-    """Ground resolution and predicted standard deviation over the image; the line surrounds the calibration's corners.
+    """Ground resolution and predicted standard deviation over the image.
+
+    A line surrounds the calibration's corners. What lies outside of them is hatched: the lens is extrapolated there,
+    and the standard deviation may be far too small.
 
     Args:
         found: the map, from `AccuracyMap.over_image`.
@@ -96,6 +100,10 @@ def accuracy(found: AccuracyMap, unit: str = "world units") -> Figure:
         covered = found.covered.cpu().double().numpy()
         if 0 < float(covered.mean()) < 1:
             axes.contour(u, v, covered, levels=[0.5], colors="white", linewidths=1.2)
+        extrapolated = found.extrapolated.cpu().double().numpy()
+        if bool(extrapolated.any()):
+            outside = axes.contourf(u, v, extrapolated, levels=[0.5, 1.5], colors="none", hatches=["//"])
+            outside.set(edgecolor=HATCH, linewidth=0)
         axes.set_title(title, fontsize=10)
         axes.set_xlabel("u, px", labelpad=1, fontsize=9)
         axes.set_ylabel("v, px", labelpad=1, fontsize=9)
@@ -110,6 +118,8 @@ def accuracy(found: AccuracyMap, unit: str = "world units") -> Figure:
             marks = (m * 10.0**e for e in range(-9, 9) for m in (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9))
             bar.set_ticks([mark for mark in marks if known.min() <= mark <= known.max()], minor=False)
         bar.ax.tick_params(labelsize=8, which="both")
+    if bool(found.extrapolated.any()):
+        figure.supxlabel("hatched: outside of the calibration's corners, where the lens is extrapolated", fontsize=9)
     return figure
 
 

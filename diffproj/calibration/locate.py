@@ -11,9 +11,7 @@ from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.options import LocateOptions, locate_options
-from diffproj.calibration.other_poses import Noise
 from diffproj.calibration.outcome import outcome
-from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.solver import Solution, Status, select
 from diffproj.calibration.task import Task
@@ -66,10 +64,9 @@ def locate(
     chosen = locate_options(options)
     loss = chosen.loss
     data = Data(views, target, chosen.weights)
-    calibration, known = None, None
+    calibration = camera if isinstance(camera, Calibration) else None
     if isinstance(camera, Calibration):
-        calibration, camera = camera, camera.camera
-        known = calibration.covariance_of_kept_poses if calibration.has_covariance else None
+        camera = camera.camera
     camera = as_camera(camera)
     if len(camera.batch_shape) > len(data.batch):
         raise ValueError(
@@ -125,18 +122,7 @@ def locate(
         ),
     )
     found = Fit(task, joined, torch.zeros_like(data.used))
-    noise = None if calibration is None else _noise(calibration, data)
-    located = outcome("locate", data, found, camera.size or views.size, chosen.throw, known, noise)
+    located = outcome("locate", data, found, camera.size or views.size, chosen.throw, calibration)
     if bool(located.ambiguous.any()):
         warnings.warn(f"locate: {located.doubts}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
     return located
-
-
-def _noise(calibration: Calibration, data: Data) -> Noise | None:
-    """The noise of corners in that calibration, for each of the cameras of the data."""
-    if calibration.pixel_sigma is None:
-        return None
-    used = calibration.used
-    count = 2 * used.sum((-2, -1)) - POSE * used.any(-1).sum(-1) - calibration.shared.shape[-1]
-    sigma = calibration.pixel_sigma.detach().to(data.points)
-    return Noise(*(z.to(sigma).expand(data.batch).reshape(-1) for z in (sigma.square(), count.clamp(min=1))))

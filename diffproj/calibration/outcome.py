@@ -11,8 +11,9 @@ from diffproj.calibration.constraints import free_basis, held_at, make_prior
 from diffproj.calibration.covariance import Covariance, reshaped
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, fit
+from diffproj.calibration.noise import Noise, level, noise_of
 from diffproj.calibration.options import Options
-from diffproj.calibration.other_poses import Noise, other_poses
+from diffproj.calibration.other_poses import other_poses
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Prior, Status
@@ -58,13 +59,18 @@ def outcome(
     found: Fit,
     size: tuple[int, int] | None,
     throw: bool,
-    known: Covariance | None = None,
-    noise: Noise | None = None,
+    known: Calibration | None = None,
 ) -> Calibration:
-    """The calibration with the batch shape of the views; `known` and `noise` of a calibration that held before."""
+    """The calibration with the batch shape of the views.
+
+    Where intrinsics were held, `known` is the calibration that they came from: its covariance, the noise of its corners
+    and the region of the image where it knows the lens go along.
+    """
     task, solution, batch = found.task, found.solution, data.batch
     cameras = task.parameters.unpack(solution.shared, solution.local)
     status, causes = verdicts(found, data.views.names, data.target)
+    before = None if known is None else noise_of(known, batch)
+    noise = level(found, before)
 
     def shaped(tensor: Tensor) -> Tensor:
         return tensor.reshape((*batch, *tensor.shape[1:]))
@@ -94,18 +100,23 @@ def outcome(
         shaped(solution.shared[:, -2:]) if task.bow else None,
         task.objective,
         causes,
-        shaped(found.pixel_sigma()),
-        partial(_covariance, found, tuple(batch), known),
-        partial(_others, found, tuple(batch), noise),
+        shaped(noise.variance.sqrt()),
+        partial(_covariance, found, tuple(batch), before, known),
+        partial(_others, found, tuple(batch), before),
+        shaped(noise.freedom),
+        None if known is None else known.region,
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)
     return calibration
 
 
-def _covariance(found: Fit, batch: tuple[int, ...], known: Covariance | None) -> Covariance:
-    own = reshaped(covariance_of(found), batch)
-    return own if known is None else own.following(known)
+def _covariance(found: Fit, batch: tuple[int, ...], noise: Noise | None, known: Calibration | None) -> Covariance:
+    if known is None or not known.has_covariance:
+        return reshaped(covariance_of(found, noise), batch)
+    before = known.covariance_of_kept_poses
+    own = covariance_of(found, noise, before.dispersion.expand(batch).reshape(-1))
+    return reshaped(own, batch).following(before)
 
 
 def _others(found: Fit, batch: tuple[int, ...], noise: Noise | None) -> OtherPoses:

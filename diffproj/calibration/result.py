@@ -13,6 +13,7 @@ from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
 from diffproj.calibration.bow import bowed
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.parametrisation import BOW, Parametrisation
+from diffproj.calibration.region import covered_region
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
 from diffproj.targets.residuals import projected_minus_seen
@@ -67,6 +68,9 @@ class Calibration:
         causes: for each camera that did not converge, the cause in words; `*B` flattened.
         pixel_sigma: the standard deviation of a corner's coordinate in pixels, as the residuals tell it `(*B,)`: their
             root mean square over the degrees of freedom; under a robust loss, 1.4826 times their median.
+        degrees_of_freedom: how many independent residuals tell `pixel_sigma` `(*B,)`, and so the scale of the
+            covariance; `None` where that is not known.
+        lens_region: for what `locate` found with a calibration, the `region` of that one.
     """
 
     camera: Camera
@@ -83,6 +87,8 @@ class Calibration:
     pixel_sigma: Float[Tensor, "*batch"] | None = None
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
+    degrees_of_freedom: Float[Tensor, "*batch"] | None = None
+    lens_region: Float[Tensor, "*#batch directions"] | None = None
 
     @property
     def board_points(self) -> Float[Tensor, "*batch n 3"]:
@@ -256,6 +262,18 @@ class Calibration:
             ValueError: the calibration came from a file without the other poses.
         """
         return self.other_poses.ratio < SURE
+
+    @cached_property
+    def region(self) -> Float[Tensor, "*#batch directions"] | None:
+        """Where in the image the corners that determined the lens lie `(*B, 64)`: see `calibration/region.py`.
+
+        They are the corners of the views; for what `locate` found, those of the calibration that it was given. `None`
+        where they are not known, as after `locate` with a camera alone.
+        """
+        if self.lens_region is not None:
+            return self.lens_region
+        own = self.knows_intrinsics or not self.has_covariance
+        return covered_region(self.views.pixels, self.used) if own else None
 
     def summary(self) -> str:
         """One camera as a text for people: parameters with deviations, RMS of each view, how it ended.

@@ -23,26 +23,36 @@ from diffproj.calibration.covariance import Covariance, Scores
 from diffproj.calibration.dispersion import dispersion
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.losses import slope_and_bend
+from diffproj.calibration.noise import Noise, pooled
 from diffproj.calibration.solver import Equations
 
 
-def covariance_of(found: Fit) -> Covariance:
-    """The joint covariance of shared parameters and poses of P cameras."""
+def covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = None) -> Covariance:
+    """The joint covariance of shared parameters and poses of P cameras.
+
+    Args:
+        found: the fit.
+        known: the noise that a calibration before had, where the shared parameters are held.
+        phi: and its dispersion `(P,)`; that of the fit if left out.
+    """
     task = found.task
-    phi = dispersion(found)
+    phi = dispersion(found) if phi is None else phi
     precision = None if task.prior is None else task.prior.precision
     common = {"names": task.names, "basis": task.basis, "precision": precision, "dispersion": phi}
     if task.objective == "plane":
         equations, scores = _on_the_plane(found)
         return covariances.covariance(equations, variance=torch.ones_like(phi), scores=scores, **common)
     if task.loss is None:
-        return covariances.covariance(found.solution.equations, variance=found.residual_variance(), **common)
-    equations, variance = _robust(found)
-    return covariances.covariance(equations, variance=variance, **common)
+        equations, factor, variance = found.solution.equations, 1.0, found.residual_variance()
+    else:
+        equations, factor, variance = _robust(found)
+    if known is not None and task.weights is None:
+        variance = pooled(Noise(variance, found.degrees_of_freedom().to(variance)), known).variance
+    return covariances.covariance(equations, variance=factor * variance, **common)
 
 
-def _robust(found: Fit) -> tuple[Equations, Tensor]:
-    """The normal equations with the score's mean derivative, and the variance that makes M of them."""
+def _robust(found: Fit) -> tuple[Equations, Tensor, Tensor]:
+    """The normal equations with the score's mean derivative a, this, and the variance in the place of `s^2`."""
     rows, residual, weight = _panel(found)
     squared = residual.square().sum(2)
     slope, bend = slope_and_bend(found.task.loss, squared)
@@ -58,7 +68,7 @@ def _robust(found: Fit) -> tuple[Equations, Tensor]:
     a_squared = mean(slope.square() + 2 * slope * bend * squared + 2 * (bend * squared).square())
     k = 1 + (1 - spare / (2 * n)) * (a_squared / a.square() - 1).clamp(min=0)
     q = torch.where(spare > 0, (weight * slope.square() * squared * used).sum((-2, -1)) / spare, torch.nan)
-    return _equations(found, rows, weight * a[:, None, None]), k.square() * q / a
+    return _equations(found, rows, weight * a[:, None, None]), a, k.square() * q / a.square()
 
 
 def _on_the_plane(found: Fit) -> tuple[Equations, Scores]:

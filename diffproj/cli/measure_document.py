@@ -10,7 +10,8 @@ from diffproj.cli.scene import Scene
 from diffproj.geometry.back_projection import Reason, explain
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
-from diffproj.measurement.measure import Measurement, Quantity
+from diffproj.measurement.measurement import Measurement
+from diffproj.measurement.quantity import Quantity
 
 REASONS = {
     Reason.NOT_FINITE: "the pixel is no number",
@@ -73,8 +74,10 @@ def _points(
     """The points, and remarks on those that are not on the plane or not in the photograph."""
     rows, remarks = [], []
     seen = camera.in_image(pixels).tolist() if camera.size is not None else [True] * len(pixels)
-    columns = (pixels, explain(pixels, camera, plane), measured.points, measured.deviations)
-    for number, (pixel, code, point, deviation) in enumerate(
+    beyond = [None] * len(pixels) if measured.extrapolated is None else measured.extrapolated.tolist()
+    bent, outside = measured.nonlinear.tolist(), []
+    columns = (pixels, explain(pixels, camera, plane), measured.points, measured.deviations, *measured.interval())
+    for number, (pixel, code, point, deviation, low, high) in enumerate(
         zip(*(column.tolist() for column in columns), strict=True), start=1
     ):
         reason = Reason(code)
@@ -82,13 +85,46 @@ def _points(
         row = {"number": number, "pixel": pixel, "valid": valid, "reason": None if valid else reason.name}
         row["world"] = [_known(x) for x in point] if valid else None
         row["deviation"] = [_known(x) for x in deviation] if valid else None
+        row["interval_95"] = [[_known(a), _known(b)] for a, b in zip(low, high, strict=True)] if valid else None
+        row["extrapolated"] = beyond[number - 1]
         rows.append(row)
         if not valid:
             remarks.append(f"Point {number} is not on the plane: {REASONS[reason]}.")
         elif not seen[number - 1]:
             width, height = camera.size or (0, 0)
             remarks.append(f"Point {number} lies outside the photograph of {width} x {height} px.")
+        elif beyond[number - 1]:
+            outside.append(number)
+        if bent[number - 1]:
+            bounds = ", ".join(
+                f"{axis} {between(a, b, s)}"
+                for axis, a, b, s in zip("xyz", low, high, deviation, strict=True)
+                if s > 1e-9 * max(deviation)
+            )
+            remarks.append(
+                f"Point {number} is so close to the horizon that its deviations mislead. 95 % intervals: {bounds}."
+            )
+    if outside:
+        remarks.append(
+            f"{listed('Point', outside)} outside of the region that the calibration's corners covered. Nothing tells "
+            "the lens there, and the truth may lie many deviations off: calibrate with the board there too."
+        )
     return rows, remarks
+
+
+def listed(word: str, numbers: Sequence[int]) -> str:
+    """`Point 2 lies`, `Points 2, 3 and 5 lie`."""
+    *most, last = map(str, numbers)
+    return f"{word}s {', '.join(most)} and {last} lie" if most else f"{word} {last} lies"
+
+
+def between(low: float, high: float, scale: float) -> str:
+    """An interval for people, whose bounds may be infinite, to the second digit of the standard deviation `scale`."""
+    decimals = max(0, 1 - math.floor(math.log10(scale))) if scale > 0 else 3
+    start, end = (f"{end:.{decimals}f}" if math.isfinite(end) else "" for end in (low, high))
+    if start and end:
+        return f"{start} to {end}"
+    return f"from {start}" if start else f"up to {end}" if end else "unknown"
 
 
 def _known(number: float) -> float | None:
@@ -102,7 +138,9 @@ def _quantities(found: Quantity) -> list[dict[str, Any]]:
         {
             "value": _known(value),
             "deviation": _known(deviation),
-            "interval_95": [below, above] if math.isfinite(below) and math.isfinite(above) else None,
+            "interval_95": [_known(below), _known(above)]
+            if math.isfinite(value) and math.isfinite(deviation)
+            else None,
             "significant": significant if math.isfinite(value) else None,
         }
         for value, deviation, below, above, significant in zip(*(column.tolist() for column in columns), strict=True)

@@ -96,8 +96,8 @@ def shown(quantity: dict[str, Any]) -> tuple[str, str, str]:
         return f"{value:.6g}", "unknown", "unknown"
     if deviation == 0:
         return f"{value:.6g}", "0", ""
-    low, high = (rounded(bound, deviation)[0] for bound in interval)
-    return (*rounded(value, deviation), f"{low} to {high}")
+    low, high = ("" if bound is None else rounded(bound, deviation)[0] for bound in interval)
+    return (*rounded(value, deviation), f"{low} to {high}" if high else f"from {low}")
 
 
 def equation(plane: list[float]) -> str:

@@ -30,6 +30,9 @@ Known = TypeVar("Known", Covariance, OtherPoses)
 KIND, VERSION = "diffproj camera", 1
 """What every file says of itself."""
 
+LATER = "degrees_of_freedom", "lens_region"
+"""Fields of a calibration that files of earlier releases lack."""
+
 
 def dumps(path: Path, item: Camera | Calibration) -> str:
     """A camera or a calibration as the text of a file.
@@ -91,6 +94,7 @@ def read_calibration(path: Path) -> Calibration | None:
             None if found["pixel_sigma"] is None else _tensor(_with_nan(found["pixel_sigma"]), torch.float64),
             None if covariance is None else partial(_same, covariance),
             None if others is None else partial(_same, others),
+            *(None if found.get(key) is None else _tensor(found[key], torch.float64) for key in LATER),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
@@ -132,6 +136,8 @@ def _calibration_fields(item: Calibration) -> dict[str, Any]:
         "pixel_sigma": None if item.pixel_sigma is None else item.pixel_sigma.tolist(),
         "covariance": item.covariance_of_kept_poses.to_fields() if item.has_covariance else None,
         "other_poses": _other_fields(item.other_poses) if item.has_alternatives else None,
+        "degrees_of_freedom": None if item.degrees_of_freedom is None else item.degrees_of_freedom.tolist(),
+        "lens_region": None if item.lens_region is None else item.lens_region.tolist(),
     }
 
 

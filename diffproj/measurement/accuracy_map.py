@@ -3,20 +3,19 @@
 Two figures for each place: the ground resolution, world units that one pixel covers along its worst direction, which is
 geometry; and the predicted standard deviation of a point measured there, along its worst direction, which adds what the
 calibration does not know. Places beyond the horizon or the lens's reach are not valid. `covered` tells the part of the
-image that the calibration's corners surround: outside of it a lens model extrapolates, and the standard deviation tells
-how far.
+image that the calibration's corners surround: outside of it, `extrapolated`, nothing tells the lens. The standard
+deviation grows there, but only as far as the lens model holds.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj.calibration.region import in_region
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import ground_resolution
 from diffproj.geometry.grid import pixel_grid
@@ -32,7 +31,8 @@ class AccuracyMap:
         pixels: where the places are in the image `(H, W, 2)`, in px.
         points: where they are on the plane `(H, W, 3)`, in world units; NaN where a pixel has none.
         valid: whether a pixel has a point on the plane, or a point a pixel in the image `(H, W)`.
-        covered: whether the calibration's corners surround the pixel `(H, W)`.
+        covered: whether the calibration's corners surround the pixel, by half a square more at most `(H, W)`; true
+            everywhere where they are not known, as for a pose that was located with a camera alone.
         resolution: world units a pixel along the worst direction `(H, W)`; NaN where not valid.
         deviation: standard deviation of a measured point along its worst direction in world units `(H, W)`; NaN where
             not valid, infinite where the calibration does not determine it.
@@ -44,6 +44,11 @@ class AccuracyMap:
     covered: Bool[Tensor, "h w"]
     resolution: Float[Tensor, "h w"]
     deviation: Float[Tensor, "h w"]
+
+    @property
+    def extrapolated(self) -> Bool[Tensor, "h w"]:
+        """Where a point is measured outside of the corners `(H, W)`: nothing tells the lens there."""
+        return self.valid & ~self.covered
 
     @classmethod
     def over_image(
@@ -172,26 +177,21 @@ def _mapped(
         pixels,
         torch.where(valid.unsqueeze(-1), measured.points, torch.nan).reshape(*shape, 3),
         valid.reshape(shape),
-        _surrounded(flat, calibration).reshape(shape),
+        _covered(flat, calibration).reshape(shape),
         shown(resolution),
         shown(_largest_deviation(measured.covariance)),
     )
 
 
+def _covered(pixels: Tensor, calibration: Calibration) -> Tensor:
+    """Which pixels `(N, 2)` the calibration's corners surround; all where the corners are not known."""
+    region = calibration.region
+    return torch.ones_like(pixels[:, 0], dtype=torch.bool) if region is None else in_region(pixels, region)
+
+
 def _largest_deviation(covariance: Tensor) -> Tensor:
     """The standard deviation along the worst direction `(N,)`; infinite where a coordinate is not determined."""
     infinite = covariance.isinf().any(-1).any(-1)
-    largest = torch.linalg.eigvalsh(torch.where(infinite[:, None, None], 0.0, covariance))[:, -1]
-    return torch.where(infinite, torch.inf, largest.clamp(min=0).sqrt())
-
-
-def _surrounded(pixels: Tensor, calibration: Calibration) -> Tensor:
-    """Which pixels `(N, 2)` lie in the convex hull of all corners that were used."""
-    corners = calibration.views.pixels[calibration.used].detach().cpu().numpy().astype(np.float32)
-    if len(corners) < 3:
-        return torch.zeros(len(pixels), dtype=torch.bool, device=pixels.device)
-    hull = torch.from_numpy(cv2.convexHull(corners).reshape(-1, 2)).to(pixels)
-    edge = hull.roll(-1, 0) - hull
-    offset = pixels.unsqueeze(1) - hull
-    side = edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0]
-    return (side >= 0).all(-1) | (side <= 0).all(-1)
+    finite = covariance.isfinite().all(-1).all(-1)
+    largest = torch.linalg.eigvalsh(torch.where(finite[:, None, None], covariance, 0.0))[:, -1].clamp(min=0).sqrt()
+    return torch.where(finite, largest, torch.where(infinite, torch.inf, torch.nan))

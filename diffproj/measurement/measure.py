@@ -12,198 +12,29 @@ so that the covariance of all points together is
 with `D = dX / d uv`, G the derivative by theta and by the plane, and Sigma their joint covariance: the calibration's,
 with its correlations between intrinsics and pose, and the plane's where one is given. A quantity of some of the points
 has the variance `g^T C g`, g its gradient. This is first order: sampling agrees as long as standard deviations are
-small beside the distance. The covariance of all pairs of points is computed only where it is asked for (`joint`).
+small beside the distance; `interval` goes on to where they are not. The covariance of all pairs of points is computed
+only where it is asked for (`joint`).
 
 Where a view's pose may be the wrong one of two, the other is too far away for that: see `doubt.py`.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.numerics import check_tensor, in_float64
-from diffproj.calibration.covariance import zero_where_infinite
 from diffproj.calibration.parametrisation import Parametrisation, moved
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.doubt import of_the_pose
-
-SIGNIFICANT = 3.0
-"""How many standard deviations a value has to be away from 0 to be told from it."""
-
-
-@dataclass(frozen=True, eq=False)
-class Quantity:
-    """Measured values with their standard deviations.
-
-    Attributes:
-        value: `(*B, M)`; NaN where a point that it needs is not valid.
-        deviation: standard deviation `(*B, M)` in the unit of the value; infinite where the calibration does not
-            determine it.
-    """
-
-    value: Float[Tensor, "*shape"]
-    deviation: Float[Tensor, "*shape"]
-
-    def interval(self, level: float = 0.95) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
-        """Lower and upper bounds between which the truth lies with that probability, for Gaussian noise.
-
-        Raises:
-            ValueError: the level is not between 0 and 1.
-        """
-        if not 0 < level < 1:
-            raise ValueError(f"level: want a probability between 0 and 1, got {level}")
-        reach = float(torch.special.ndtri(torch.tensor((1 + level) / 2, dtype=torch.float64)))
-        return self.value - reach * self.deviation, self.value + reach * self.deviation
-
-    @property
-    def significant(self) -> Bool[Tensor, "*shape"]:
-        """Whether the value is at least three of its standard deviations from 0; false where both are 0."""
-        return (self.value.abs() >= SIGNIFICANT * self.deviation) & (self.value != 0)
-
-
-@dataclass(frozen=True, eq=False)
-class Measurement:
-    """Points measured on a plane, with their joint covariance.
-
-    Attributes:
-        points: `(*B, N, 3)` in world units.
-        valid: `(*B, N)`, as `back_project` gives it.
-        includes_intrinsics: whether the standard deviations include the uncertainty of focal lengths, principal point
-            and lens. They do for a calibration with its covariance. For a camera alone, or a calibration from a file
-            without a covariance, they hold the pixels' noise only; for a pose that `locate` found with a camera alone,
-            the pixels' noise and the pose's uncertainty.
-    """
-
-    points: Float[Tensor, "*batch n 3"]
-    valid: Bool[Tensor, "*batch n"]
-    includes_intrinsics: bool
-    _common: Tensor  # G (*B, N, 3, Q)
-    _sigma: Tensor  # Sigma (*B, Q, Q), infinite on the diagonal only
-    _own: Tensor  # sigma_i D_i (*B, N, 3, 2)
-
-    @property
-    def covariance(self) -> Float[Tensor, "*batch n 3 3"]:
-        """The covariance of each point `(*B, N, 3, 3)` in squared world units; infinite where it is not determined."""
-        C = self._common @ zero_where_infinite(self._sigma).unsqueeze(-3) @ self._common.mT + self._own @ self._own.mT
-        return _without(C, self._unknown(self._common))
-
-    @property
-    def deviations(self) -> Float[Tensor, "*batch n 3"]:
-        """The standard deviations of each point's coordinates `(*B, N, 3)` in world units."""
-        return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-
-    def joint(self) -> Float[Tensor, "*batch all all"]:
-        """The covariance of all coordinates together, `(*B, 3 N, 3 N)`, points in order."""
-        G = self._common.flatten(-3, -2)
-        own = self._own @ self._own.mT
-        N = own.shape[-3]
-        apart = torch.eye(N, dtype=own.dtype, device=own.device)[:, None, :, None]
-        blocks = (own.unsqueeze(-2) * apart).flatten(-2).flatten(-3, -2)
-        C = G @ zero_where_infinite(self._sigma) @ G.mT + blocks
-        return _without(C, self._unknown(G))
-
-    def quantity(self, function: Callable[[Tensor], Tensor], which: Sequence[Sequence[int]] | Tensor) -> Quantity:
-        """Any number that depends on a few of the points, with its standard deviation.
-
-        Args:
-            function: takes k points `(k, 3)` to a number; written with PyTorch's functions, so that it has a gradient.
-            which: the numbers of the k points of each of M quantities, `(M, k)`.
-
-        Raises:
-            IndexError: there is no such point.
-
-        Example:
-            >>> import diffproj as dp
-            >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-            >>> measured = dp.measure(calibration.views.pixels[0, :3], calibration, dp.Plane.z(0.0))
-            >>> middle = measured.quantity(lambda p: p.mean(dim=0)[0], [[0, 1, 2]])
-            >>> print(f"{middle.value[0]:.1f} mm")  # x of the centroid of three corners in a row
-            25.0 mm
-        """
-        index, N = torch.as_tensor(which, device=self.points.device), self.points.shape[-2]
-        if index.ndim != 2 or index.is_floating_point():
-            raise ValueError(f"which: want the numbers of k points for each of M quantities, got {tuple(index.shape)}")
-        if bool(((index < -N) | (index >= N)).any()):
-            raise IndexError(f"which: want numbers of the {N} points, got {index.flatten().tolist()}")
-        index = index % N
-        k = index.shape[-1]
-        chosen = self.points[..., index, :]  # (*B, M, k, 3)
-        flat = chosen.reshape(-1, k, 3)
-        gradient, value = torch.func.vmap(torch.func.grad_and_value(function))(flat)
-        gradient, value = gradient.reshape(chosen.shape), value.reshape(chosen.shape[:-2])
-        g = gradient.unsqueeze(-1)
-        common = (self._common[..., index, :, :] * g).sum((-3, -2))  # (*B, M, Q)
-        own = (self._own[..., index, :, :] * g).sum(-2)  # (*B, M, k, 2): points named twice count together
-        same = (index.unsqueeze(-1) == index.unsqueeze(-2)).to(own.dtype)
-        noise = (own * (same @ own)).sum((-2, -1))
-        variance = ((common @ zero_where_infinite(self._sigma)) * common).sum(-1) + noise
-        variance = torch.where(self._unknown(common.unsqueeze(-2)).squeeze(-1).squeeze(-1), torch.inf, variance)
-        valid = self.valid[..., index].all(-1)
-        # The root's slope at 0 is infinite: the length between a point and itself has deviation 0 and zero gradient.
-        known = valid & (variance > 0)
-        deviation = torch.where(known, torch.where(known, variance, 1.0).sqrt(), 0.0)
-        return Quantity(torch.where(valid, value, torch.nan), torch.where(valid, deviation, torch.nan))
-
-    def lengths(self, pairs: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
-        """Distances between points in world units: of successive points, or of `pairs (M, 2)`."""
-        return self.quantity(_length, self._successive(2) if pairs is None else _sets("pairs", pairs, 2))
-
-    def angles(self, triples: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
-        """Angles at the second of three points in radians: of successive points, or of `triples (M, 3)`."""
-        return self.quantity(_angle, self._successive(3) if triples is None else _sets("triples", triples, 3))
-
-    def area(self, corners: Sequence[int] | None = None) -> Quantity:
-        """The area of the polygon with these corners in order (all points if left out), in squared world units.
-
-        Parts of an outline that crosses itself cancel.
-        """
-        every = list(range(self.points.shape[-2])) if corners is None else list(corners)
-        return self.quantity(_area, [every])
-
-    def summary(self) -> str:
-        """Points and successive lengths with their standard deviations, as a text for people; for one camera.
-
-        Raises:
-            ValueError: there are many cameras.
-        """
-        if self.points.ndim > 2:
-            raise ValueError(f"summary: want one camera, got batch shape {tuple(self.points.shape[:-2])}")
-        lines = []
-        for n, (point, deviation, valid) in enumerate(
-            zip(self.points.tolist(), self.deviations.tolist(), self.valid.tolist(), strict=True)
-        ):
-            texts = (f"{x:10.3f} ± {s:.3f}" for x, s in zip(point, deviation, strict=True))
-            lines.append(f"point {n:<3} {'  '.join(texts) if valid else 'not on the plane'}")
-        if len(lines) > 1:
-            found = self.lengths()
-            rows = zip(found.value.tolist(), found.deviation.tolist(), found.significant.tolist(), strict=True)
-            for n, (length, deviation, significant) in enumerate(rows):
-                note = "" if significant else "  less than three deviations from 0"
-                lines.append(f"{n} to {n + 1:<4} {length:10.3f} ± {deviation:.3f}{note}")
-        if not self.includes_intrinsics:
-            known = "pixels and the pose" if self._sigma.shape[-1] else "pixels alone"
-            lines.append(f"The deviations hold the noise of the {known}: the camera came without a covariance.")
-        return "\n".join(lines)
-
-    def _successive(self, k: int) -> Tensor:
-        N = self.points.shape[-2]
-        if k > N:
-            raise ValueError(f"points: want at least {k}, got {N}")
-        return torch.arange(N - k + 1).unsqueeze(-1) + torch.arange(k)
-
-    def _unknown(self, rows: Tensor) -> Tensor:
-        """Which rows `(..., r, Q)` depend on what the calibration does not determine, `(..., r, 1)`."""
-        lost = self._sigma.diagonal(dim1=-2, dim2=-1).isinf()
-        while lost.ndim < rows.ndim - 1:
-            lost = lost.unsqueeze(-2)
-        return (rows.abs() * lost.unsqueeze(-2)).sum(-1, keepdim=True) > 0
+from diffproj.measurement.measurement import Measurement
+from diffproj.measurement.propagation import Noise
+from diffproj.measurement.sight import Sight
 
 
 def measure(
@@ -268,20 +99,29 @@ def measure(
         with_offset = torch.cat([-points, torch.ones_like(points[..., :1])], dim=-1)
         blocks.append(lift.unsqueeze(-1) * with_offset.unsqueeze(-2))
         covariances.append(in_float64(plane_covariance))
+    away = points.new_zeros(*points.shape, 0)
     if isinstance(calibration, Calibration) and calibration.has_alternatives:
-        doubt = of_the_pose(pixels, calibration, view_number(calibration, view), plane, points, valid)
-        blocks, covariances = [*blocks, doubt.columns], [*covariances, doubt.covariance]
+        away, doubt = of_the_pose(pixels, calibration, view_number(calibration, view), plane, points, valid)
+        blocks, covariances = [*blocks, away], [*covariances, doubt]
     common = torch.where(valid[..., None, None], torch.cat(blocks, dim=-1), 0.0)
-    own = sigma[..., None, None] * D
+    sight = Sight(pixels.expand(*batch, *pixels.shape[-2:]), sigma, camera, plane, by_theta, away)
+    noise = Noise(
+        sight,
+        common,
+        _block_diagonal(covariances, batch),
+        sigma[..., None, None] * D,
+        _degrees_of_freedom(calibration, like=points),
+        pixels_too=pixel_sigma is None,
+    )
     includes_intrinsics = isinstance(calibration, Calibration) and known is not None and calibration.knows_intrinsics
-    return Measurement(points, valid, includes_intrinsics, common, _block_diagonal(covariances, batch), own)
+    region = calibration.region if isinstance(calibration, Calibration) else None
+    return Measurement(points, valid, includes_intrinsics, noise, region)
 
 
-def _sets(name: str, which: Sequence[Sequence[int]] | Tensor, k: int) -> Tensor:
-    index = torch.as_tensor(which)
-    if index.ndim != 2 or index.shape[-1] != k:
-        raise ValueError(f"{name}: want point numbers of shape (M, {k}), got {tuple(index.shape)}")
-    return index
+def _degrees_of_freedom(calibration: Calibration | Camera | PinholeCamera, like: Tensor) -> Tensor:
+    """Of the calibration's residual level, from which the scale of its covariance is taken, `(*B,)`."""
+    found = calibration.degrees_of_freedom if isinstance(calibration, Calibration) else None
+    return like.new_full(like.shape[:-2], torch.inf) if found is None else found.to(like).expand(like.shape[:-2])
 
 
 def view_number(calibration: Calibration, view: int | str) -> int:
@@ -359,26 +199,3 @@ def _block_diagonal(blocks: list[Tensor], batch: Sequence[int]) -> Tensor:
         rows.append(torch.nn.functional.pad(block, (start, size - start - block.shape[-1])))
         start += block.shape[-1]
     return torch.cat(rows, dim=-2)
-
-
-def _without(C: Tensor, unknown: Tensor) -> Tensor:
-    """The covariance with infinite variances, and no covariances, where a coordinate `(..., r, 1)` is not known."""
-    kept = torch.where(unknown | unknown.mT, 0.0, C)
-    return kept + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(C).squeeze(-1))
-
-
-def _length(points: Tensor) -> Tensor:
-    difference = points[1] - points[0]
-    squared = difference.square().sum()
-    apart = squared > 0
-    return torch.where(apart, torch.where(apart, squared, 1.0).sqrt(), 0.0)
-
-
-def _angle(points: Tensor) -> Tensor:
-    a, b = points[0] - points[1], points[2] - points[1]
-    return torch.atan2(torch.linalg.cross(a, b).norm(), (a * b).sum())
-
-
-def _area(points: Tensor) -> Tensor:
-    around = torch.linalg.cross(points - points[:1], points.roll(-1, 0) - points[:1]).sum(0)
-    return around.norm() / 2

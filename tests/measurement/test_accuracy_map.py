@@ -52,7 +52,7 @@ def test_resolution_is_what_noise_of_one_pixel_does(calibration: dp.Calibration,
     accuracy = dp.AccuracyMap.over_image(calibration, plane, step=20, view=3)
     flat = accuracy.pixels.flatten(0, 1)
     measured = dp.measure(flat, calibration, plane or dp.Plane.z(0.0), view=3, pixel_sigma=1.0)
-    largest = torch.linalg.svdvals(measured._own)[:, 0].reshape(accuracy.valid.shape)
+    largest = torch.linalg.svdvals(measured._noise.own)[:, 0].reshape(accuracy.valid.shape)
     assert torch.equal(measured.valid, accuracy.valid.flatten())
     assert accuracy.valid.sum() > 100
     # They agree to 1e-15 on the board, and to 3e-14 up to the horizon of the upright plane.

@@ -66,18 +66,37 @@ def test_jacobians_are_autograds(lens: str, slanted: bool) -> None:
     size = found.covariance.view(3).shape[-1]
     by_theta = torch.func.jacfwd(lambda step: redone(found, 3, step, pixels, plane))(torch.zeros(size, dtype=D))
     scale = by_theta.abs().amax((0, 1))
-    assert ((measured._common[..., :size] - by_theta).abs().amax((0, 1)) <= 1e-8 * scale).all()
+    assert ((measured._noise.common[..., :size] - by_theta).abs().amax((0, 1)) <= 1e-8 * scale).all()
     by_pixel = torch.func.vmap(torch.func.jacfwd(lambda p: dp.back_project(p[None], found.cameras[3], plane)[0][0]))(
         pixels
     )
-    torch.testing.assert_close(measured._own, by_pixel, rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(measured._noise.own, by_pixel, rtol=1e-8, atol=1e-10)
 
     def by_coefficients(abcd: torch.Tensor) -> torch.Tensor:
         return dp.back_project(pixels, found.cameras[3], dp.Plane(abcd[:3], abcd[3]))[0]
 
     abcd = torch.cat([plane.to(D).normal, plane.to(D).offset[None]])
     by_plane = torch.func.jacfwd(by_coefficients)(abcd)
-    torch.testing.assert_close(measured._common[..., size:], by_plane, rtol=1e-7, atol=1e-7)
+    torch.testing.assert_close(measured._noise.common[..., size:], by_plane, rtol=1e-7, atol=1e-7)
+
+
+def test_points_on_the_curve_are_those_of_moved_cameras() -> None:
+    """Errors of camera, pose and pixels, followed by the shift of pixels that they amount to, up to the horizon."""
+    found, plane = simulated("brown5"), dp.Plane([0.0, 1.0, 0.05], 300.0)
+    horizon = dp.back_project(torch.tensor([[320.0, v] for v in range(480)], dtype=D), found.cameras[3], plane)[1]
+    first = int(horizon.nonzero()[0])
+    pixels = torch.tensor([[320.0, first + 3], [340, first + 100]], dtype=D)
+    measured = dp.measure(pixels, found, plane, view=3, pixel_sigma=0.3)
+    sight, Q = measured._noise.sight, measured._noise.sigma.shape[-1]
+    for seed in range(5):
+        draw = torch.randn(Q, generator=torch.Generator().manual_seed(seed), dtype=D)
+        theta = (measured._noise.root() @ draw)[None]
+        noise = torch.randn(1, 2, 2, generator=torch.Generator().manual_seed(seed), dtype=D)
+        points, valid = sight.points(torch.tensor([[0, 1]]), theta, noise)
+        assert valid.all()
+        exact = redone(found, 3, theta[0], pixels + 0.3 * noise[0], plane)
+        moved = (exact - measured.points).norm(dim=-1)
+        assert ((points[0] - exact).norm(dim=-1) < 0.03 * moved).all()
 
 
 def test_joint_covariance_is_symmetric_and_positive(calibration: dp.Calibration) -> None:
@@ -199,7 +218,8 @@ def test_points_that_are_not_there(calibration: dp.Calibration) -> None:
     measured = dp.measure(pixels, calibration, away)
     lengths = measured.lengths()
     assert measured.points.isfinite().all()
-    assert measured.covariance.isfinite().all()
+    assert torch.equal(measured.covariance.isnan().all(-1).all(-1), ~measured.valid)
+    assert torch.equal(measured.joint().isfinite().all(-1).any(), torch.tensor(False))
     assert torch.equal(lengths.value.isnan(), ~(measured.valid[1:] & measured.valid[:-1]))
     assert "not on the plane" in measured.summary()
 

@@ -1,0 +1,310 @@
+"""`Measurement`: points on a plane with their joint covariance, and what follows from them with error bars."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from diffproj.calibration.covariance import zero_where_infinite
+from diffproj.calibration.region import in_region
+from diffproj.measurement.folded import longest_first, norm_variance
+from diffproj.measurement.intervals import angle_interval, curved_interval, norm_interval
+from diffproj.measurement.propagation import Noise, Propagated, kink_variance
+from diffproj.measurement.quantity import Bounds, Quantity
+from diffproj.measurement.shapes import area_vector, difference, length, turn
+
+EXTRAPOLATED = (
+    "Extrapolated: outside of the region that the calibration's corners covered. Nothing tells the lens there, and the "
+    "truth may lie many deviations off: calibrate with the board there too."
+)
+NONLINEAR = "Nonlinear: close to the horizon or to zero, where the deviation misleads; take the interval."
+"""What the summary says of points and lengths that it marks so."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Points measured on a plane, with their joint covariance.
+
+    Attributes:
+        points: `(*B, N, 3)` in world units; (0, 0, 0) where not valid.
+        valid: `(*B, N)`, as `back_project` gives it. Where it is false, covariances, deviations and intervals are NaN.
+        includes_intrinsics: whether the standard deviations include the uncertainty of focal lengths, principal point
+            and lens. They do for a calibration with its covariance. For a camera alone, or a calibration from a file
+            without a covariance, they hold the pixels' noise only; for a pose that `locate` found with a camera alone,
+            the pixels' noise and the pose's uncertainty.
+    """
+
+    points: Float[Tensor, "*batch n 3"]
+    valid: Bool[Tensor, "*batch n"]
+    includes_intrinsics: bool
+    _noise: Noise = field(repr=False)
+    _region: Tensor | None = field(default=None, repr=False)
+
+    @property
+    def degrees_of_freedom(self) -> Float[Tensor, "*batch"]:
+        """How many residuals of the calibration tell the scale of the deviations `(*B,)`.
+
+        Infinite where that is known, or where nothing is known of it. Intervals are wider where there are few.
+        """
+        return self._noise.degrees_of_freedom
+
+    @property
+    def covariance(self) -> Float[Tensor, "*batch n 3 3"]:
+        """The covariance of each point `(*B, N, 3, 3)` in squared world units; infinite where it is not determined."""
+        noise = self._noise
+        C = noise.common @ zero_where_infinite(noise.sigma).unsqueeze(-3) @ noise.common.mT + noise.own @ noise.own.mT
+        return torch.where(self.valid[..., None, None], _without(C, noise.unknown(noise.common)), torch.nan)
+
+    @property
+    def deviations(self) -> Float[Tensor, "*batch n 3"]:
+        """The standard deviations of each point's coordinates `(*B, N, 3)` in world units, to first order."""
+        return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+
+    def joint(self) -> Float[Tensor, "*batch all all"]:
+        """The covariance of all coordinates together, `(*B, 3 N, 3 N)`, points in order; NaN where not valid."""
+        noise = self._noise
+        G = noise.common.flatten(-3, -2)
+        own = noise.own @ noise.own.mT
+        N = own.shape[-3]
+        apart = torch.eye(N, dtype=own.dtype, device=own.device)[:, None, :, None]
+        blocks = (own.unsqueeze(-2) * apart).flatten(-2).flatten(-3, -2)
+        C = _without(G @ zero_where_infinite(noise.sigma) @ G.mT + blocks, noise.unknown(G))
+        valid = self.valid.repeat_interleave(3, dim=-1)
+        return torch.where(valid.unsqueeze(-1) & valid.unsqueeze(-2), C, torch.nan)
+
+    def interval(self, level: float = 0.95) -> tuple[Float[Tensor, "*batch n 3"], Float[Tensor, "*batch n 3"]]:
+        """Lower and upper bounds of each coordinate `(*B, N, 3)`, as `Quantity.interval` gives them.
+
+        Raises:
+            ValueError: the level is not between 0 and 1.
+
+        Example:
+            >>> import diffproj as dp
+            >>> floor = dp.Plane([0.0, 1.0, 0.0], 1.5)  # 1.5 m below a camera that looks to the horizon
+            >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+            >>> pixels = torch.tensor([[320.0, 340.0], [320.0, 243.0]], dtype=torch.float64)
+            >>> measured = dp.measure(pixels, dp.Camera(K), floor, pixel_sigma=1.0)
+            >>> low, high = measured.interval()
+            >>> for metres in zip(low[:, 2].tolist(), measured.points[:, 2].tolist(), high[:, 2].tolist()):
+            ...     print("{:.1f} {:.1f} {:.1f}".format(*metres))
+            7.4 7.5 7.7
+            151.2 250.0 721.2
+            >>> measured.nonlinear.tolist()
+            [False, True]
+        """
+        bounds = [coordinate.interval(level) for coordinate in self._coordinates]
+        low, high = (torch.stack(side, dim=-1) for side in zip(*bounds, strict=True))
+        return low, high
+
+    @cached_property
+    def nonlinear(self) -> Bool[Tensor, "*batch n"]:
+        """Where a point's deviations mislead, and `interval` is to be taken `(*B, N)`: see `Quantity.nonlinear`."""
+        spread = torch.stack([coordinate.deviation for coordinate in self._coordinates], dim=-1)
+        bent = torch.stack([coordinate.nonlinear for coordinate in self._coordinates], dim=-1)
+        return (bent & (spread > 1e-9 * spread.amax(-1, keepdim=True))).any(-1)
+
+    @cached_property
+    def extrapolated(self) -> Bool[Tensor, "*batch n"] | None:
+        """Which pixels lie outside the region that the corners of the calibration covered `(*B, N)`.
+
+        Nothing tells the lens there: the deviations assume that its model goes on to hold, with the coefficients that
+        the corners inside determine, and errors of ten times as much have been seen. The region is the convex hull of
+        all corners that were used, grown by half a square; for a calibration from `locate` that of the calibration it
+        was given. `None` where the corners are not known: for a camera alone, and a pose that was located with one.
+        """
+        return None if self._region is None else ~in_region(self._noise.sight.pixels, self._region)
+
+    def quantity(self, function: Callable[[Tensor], Tensor], which: Sequence[Sequence[int]] | Tensor) -> Quantity:
+        """Any number that depends on a few of the points, with its standard deviation.
+
+        Args:
+            function: takes k points `(k, 3)` to a number; written with PyTorch's functions, so that it has a gradient.
+            which: the numbers of the k points of each of M quantities, `(M, k)`.
+
+        Raises:
+            IndexError: there is no such point.
+
+        Example:
+            >>> import diffproj as dp
+            >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+            >>> measured = dp.measure(calibration.views.pixels[0, :3], calibration, dp.Plane.z(0.0))
+            >>> middle = measured.quantity(lambda p: p.mean(dim=0)[0], [[0, 1, 2]])
+            >>> print(f"{middle.value[0]:.1f} mm")  # x of the centroid of three corners in a row
+            25.0 mm
+        """
+        index = self._numbers(which)
+        chosen = self.points[..., index, :]  # (*B, M, k, 3)
+        gradient, value = torch.func.vmap(torch.func.grad_and_value(function))(chosen.flatten(0, -3))
+        gradient, value = gradient.reshape(chosen.shape), value.reshape(chosen.shape[:-2])
+        spread = Propagated.of(self._noise, index, gradient.nan_to_num(0.0, 0.0, 0.0).unsqueeze(-3))
+        with torch.no_grad():
+            first = spread.covariance.squeeze(-1).squeeze(-1)
+            kink = kink_variance(function, spread.steps(), chosen, first)
+        return self._number(spread, function, value, kink)
+
+    def lengths(self, pairs: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
+        """Distances between points in world units: of successive points, or of `pairs (M, 2)`."""
+        return self._norms(difference, self._successive(2) if pairs is None else _sets("pairs", pairs, 2))
+
+    def angles(self, triples: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
+        """Angles at the second of three points in radians: of successive points, or of `triples (M, 3)`.
+
+        Where an arm has no length the deviation is infinite, and where an arm may have none any angle is possible.
+        """
+        index = self._successive(3) if triples is None else _sets("triples", triples, 3)
+        index = self._numbers(index)
+        arms = [self._norms(difference, index[:, [1, end]]) for end in (0, 2)]
+        undefined = (arms[0].value == 0) | (arms[1].value == 0)
+        found = self._norms(turn, index, limit=torch.pi, undefined=undefined)
+        return replace(found, _bounds=partial(angle_interval, arms, found))
+
+    def area(self, corners: Sequence[int] | None = None) -> Quantity:
+        """The area of the polygon with these corners in order (all points if left out), in squared world units.
+
+        Parts of an outline that crosses itself cancel.
+        """
+        every = list(range(self.points.shape[-2])) if corners is None else list(corners)
+        return self._norms(area_vector, [every])
+
+    def summary(self) -> str:
+        """Points and successive lengths with their standard deviations, as a text for people; for one camera.
+
+        Raises:
+            ValueError: there are many cameras.
+        """
+        if self.points.ndim > 2:
+            raise ValueError(f"summary: want one camera, got batch shape {tuple(self.points.shape[:-2])}")
+        valid, bent = self.valid.tolist(), self.nonlinear.tolist()
+        beyond = [False] * len(valid) if self.extrapolated is None else self.extrapolated.tolist()
+        lines = []
+        for n, (point, deviation) in enumerate(zip(self.points.tolist(), self.deviations.tolist(), strict=True)):
+            texts = (f"{x:10.3f} ± {s:.3f}" for x, s in zip(point, deviation, strict=True))
+            notes = "  nonlinear" * bent[n] + "  extrapolated" * beyond[n]
+            lines.append(f"point {n:<3} {'  '.join(texts) + notes if valid[n] else 'not on the plane'}")
+        if len(lines) > 1:
+            found = self.lengths()
+            lines += [f"{n} to {n + 1:<4} {text}" for n, text in enumerate(_lines(found))]
+            bent = [*bent, *found.nonlinear.tolist()]
+        if any(beyond[n] for n in range(len(valid)) if valid[n]):
+            lines.append(EXTRAPOLATED)
+        if any(bent):
+            lines.append(NONLINEAR)
+        if not self.includes_intrinsics:
+            known = "pixels and the pose" if self._noise.sigma.shape[-1] else "pixels alone"
+            lines.append(f"The deviations hold the noise of the {known}: the camera came without a covariance.")
+        return "\n".join(lines)
+
+    def _norms(
+        self,
+        function: Callable[[Tensor], tuple[Tensor, Tensor]],
+        which: Sequence[Sequence[int]] | Tensor,
+        limit: float = torch.inf,
+        undefined: Tensor | None = None,
+    ) -> Quantity:
+        """Lengths of vectors that depend on the points, or what they lack to the limit: see `shapes`."""
+        index = self._numbers(which)
+        chosen = self.points[..., index, :]
+
+        def twice(points: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+            found = function(points)
+            return found[0], found
+
+        J, (w, supplement) = torch.func.vmap(torch.func.jacrev(twice, has_aux=True))(chosen.flatten(0, -3))
+        w, supplement = w.reshape(*chosen.shape[:-2], 3), supplement.reshape(chosen.shape[:-2])
+        spread = Propagated.of(self._noise, index, J.reshape(*chosen.shape[:-2], 3, *chosen.shape[-2:]))
+        C, r = spread.covariance, length(w)
+        u = w / torch.where(r > 0, r, 1.0).unsqueeze(-1)
+        along = (u * (C @ u.unsqueeze(-1)).squeeze(-1)).sum(-1)
+        across = C.diagonal(dim1=-2, dim2=-1).sum(-1) - along
+        rows = (spread.common * u.unsqueeze(-1)).sum(-2)
+        rows = torch.where((r > 0).unsqueeze(-1), rows, spread.common.abs().sum(-2))
+        lost = self._noise.unknown(rows.unsqueeze(-2)).squeeze(-1).squeeze(-1)
+        lost = lost if undefined is None else lost | undefined
+        bounds = partial(norm_interval, spread, function, w, supplement, lost, limit)
+        freedom = spread.degrees_of_freedom(torch.where((r > 0).unsqueeze(-1), u, longest_first(C.detach())[1]))
+        value = torch.where(supplement, limit - r, r) if limit < torch.inf else r
+        return self._quantity(index, value, norm_variance(r, along, across), lost, freedom, bounds)
+
+    def _number(
+        self, spread: Propagated, function: Callable[[Tensor], Tensor], value: Tensor, kink: Tensor
+    ) -> Quantity:
+        """A number with what its slopes make uncertain and, at a kink, what they do not tell."""
+        variance = spread.covariance.squeeze(-1).squeeze(-1) + kink
+        lacking = variance.detach().clamp(min=0).sqrt() - (variance.detach() - kink).clamp(min=0).sqrt()
+        lost = self._noise.unknown(spread.common).squeeze(-1).squeeze(-1)
+        freedom = spread.degrees_of_freedom(torch.ones_like(value).unsqueeze(-1))
+        bounds = partial(curved_interval, spread, function, value.detach(), lost, lacking)
+        return self._quantity(spread.index, value, variance, lost, freedom, bounds)
+
+    def _quantity(
+        self, index: Tensor, value: Tensor, variance: Tensor, lost: Tensor, freedom: Tensor, bounds: Bounds
+    ) -> Quantity:
+        valid = self.valid[..., index].all(-1)
+        # The root's slope at 0 is infinite: the length between a point and itself has deviation 0 and zero gradient.
+        known = valid & (variance > 0)
+        deviation = torch.where(known, torch.where(known, variance, 1.0).sqrt(), 0.0)
+        deviation = torch.where(lost, torch.inf, deviation)
+        nowhere = torch.full_like(value, torch.nan)
+        return Quantity(torch.where(valid, value, nowhere), torch.where(valid, deviation, nowhere), freedom, bounds)
+
+    @cached_property
+    def _coordinates(self) -> list[Quantity]:
+        index = torch.arange(self.points.shape[-2], device=self.points.device).unsqueeze(-1)
+        found = []
+        for axis in range(3):
+            slope = torch.zeros_like(self.points)
+            slope[..., axis] = 1.0
+            spread = Propagated.of(self._noise, index, slope[..., None, None, :])
+            value = self.points[..., axis]
+            found.append(self._number(spread, partial(_coordinate, axis), value, torch.zeros_like(value)))
+        return found
+
+    def _numbers(self, which: Sequence[Sequence[int]] | Tensor) -> Tensor:
+        """The numbers of points `(M, k)`, from 0."""
+        index, N = torch.as_tensor(which, device=self.points.device), self.points.shape[-2]
+        if index.ndim != 2 or index.is_floating_point():
+            raise ValueError(f"which: want the numbers of k points for each of M quantities, got {tuple(index.shape)}")
+        if bool(((index < -N) | (index >= N)).any()):
+            raise IndexError(f"which: want numbers of the {N} points, got {index.flatten().tolist()}")
+        return index % N
+
+    def _successive(self, k: int) -> Tensor:
+        N = self.points.shape[-2]
+        if k > N:
+            raise ValueError(f"points: want at least {k}, got {N}")
+        return torch.arange(N - k + 1).unsqueeze(-1) + torch.arange(k)
+
+
+def _sets(name: str, which: Sequence[Sequence[int]] | Tensor, k: int) -> Tensor:
+    index = torch.as_tensor(which)
+    if index.ndim != 2 or index.shape[-1] != k:
+        raise ValueError(f"{name}: want point numbers of shape (M, {k}), got {tuple(index.shape)}")
+    return index
+
+
+def _coordinate(axis: int, points: Tensor) -> Tensor:
+    return points[0, axis]
+
+
+def _without(C: Tensor, unknown: Tensor) -> Tensor:
+    """The covariance with infinite variances, and no covariances, where a coordinate `(..., r, 1)` is not known."""
+    kept = torch.where(unknown | unknown.mT, 0.0, C)
+    return kept + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(C).squeeze(-1))
+
+
+def _lines(found: Quantity) -> list[str]:
+    """Lengths with their deviations, and with their intervals where the deviations mislead."""
+    columns = (found.value, found.deviation, *found.interval(), found.nonlinear, found.significant)
+    lines = []
+    for value, deviation, low, high, bent, significant in zip(*(column.tolist() for column in columns), strict=True):
+        if math.isnan(value):
+            lines.append("not both points are on the plane")
+            continue
+        note = f"  nonlinear, 95 %: {low:.3f} to {high:.3f}" * bent
+        note += "" if significant else "  less than three deviations from 0"
+        lines.append(f"{value:10.3f} ± {deviation:.3f}{note}")
+    return lines

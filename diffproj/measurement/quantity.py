@@ -1,0 +1,82 @@
+"""`Quantity`: measured values, their standard deviations, and the intervals in which the truth lies."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from diffproj.measurement.student import normal_reach, student_reach
+
+SIGNIFICANT = 0.9973
+"""The level of the interval that has to leave out 0 for a value to be told from it: three standard deviations'."""
+
+BENT = 0.1
+"""By how much of its half width an interval has to differ from `value -+ reach * deviation` to be called nonlinear."""
+
+Bounds = Callable[[float, Tensor], tuple[Tensor, Tensor]]
+"""From a level and the number of deviations that it takes to lower and upper bounds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Quantity:
+    """Measured values with their standard deviations.
+
+    Attributes:
+        value: `(*B, M)`; NaN where a point that it needs is not valid.
+        deviation: standard deviation `(*B, M)` in the unit of the value: its root mean square error to first order, and
+            at values where that is 0 by symmetry, as of a length of 0 or an angle of 180 degrees, that of the noise
+            itself. Infinite where the calibration does not determine it, NaN where the value is.
+        degrees_of_freedom: how many residuals tell the deviation `(*B, M)`; infinite where it is known. All infinite
+            if left out.
+    """
+
+    value: Float[Tensor, "*shape"]
+    deviation: Float[Tensor, "*shape"]
+    degrees_of_freedom: Float[Tensor, "*shape"] | None = None
+    _bounds: Bounds | None = field(default=None, repr=False)
+
+    def interval(self, level: float = 0.95) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
+        """Lower and upper bounds between which the truth lies with that probability, for Gaussian noise.
+
+        They reach further where the deviation was estimated from few residuals (Student's t). They follow the curve
+        from the pixels to the plane: near the horizon the upper bound of a length lies further off than the lower one,
+        and is infinite where the noise reaches the horizon. No length or area has a negative bound, no angle one beyond
+        180 degrees; a length that noise may have made has the lower bound 0. Bounds carry no gradients.
+
+        Raises:
+            ValueError: the level is not between 0 and 1.
+        """
+        value, deviation, reach = self.value.detach(), self.deviation.detach(), self._reach(level)
+        if self._bounds is None:
+            return value - reach * deviation, value + reach * deviation
+        low, high = self._bounds(level, reach)
+        return torch.where(value.isnan(), torch.nan, low), torch.where(value.isnan(), torch.nan, high)
+
+    @property
+    def significant(self) -> Bool[Tensor, "*shape"]:
+        """Whether the value is told from 0: at least three standard deviations away, or as much as makes it as sure.
+
+        It takes more where the deviation was estimated from few residuals, and for the length between two points, which
+        noise alone makes longer than 0. False where value and deviation are both 0.
+        """
+        low, high = self.interval(SIGNIFICANT)
+        return (low > 0) | (high < 0)
+
+    @property
+    def nonlinear(self) -> Bool[Tensor, "*shape"]:
+        """Where the deviation alone misleads, and `interval` is to be taken: near the horizon, and near zero.
+
+        There the 95 % interval differs from `value -+ reach * deviation` by more than a tenth of its half width.
+        """
+        low, high = self.interval()
+        value, half = self.value.detach(), self._reach(0.95) * self.deviation.detach()
+        off = torch.maximum((low - value + half).abs(), (high - value - half).abs())
+        return off > BENT * half + 1e-9 * value.abs()
+
+    def _reach(self, level: float) -> Tensor:
+        """How many deviations an interval of that level takes."""
+        if self.degrees_of_freedom is None:
+            return torch.full_like(self.value, normal_reach(level))
+        return student_reach(level, self.degrees_of_freedom)

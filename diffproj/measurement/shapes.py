@@ -1,0 +1,44 @@
+"""Lengths, angles and areas as the lengths of vectors that are smooth where the numbers themselves have a kink.
+
+A length is that of the difference of two points; an area that of the outline's area vector; an angle that of the turn
+from one arm to the other, or, above a right angle, what it lacks to 180 degrees. At zero the vector has a derivative,
+and so a covariance, where its length has none.
+"""
+
+import torch
+from torch import Tensor
+
+
+def difference(points: Tensor) -> tuple[Tensor, Tensor]:
+    """From the first of two points `(2, 3)` to the second; and false."""
+    return points[1] - points[0], torch.zeros_like(points[0, 0], dtype=torch.bool)
+
+
+def area_vector(points: Tensor) -> tuple[Tensor, Tensor]:
+    """At right angles to the outline of points `(k, 3)`, as long as its area; and false."""
+    around = torch.linalg.cross(points - points[:1], points.roll(-1, 0) - points[:1]).sum(0)
+    return around / 2, torch.zeros_like(points[0, 0], dtype=torch.bool)
+
+
+def turn(points: Tensor) -> tuple[Tensor, Tensor]:
+    """At right angles to both arms at the second of three points `(3, 3)`, as long as the angle or its supplement.
+
+    Returns:
+        The vector `(3,)` in radians, zero where an arm has no length; and whether its length is the supplement.
+    """
+    a, b = points[0] - points[1], points[2] - points[1]
+    cross, dot = torch.linalg.cross(a, b), (a * b).sum()
+    obtuse, dot = dot < 0, dot.abs()
+    squared = cross.square().sum()
+    turned = squared > 0
+    sine = torch.where(turned, squared, 1.0).sqrt()
+    sound = dot > 0
+    straight = torch.where(sound, torch.where(sound, dot, 1.0).reciprocal(), 0.0)
+    return cross * torch.where(turned, torch.atan2(sine, dot) / sine, straight), obtuse
+
+
+def length(vector: Tensor) -> Tensor:
+    """The lengths `(...)` of vectors `(..., 3)`, with zero gradient at zero."""
+    squared = vector.square().sum(-1)
+    apart = squared > 0
+    return torch.where(apart, torch.where(apart, squared, 1.0).sqrt(), 0.0)
