@@ -59,6 +59,16 @@ def locate(
         >>> print(f"{dp.locate(views[8:], board, camera).rms:.2f}")
         0.18
     """
+    found = located(views, target, camera, **options)
+    if bool(found.ambiguous.any()):
+        warnings.warn(f"locate: {found.doubts}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
+    return found
+
+
+def located(
+    views: Views, target: Target, camera: Camera | PinholeCamera | Calibration, **options: Unpack[LocateOptions]
+) -> Calibration:
+    """The same without a warning."""
     if isinstance(views, Camera | PinholeCamera | Calibration):
         raise TypeError("locate: want (views, target, camera) in this order, got the camera first")
     chosen = locate_options(options)
@@ -122,7 +132,4 @@ def locate(
         ),
     )
     found = Fit(task, joined, torch.zeros_like(data.used))
-    located = outcome("locate", data, found, camera.size or views.size, chosen.throw, calibration)
-    if bool(located.ambiguous.any()):
-        warnings.warn(f"locate: {located.doubts}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
-    return located
+    return outcome("locate", data, found, camera.size or views.size, chosen.throw, calibration)

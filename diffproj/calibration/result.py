@@ -55,7 +55,8 @@ class Calibration:
     Attributes:
         camera: intrinsics and lens with the world frame in the camera, batch shape `*B`: what one saves.
         cameras: the same camera at the pose of each view, batch shape `(*B, V)`: `X_cam = R X_board + t`. Where no
-            corner of a view was used, its pose is only a place holder.
+            corner of a view was used, its pose is only a place holder. Where a view fits two poses, the better one;
+            the other is in `alternatives`.
         views: the corners that were given.
         points: the board's corners `(N, 3)` in world units, as if it were flat.
         used: which corners were used `(*B, V, N)`: seen, not rejected as outliers, and in a view with at least 4.

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from diffproj.calibration.calibrate import calibrate
-from diffproj.calibration.locate import locate
+from diffproj.calibration.locate import located
 from diffproj.calibration.options import CalibrationOptions
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.lens.models import LensModel
@@ -96,8 +96,8 @@ def cross_validate(
     second = torch.arange(views.pixels.shape[-2], device=views.device) % 2 == 1
     errors = []
     for posing in (second, ~second):
-        located = locate(held_out.hiding(posing), target, fits.camera)
-        errors.append(_squared_errors(located, held_out.hiding(~posing)))
+        posed = located(held_out.hiding(posing), target, fits.camera)
+        errors.append(_squared_errors(posed, held_out.hiding(~posing)))
     px, world = (_rms([error[i] for error in errors], [error[2] for error in errors]) for i in range(2))
     in_sample = _squared_errors(fits, Views.unchecked(every.pixels, fits.used, every.names, every.size))
     return CrossValidation(fits, _rms([in_sample[0]], [in_sample[2]]), px, _rms([in_sample[1]], [in_sample[2]]), world)

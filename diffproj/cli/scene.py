@@ -1,12 +1,10 @@
 """Where the camera stood: at a view that it was calibrated with, or before a board in a new photograph."""
 
 import argparse
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from diffproj.calibration.ambiguity import AmbiguousPoseWarning
-from diffproj.calibration.locate import locate
+from diffproj.calibration.locate import located
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.inputs import find_corners, photographs
 from diffproj.cli.terminal import progress_bars
@@ -90,19 +88,17 @@ def new_photograph(options: argparse.Namespace) -> Scene:
             "it with the camera as it was calibrated, and do not resize or crop it"
         )
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AmbiguousPoseWarning)  # a remark beside the results says it
-            located = locate(views, board, camera if calibration is None else calibration)
+        found = located(views, board, camera if calibration is None else calibration)
     except CalibrationError as error:
         raise ValueError(
             f"{options.photograph}: no pose of the board explains its corners; check --camera, --board and --square"
         ) from error
     includes = ("pixels", "pose")
-    title = f"{options.photograph}: board found\nRMS {float(located.rms):.4f} px over {int(located.used.sum())} corners"
+    title = f"{options.photograph}: board found\nRMS {float(found.rms):.4f} px over {int(found.used.sum())} corners"
     if calibration is not None:
         title += f" ({float(calibration.rms):.4f} px in the calibration)"
         includes += ("camera",) if calibration.knows_intrinsics else ()
-    return Scene(options.camera, options.photograph, located, 0, includes, title, "the unit of --square")
+    return Scene(options.camera, options.photograph, found, 0, includes, title, "the unit of --square")
 
 
 def _loaded(path: Path) -> tuple[Camera, Calibration | None]:

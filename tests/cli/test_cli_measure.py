@@ -154,6 +154,24 @@ def test_view_without_covariance(capsys: pytest.CaptureFixture[str]) -> None:
     assert "the pixels' noise of 0.5 px ONLY" in out
 
 
+def test_a_view_whose_pose_may_be_the_wrong_one_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    board, camera = dp.Chessboard(8, 5, 25.0), dp.load_camera("alone.json")
+    tilted = dp.rotation_from_euler(*torch.tensor([0.15, 0.1, 0.3], dtype=D))
+    corners, _ = camera.at(tilted, torch.tensor([0.0, 0, 6000], dtype=D)).project(board.points)
+    noise = 0.3 * torch.randn(corners.shape, generator=torch.Generator().manual_seed(0), dtype=D)
+    with pytest.warns(dp.AmbiguousPoseWarning):
+        found = dp.locate(dp.Views((corners + noise)[None], names=["far.png"], size=(640, 480)), board, camera)
+    dp.save_camera("far.json", found)
+    options = ("--camera", "far.json", "--view", "far.png", "--points", "320,240", "330,250")
+    try:
+        document = parsed(capsys, *options)
+        assert document["remarks"][-1].startswith("The board's corners fit two poses, and the one taken is only ")
+        same(document, dp.measure(pixels("320,240", "330,250"), found, dp.Plane.z(0.0)))
+        assert "tells them apart" in " ".join(run(capsys, *options)[1].split())
+    finally:
+        Path("far.json").unlink()
+
+
 def test_located_with_a_camera_alone_does_not_know_the_camera(capsys: pytest.CaptureFixture[str]) -> None:
     board = dp.Chessboard(8, 5, 25.0)
     located = dp.locate(dp.detect("photo.png", board), board, dp.load_camera("alone.json"))
@@ -243,7 +261,7 @@ def test_corners_that_no_pose_explains(capsys: pytest.CaptureFixture[str], monke
     def fail(*_: object) -> None:
         raise dp.CalibrationError("locate: diverged")
 
-    monkeypatch.setattr("diffproj.cli.scene.locate", fail)
+    monkeypatch.setattr("diffproj.cli.scene.located", fail)
     code, out, err = run(capsys, "photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS)
     assert (code, out) == (1, "")
     assert "photo.png: no pose of the board explains its corners; check --camera, --board and --square" in err
