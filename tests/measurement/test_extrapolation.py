@@ -65,10 +65,10 @@ def test_it_is_said_and_drawn() -> None:
     assert "Extrapolated: outside of the region that the calibration's corners covered" in text
     middle = dp.measure(torch.tensor([[510.0, 380], [520, 390]], dtype=D), calibration, Z).summary()
     assert "xtrapolated" not in middle
-    accuracy = dp.AccuracyMap.over_image(calibration, step=32)
+    accuracy = dp.AccuracyMap.over_image(dp.calibrate(dp.example_views("left"), BOARD), step=32)
     assert torch.equal(accuracy.extrapolated, accuracy.valid & ~accuracy.covered)
     assert accuracy.extrapolated[0, 0]
-    assert 0.5 < float(accuracy.extrapolated.double().mean()) < 0.95
+    assert 0.3 < float(accuracy.extrapolated.double().mean()) < 0.6
     figure = figures.accuracy(accuracy)
     assert "hatched: outside of the calibration's corners" in figure.get_supxlabel()
     hatched = [c for axes in figure.axes for c in axes.collections if any(getattr(c, "hatches", None) or ())]
