@@ -91,8 +91,8 @@ class Measurement:
             >>> low, high = measured.interval()
             >>> for metres in zip(low[:, 2].tolist(), measured.points[:, 2].tolist(), high[:, 2].tolist()):
             ...     print("{:.1f} {:.1f} {:.1f}".format(*metres))
-            7.4 7.5 7.7
-            151.2 250.0 721.2
+            7.4 7.5 7.6
+            151.2 250.0 721.1
             >>> measured.nonlinear.tolist()
             [False, True]
         """

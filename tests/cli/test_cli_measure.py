@@ -123,7 +123,11 @@ def test_view_of_the_calibration(capsys: pytest.CaptureFixture[str]) -> None:
     same(document, measured)
     assert (document["photograph"], document["pixel_sigma"]) == (None, 0.7)
     assert document["plane"] == [-0.1, 0, 1, -12]
-    assert document["remarks"] == ["Point 1 lies outside the photograph of 640 x 480 px."]
+    assert document["remarks"][0] == "Point 1 lies outside the photograph of 640 x 480 px."
+    assert document["remarks"][1].startswith(
+        "Point 2 lies outside of the region that the calibration's corners covered."
+    )
+    assert [point["extrapolated"] for point in document["points"]] == [True, True]
     code, out, _ = run(capsys, *options, "--points=-5,3", "--points", "100,120")
     assert code == 0
     assert "│ 1, 2 " in out
@@ -222,12 +226,12 @@ def test_remarks_on_lengths_and_areas(capsys: pytest.CaptureFixture[str]) -> Non
     document = parsed(capsys, *options, "300,200", "300,200", "300.1,200")
     assert [row["significant"] for row in (*document["lengths"], document["area"])] == [False, False, False]
     assert len(document["remarks"]) == 3
-    document = parsed(capsys, *options, "100,100", "300,300", "300,100", "100,300")
+    document = parsed(capsys, *options, "200,200", "300,300", "300,200", "200,300")
     assert document["remarks"] == [
         "The outline crosses itself, so its area means little: give the points in order around it."
     ]
     _, out, _ = run(capsys, *options, "300,200", "300,200")
-    assert re.search(r"│ 1, 2 +│ 0 +│ 0 +│ +│\n", out)
+    assert re.search(r"│ 1, 2 +│ 0\.00+ +│ 0\.\d\d+ +│ 0\.00+ to 0\.\d+ +│\n", out)
     _, out, _ = run(capsys, *options, "100,100", "300,300", "100,300")
     assert re.search(r"\nArea of the outline 1 to 3: [\d.]+ ± [\d.]+, 95 % interval [\d.]+ to [\d.]+\n", out)
 
