@@ -38,13 +38,15 @@ class Covariance:
     """Joint covariance of shared parameters and poses, for batch shape `*B`.
 
     A pose is perturbed by `R <- exp(omega) R`, `t <- t + tau`: its six coordinates are omega in radians (about the
-    camera's axes) and tau in world units.
+    camera's axes) and tau in world units. Far from the world's origin a small turn is a large shift, and the two
+    nearly cancel; `about_middle` has poses that turn about the target instead.
 
     Attributes:
         names: of the s shared parameters: `f_x f_y c_x c_y`, then those of the lens and of the bow.
         shared: their covariance `(*B, s, s)`; rows of fixed parameters are 0.
         undetermined: which shared parameters the corners do not determine `(*B, s)`.
         undetermined_views: which poses they do not determine `(*B, V)`.
+        middle: the middle of the target `(3,)` in the world; `None` stands for the world's origin.
     """
 
     names: tuple[str, ...]
@@ -53,7 +55,14 @@ class Covariance:
     undetermined_views: Bool[Tensor, "*batch v"]
     _follow: Tensor  # F_v^T (*B, V, 6, s): minus the derivative of the pose by the shared parameters
     _mixed: Tensor  # Cov(W_v^-1 h_v, dx), (*B, V, 6, s)
-    _alone: Tensor  # Cov(W_v^-1 h_v), (*B, V, 6, 6)
+    _alone: Tensor  # Cov(W_v^-1 h_v), (*B, V, 6, 6); poses turn about the middle in these three
+    middle: Float[Tensor, "3"] | None = None
+    _arm: Tensor | None = None  # R_v middle (*B, V, 3), from the world's origin to the middle along the camera's axes
+
+    @property
+    def about_middle(self) -> "Covariance":
+        """The same of poses that turn about the middle of the target: `t + R middle <- t + R middle + tau`."""
+        return replace(self, middle=None, _arm=None)
 
     @property
     def deviations(self) -> dict[str, Float[Tensor, "*batch"]]:
@@ -69,6 +78,7 @@ class Covariance:
         same = view % self._alone.shape[-3] == other % self._alone.shape[-3]
         if same:
             blocks = blocks + self._alone[..., view, :, :]
+        blocks = self._turns[..., view, :, :] @ blocks @ self._turns[..., other, :, :].mT
         unknown = (self.undetermined_views[..., view] | self.undetermined_views[..., other])[..., None, None]
         infinite = torch.diag_embed(torch.full_like(blocks[..., 0], torch.inf))
         return torch.where(unknown, infinite if same else torch.zeros_like(blocks), blocks)
@@ -76,7 +86,7 @@ class Covariance:
     def cross(self, view: int) -> Float[Tensor, "*batch 6 s"]:
         """The cross-covariance of a pose (rows) and the shared parameters (columns)."""
         cross = self._mixed[..., view, :, :] - self._follow[..., view, :, :] @ zero_where_infinite(self.shared)
-        return torch.where(self.undetermined_views[..., view, None, None], 0.0, cross)
+        return torch.where(self.undetermined_views[..., view, None, None], 0.0, self._turns[..., view, :, :] @ cross)
 
     def view(self, view: int) -> Float[Tensor, "*batch sp sp"]:
         """The joint covariance of the shared parameters and the pose of one view, `(*B, s + 6, s + 6)`."""
@@ -106,7 +116,11 @@ class Covariance:
         poses = poses + torch.stack(
             [torch.nn.functional.pad(self._alone[..., v, :, :], (6 * v, 6 * (V - 1 - v))) for v in range(V)], dim=-3
         ).flatten(-3, -2)
-        cross = (Q - F @ zero_where_infinite(self.shared)) * known.unsqueeze(-1)
+        cross = Q - F @ zero_where_infinite(self.shared)
+        turn = torch.zeros_like(poses)
+        for v in range(V):
+            turn[..., 6 * v : 6 * v + 6, 6 * v : 6 * v + 6] = self._turns[..., v, :, :]
+        poses, cross = turn @ poses @ turn.mT, turn @ cross * known.unsqueeze(-1)
         poses = poses * known.unsqueeze(-1) * known.unsqueeze(-2)
         poses = poses + torch.diag_embed(torch.where(known > 0, 0.0, torch.inf))
         return torch.cat([torch.cat([self.shared, cross.mT], dim=-1), torch.cat([cross, poses], dim=-1)], dim=-2)
@@ -121,6 +135,8 @@ class Covariance:
             "undetermined": self.undetermined,
             "undetermined_views": self.undetermined_views,
         }
+        if self.middle is not None and self._arm is not None:
+            tensors |= {"middle": self.middle, "arm": self._arm}
         return {"names": list(self.names), **{key: tensor.tolist() for key, tensor in tensors.items()}}
 
     @classmethod
@@ -145,7 +161,22 @@ class Covariance:
             torch.tensor(fields[key], dtype=torch.float64) for key in ("shared", "follow", "mixed", "alone")
         )
         infinite = torch.diag_embed(torch.where(undetermined, torch.inf, 0.0).to(shared))
-        return cls(tuple(fields["names"]), shared + infinite, undetermined, undetermined_views, *blocks)
+        middle = [torch.tensor(fields[key], dtype=torch.float64) for key in ("middle", "arm") if key in fields]
+        return cls(tuple(fields["names"]), shared + infinite, undetermined, undetermined_views, *blocks, *middle)
+
+    @property
+    def _turns(self) -> Tensor:
+        """From poses that turn about the middle to those about the world's origin `(*B, V, 6, 6)`.
+
+        The translation from the origin is `t = t_middle - R middle`, so that `tau = tau_middle + (R middle) x omega`.
+        """
+        turns = torch.eye(6, dtype=self._alone.dtype, device=self._alone.device).expand(self._alone.shape)
+        if self._arm is None:
+            return turns
+        x, y, z = self._arm.unbind(-1)
+        zero = torch.zeros_like(x)
+        cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+        return turns + torch.nn.functional.pad(cross, (0, 3, 3, 0))
 
 
 def zero_where_infinite(covariance: Tensor) -> Tensor:

@@ -66,7 +66,8 @@ def outcome(
         return tensor.reshape((*batch, *tensor.shape[1:]))
 
     lens = cameras.distortion
-    R, t = (shaped(z) for z in solution.local)
+    about_middle = solution.local
+    R, t = shaped(about_middle[0]), shaped(data.in_world(*about_middle))
     if lens is not None:
         lens = type(lens)(shaped(solution.shared[:, 4 : 4 + lens.coefficients.shape[-1]]))  # type: ignore
     camera = Camera.unchecked(shaped(cameras.K[:, 0]), R[..., 0, :, :], t[..., 0, :], lens, size).without_pose()
@@ -82,7 +83,7 @@ def outcome(
         camera,
         posed,
         data.views.to(torch.float64),
-        data.points,
+        data.given_points.detach(),
         shaped(task.used),
         shaped(found.rejected),
         shaped(status),
@@ -91,13 +92,13 @@ def outcome(
         task.objective,
         causes,
         shaped(found.pixel_sigma()),
-        partial(_covariance, found, tuple(batch), known),
+        partial(_covariance, found, tuple(batch), known, data.middle, R.detach()),
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)
     return calibration
 
 
-def _covariance(found: Fit, batch: tuple[int, ...], known: Covariance | None) -> Covariance:
-    own = reshaped(found.covariance(), batch)
+def _covariance(found: Fit, batch: tuple[int, ...], known: Covariance | None, middle: Tensor, R: Tensor) -> Covariance:
+    own = replace(reshaped(found.covariance(), batch), middle=middle, _arm=R @ middle)
     return own if known is None else own.following(known)
