@@ -21,7 +21,7 @@ class Data:
     Attributes:
         views, target: as given.
         batch: `*B`.
-        middle: the centroid of the board's points `(3,)`, without graph: the origin of the frame that is solved in. Poses
+        middle: the centroid of the points `(3,)`, without graph: the origin of the frame that is solved in. Poses
             turn about it, so that it does not matter how far away the world's origin is.
         points: the board's points about their middle `(N, 3)`, without graph.
         pixels: `(P, V, N, 2)`, without graph.

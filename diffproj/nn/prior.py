@@ -91,7 +91,7 @@ class CalibrationPrior(GeometryModule):
         return (off * (self.precision * off.unsqueeze(-2)).sum(-1)).sum(-1) / 2
 
     def _vector(self, camera: Camera) -> Tensor:
-        """The parameters of a camera `(*B, p)`: intrinsics and lens, then with a pose its rotation from R_0 and place."""
+        """The parameters of a camera `(*B, p)`: intrinsics and lens, with a pose its turn from R_0 and its place."""
         parts = [in_float64(Parametrisation.of(camera).pack(camera))]
         if self.with_pose:
             turn = (in_float64(camera.R).unsqueeze(-3) * self.R_0.unsqueeze(-2)).sum(-1).mT  # R R_0^T
