@@ -201,6 +201,7 @@ def covariance(
     basis: Tensor | None = None,
     precision: Tensor | None = None,
     scores: Scores | None = None,
+    shares: Tensor | None = None,
 ) -> Covariance:
     """The covariance of P calibrations, from their normal equations.
 
@@ -211,6 +212,7 @@ def covariance(
         basis: of the free directions of the shared parameters `(P, s, q)`; all if left out.
         precision: the prior's `(P, s, s)`.
         scores: covariance of the scores, for the sandwich form.
+        shares: how much each view counts `(P, V)`; 1 if left out. U holds them, the blocks of the views do not.
     """
     U, E, W = equations.U, equations.E, equations.W
     if basis is not None:
@@ -221,7 +223,8 @@ def covariance(
             scores = Scores(T.unsqueeze(1) @ scores.U @ basis.unsqueeze(1), T.unsqueeze(1) @ scores.E, scores.W)
     inverse_W, unknown_views = _local_inverse(W)
     F = E @ inverse_W  # (P, V, q, 6)
-    S = U - (F @ E.mT).sum(1)
+    share = torch.ones_like(E[..., :1, :1]) if shares is None else shares[..., None, None]
+    S = U - (share * (F @ E.mT)).sum(1)
     inverse_S, unknown = _inverse(S, U.diagonal(dim1=-2, dim2=-1))
     prior = torch.zeros_like(S) if precision is None else precision
     if scores is None:
@@ -231,7 +234,7 @@ def covariance(
         alone = v.unsqueeze(1) * inverse_W
     else:
         leaning = F @ scores.E.mT
-        middle = (scores.U - leaning - leaning.mT + F @ scores.W @ F.mT).sum(1) + prior
+        middle = (share * (scores.U - leaning - leaning.mT + F @ scores.W @ F.mT)).sum(1) + prior
         mixed = inverse_W @ (scores.E.mT - scores.W @ F.mT) @ inverse_S.unsqueeze(1)
         alone = inverse_W @ scores.W @ inverse_W
     shared = inverse_S @ middle @ inverse_S

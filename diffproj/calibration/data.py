@@ -1,11 +1,13 @@
 """What calibration is given, checked: views, board and weights."""
 
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffproj._core.numerics import in_float64
+from diffproj.calibration.distinct import shares
 from diffproj.calibration.task import Task
 from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target
@@ -73,6 +75,11 @@ class Data:
         visible = visible.reshape(self.pixels.shape[:-1])
         self.used = visible & (visible.sum(-1, keepdim=True) >= 4)
         _check_inside(views, self.pixels, self.used)
+
+    @cached_property
+    def shares(self) -> Tensor | None:
+        """How much each view counts in what all views share `(P, V)`; `None` where all count fully."""
+        return shares(self.points, self.pixels, self.used)
 
     def about_middle(self, R: Tensor, t: Tensor) -> Tensor:
         """Translations `(..., 3)` from the board's middle, of those from the world's origin."""

@@ -55,13 +55,16 @@ class Fit:
         if task.loss is not None:
             return _robust_sigma(image, task.used)
         spare = self.degrees_of_freedom()
-        return torch.where(spare > 0, image.square().sum((1, 2, 3)) / spare, torch.nan).sqrt()
+        squares = image.square().sum((2, 3))
+        squares = squares if task.shares is None else squares * task.shares
+        return torch.where(spare > 0, squares.sum(-1) / spare, torch.nan).sqrt()
 
     def degrees_of_freedom(self) -> Tensor:
-        """Number of residual components minus number of free parameters, `(P,)`."""
+        """Number of residual components minus number of free parameters, `(P,)`; views count by their shares."""
         used = self.task.used
         shared = self.task.names if self.task.basis is None else range(self.task.basis.shape[-1])
-        return 2 * used.sum((-2, -1)) - len(shared) - POSE * used.any(-1).sum(-1)
+        spare = 2 * used.sum(-1) - POSE * used.any(-1)
+        return (spare if self.task.shares is None else spare * self.task.shares).sum(-1) - len(shared)
 
     def plain_covariance(self) -> Covariance:
         """The covariance for least squares with equal weights."""
@@ -72,6 +75,7 @@ class Fit:
             self.residual_variance(),
             basis=self.task.basis,
             precision=None if prior is None else prior.precision,
+            shares=self.task.shares,
         )
 
     def covariance(self) -> Covariance:
@@ -92,7 +96,8 @@ class Fit:
         kept = self._finite_sample_factor(weight, slope, bend, squared)[:, None, None, None]
         M = (score * both.square()) @ score.mT / kept
         s = len(task.names)
-        U = H[..., :s, :s].sum(1)
+        U = H[..., :s, :s] if task.shares is None else H[..., :s, :s] * task.shares[..., None, None]
+        U = U.sum(1)
         precision = None if task.prior is None else task.prior.precision
         return covariances.covariance(
             Equations(
@@ -106,6 +111,7 @@ class Fit:
             basis=task.basis,
             precision=precision,
             scores=Scores(M[..., :s, :s], M[..., :s, s:], M[..., s:, s:]),
+            shares=task.shares,
         )
 
     def _finite_sample_factor(self, weight: Tensor, slope: Tensor, bend: Tensor, squared: Tensor) -> Tensor:
@@ -120,6 +126,8 @@ class Fit:
         is at least 0.1.
         """
         used = self.task.used.to(squared)
+        if self.task.shares is not None:
+            used = used * self.task.shares.unsqueeze(-1)
         n = used.sum((-2, -1))
         h = 1 - self.degrees_of_freedom() / (2 * n)
 

@@ -39,6 +39,7 @@ def minimised(
         model,
         bow=options.bow,
         loss=options.loss,
+        shares=data.shares,
         prior=None if prior is None else Prior(prior.mean.detach(), prior.precision.detach()),
         basis=free_basis(shared, parameters, options.fixed, options.tied_focal),
     )
