@@ -22,7 +22,7 @@ ALIKE_PX = 2.0
 two are 15 px apart, of 1000 random ones 9 px.)"""
 ALIKE_PART = 0.05
 """The same relative to the RMS distance of the board's corners from their centroid on the image."""
-COMMON = 0.5
+COMMON = 0.25
 """Part of a view's corners that another must share to be compared with it."""
 COMPARISONS, FEWEST = 20_000_000, 16
 """Corners times pairs of views up to which all corners are compared; of more views fewer are, but at least so many."""
@@ -30,6 +30,8 @@ FIRST = 8
 """Corners that are compared first; in most sets they tell all views from each other."""
 ONE_VIEW_PX = 10.0
 """Displacement up to which all views of a camera tell no more about it than one does."""
+SENTENCES = 3
+"""Places with several views that a summary tells one by one."""
 ROWS = 1000
 """Views that are compared with all others at a time, for the sake of memory."""
 
@@ -75,6 +77,34 @@ def shares(
     if not bool((number > 1).any()):
         return None
     return torch.ones_like(pixels[..., 0, 0]).index_put((p, v), number.clamp(min=1).to(pixels).reciprocal())
+
+
+def described(same: Bool[Tensor, "v v"], names: tuple[str, ...]) -> str:
+    """What `alike` says of one camera, in a sentence."""
+    same = same.cpu()
+    if len(set(names)) < len(names):
+        names = tuple(f"view {number + 1}" for number in range(len(names)))
+    left, parts = same.diagonal().clone(), []
+    for view in range(len(names)):
+        others = (same[view] & left).nonzero().flatten().tolist() if bool(left[view]) else []
+        left[others] = False
+        others = [other for other in others if other != view]
+        if others:
+            parts.append(f"{_listed(others, names)} show{'s' * (len(others) == 1)} the board as {names[view]} does")
+    number = same.sum(-1)[same.diagonal()].to(torch.float64)
+    rest = len(parts) - SENTENCES
+    more = f"; {rest} more group{'s' * (rest > 1)} of views alike" if rest > 0 else ""
+    return f"{'; '.join(parts[:SENTENCES])}{more}: {len(number)} views count as {float(number.reciprocal().sum()):.3g}"
+
+
+def _listed(views: list[int], names: tuple[str, ...]) -> str:
+    """Views by name: the first and the last of a row, or the first few."""
+    if len(views) > 2 and views[-1] - views[0] == len(views) - 1:
+        first, last = names[views[0]], names[views[-1]]
+        numbered = first.startswith("view ") and last.startswith("view ")
+        return f"views {first[5:]} to {last[5:]}" if numbered else f"{first} to {last}"
+    few = ", ".join(names[view] for view in views[:4])
+    return few if len(views) <= 4 else f"{few} and {len(views) - 4} more"
 
 
 def one_view(

@@ -93,6 +93,7 @@ def outcome(
         task.objective,
         causes,
         shaped(found.pixel_sigma()),
+        None if task.shares is None else shaped(task.shares),
         partial(_covariance, found, tuple(batch), known, data.middle, R.detach()),
     )
     if throw and bool((status != Status.CONVERGED).any()):

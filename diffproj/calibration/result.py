@@ -10,6 +10,7 @@ from torch import Tensor
 
 from diffproj.calibration.bow import bowed
 from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.distinct import alike, described
 from diffproj.calibration.parametrisation import BOW, Parametrisation
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
@@ -62,6 +63,8 @@ class Calibration:
         causes: for each camera that did not converge, the cause in words; `*B` flattened.
         pixel_sigma: the standard deviation of a corner's coordinate in pixels, as the residuals tell it `(*B,)`: their
             root mean square over the degrees of freedom; under a robust loss, 1.4826 times their median.
+        shares: how much each view counted for the camera `(*B, V)`: 1, or 1 over the number of views that show the
+            board as it does, to within 2 px, which bring nothing new. `None` where all counted fully.
     """
 
     camera: Camera
@@ -76,6 +79,7 @@ class Calibration:
     objective: Objective = "image"
     causes: tuple[str, ...] = ()
     pixel_sigma: Float[Tensor, "*batch"] | None = None
+    shares: Float[Tensor, "*batch v"] | None = None
     _covariance: Callable[[], Covariance] | None = None
 
     @property
@@ -193,6 +197,9 @@ class Calibration:
             remark = f"  without corners {', '.join(map(str, out))}" if out and used[view] else ""
             text = f"{rms:.4f} px{remark}" if used[view] else f"left out: {seen[view] - len(out)} corners, 4 are needed"
             lines.append(f"  {name:<{width}}  {text}")
+        if self.shares is not None:
+            same = alike(self.points, self.views.pixels.unsqueeze(0), self.used.unsqueeze(0))[0]
+            lines.append(described(same, self.views.names))
         return "\n".join([*lines, self.message])
 
     def _causes(self) -> tuple[str, ...]:

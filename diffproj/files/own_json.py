@@ -86,6 +86,7 @@ def read_calibration(path: Path) -> Calibration | None:
             found["objective"],
             tuple(found["causes"]),
             None if found["pixel_sigma"] is None else _tensor(_with_nan(found["pixel_sigma"]), torch.float64),
+            None if found.get("shares") is None else _tensor(found["shares"], torch.float64),
             None if covariance is None else partial(_same, covariance),
         )
     except (KeyError, TypeError, ValueError) as error:
@@ -126,6 +127,7 @@ def _calibration_fields(item: Calibration) -> dict[str, Any]:
         "rejected": item.rejected.tolist(),
         "causes": item.causes,
         "pixel_sigma": None if item.pixel_sigma is None else item.pixel_sigma.tolist(),
+        "shares": None if item.shares is None else item.shares.tolist(),
         "covariance": item.covariance.to_fields() if item.has_covariance else None,
     }
 
