@@ -10,7 +10,8 @@ measured by the mean over neighbouring corners a, b of
 
     (a_u - a_v) . (b_u - b_v) = a_u . b_u + a_v . b_v - a_u . b_v - b_u . a_v
 
-which noise of any size leaves near zero, and which is a product of matrices for all pairs of views at once.
+which noise of any size and single wrong corners leave near zero, and which is a product of matrices for all pairs of
+views at once.
 """
 
 import torch
@@ -26,8 +27,10 @@ COMMON = 0.25
 """Part of a view's corners that another must share to be compared with it."""
 COMPARISONS, FEWEST = 20_000_000, 16
 """Corners times pairs of views up to which all corners are compared; of more views fewer are, but at least so many."""
+NEIGHBOURS = 3
+"""Neighbours of each corner that it is compared along with, so that some are left where corners are hidden."""
 FIRST = 8
-"""Corners that are compared first; in most sets they tell all views from each other."""
+"""Corners, with one neighbour each, that are compared first; in most sets they tell all views from each other."""
 ONE_VIEW_PX = 10.0
 """Displacement up to which all views of a camera tell no more about it than one does."""
 SENTENCES = 3
@@ -46,7 +49,7 @@ def alike(
         pixels: finite where used.
         used: which corners count.
     """
-    products = _Products(points, pixels, used, max(FEWEST, COMPARISONS // (len(used) * used.shape[1] ** 2)))
+    products = _Products(points, pixels, used, max(FEWEST, COMPARISONS // (len(used) * used.shape[1] ** 2)), NEIGHBOURS)
     count = used.sum(-1).clamp(min=1)
     seen = torch.where(used.unsqueeze(-1), pixels, 0.0)
     offset = torch.where(used.unsqueeze(-1), pixels - (seen.sum(-2) / count.unsqueeze(-1)).unsqueeze(-2), 0.0)
@@ -57,7 +60,7 @@ def alike(
         common = products.common(rows)
         lowest = torch.minimum(limit[:, rows].unsqueeze(-1), limit.unsqueeze(-2))
         enough = COMMON * torch.minimum(corners[:, rows].unsqueeze(-1), corners.unsqueeze(-2))
-        blocks.append((products.moved(rows) < lowest * common) & (common >= enough))
+        blocks.append((products.moved(rows) < lowest * common) & (common >= enough) & (common > 0))
     same = torch.cat(blocks, dim=1)
     same.diagonal(dim1=-2, dim2=-1).copy_(used.any(-1))
     return same
@@ -67,7 +70,7 @@ def shares(
     points: Float[Tensor, "n 3"], pixels: Float[Tensor, "p v n 2"], used: Bool[Tensor, "p v n"]
 ) -> Float[Tensor, "p v"] | None:
     """How much each view counts, 1 over the number of those that show the board alike; `None` where all count fully."""
-    products = _Products(points, pixels, used, FIRST)
+    products = _Products(points, pixels, used, FIRST, 1)
     doubtful = torch.cat([products.any_below(rows, ALIKE_PX**2) for rows in products.rows()], dim=-1)
     if not bool(doubtful.any()):
         return None
@@ -111,30 +114,33 @@ def one_view(
     points: Float[Tensor, "n 3"], pixels: Float[Tensor, "p v n 2"], used: Bool[Tensor, "p v n"]
 ) -> Bool[Tensor, " p"]:
     """Of which cameras no two views differ by more than a few pixels, or there is but one."""
-    products = _Products(points, pixels, used, FEWEST)
+    products = _Products(points, pixels, used, FEWEST, NEIGHBOURS)
     most = used.sum(-1).argmax(-1)
     left, mask = (whole[torch.arange(len(used)), most].unsqueeze(1) for whole in (products.left, products.mask))
-    from_one = left @ products.right.mT, mask @ products.mask.mT
-    one = (from_one[0] <= (2 * ONE_VIEW_PX) ** 2 * from_one[1]).squeeze(1) | ~used.any(-1)
-    one = one.all(-1)
-    if bool(one.any()):  # from one of them none is far: do the others lie on either side of it?
-        near = [
-            (products.moved(rows) <= ONE_VIEW_PX**2 * products.common(rows)).flatten(1).all(-1)
-            for rows in products.rows()
-        ]
-        one = one & torch.stack(near).all(0)
+    moved, common = left @ products.right.mT, mask @ products.mask.mT
+    unused = ~used.any(-1)
+    itself = torch.nn.functional.one_hot(most, used.shape[1]) > 0
+    near = (moved < (2 * ONE_VIEW_PX) ** 2 * common).squeeze(1) | itself | unused
+    one = near.all(-1)
+    if bool((one & ((~unused).sum(-1) > 1)).any()):  # none is far from one of them: are the others from each other?
+        for rows in products.rows():
+            near = products.moved(rows) <= ONE_VIEW_PX**2 * products.common(rows)
+            one = one & near.flatten(1).all(-1)
     return one
 
 
 class _Products:
     """Sums over the neighbouring corners that both of two views show, for all pairs of views."""
 
-    def __init__(self, points: Tensor, pixels: Tensor, used: Tensor, corners: int) -> None:
-        N = len(points)
-        corner = torch.linspace(0, N - 1, min(N, corners)).long().to(points.device)
-        apart = torch.cdist(points[corner], points)
-        apart[torch.arange(len(corner)), corner] = torch.inf
-        neighbour = apart.argmin(-1)
+    def __init__(self, points: Tensor, pixels: Tensor, used: Tensor, corners: int, neighbours: int) -> None:
+        seen = used.flatten(0, 1).any(0).nonzero().flatten()
+        N = max(1, len(seen))
+        some = torch.linspace(0, N - 1, min(N, corners), device=points.device).long()[: len(seen)]
+        apart = torch.cdist(points[seen[some]], points[seen])
+        apart[torch.arange(len(some)), some] = torch.inf
+        nearest = apart.topk(min(neighbours, N - 1), largest=False).indices
+        corner = seen[some].repeat_interleave(nearest.shape[-1])
+        neighbour = seen[nearest.flatten()]
         both = used[..., corner] & used[..., neighbour]
         self.mask = both.to(pixels)
         origin = pixels[:, :1, :1]  # near the others: squares of coordinates would cancel
@@ -160,4 +166,4 @@ class _Products:
         left = torch.cat([self.left[:, rows], self.mask[:, rows]], dim=-1)
         moved = left @ torch.cat([self.right, -limit * self.mask], dim=-1).mT
         moved.diagonal(rows.start, dim1=-2, dim2=-1).fill_(torch.inf)
-        return moved.amin(-1) < 0
+        return moved.amin(-1) <= 0  # 0 where they have no corners in common: more have to be looked at

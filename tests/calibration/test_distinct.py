@@ -241,3 +241,20 @@ def test_few_views_are_no_one_view() -> None:
     assert not bool(one_view(POINTS, VIEWS.pixels[None, [3, 5]], seen))
     seen[0, 1] = False
     assert bool(one_view(POINTS, VIEWS.pixels[None, [3, 5]], seen))
+
+
+def test_wrong_corners_and_patterns_do_not_hide_them() -> None:
+    generator = torch.Generator().manual_seed(0)
+    frames = noisy(VIEWS[[i for i in (0, 3, 6, 9) for _ in range(10)]], 0.2)
+    wrong = torch.rand(frames.visible.shape, generator=generator) < 0.02
+    dirty = frames.pixels + wrong.unsqueeze(-1) * (20 + 40 * torch.rand(40, 54, 1, generator=generator, dtype=D))
+    share = shares(POINTS, dirty[None], frames.visible[None])
+    assert share is not None
+    torch.testing.assert_close(share, torch.full((1, 40), 0.1, dtype=D), rtol=1e-12, atol=0)
+    every_other = (torch.arange(54) % 2 == 0).expand(1, 40, 54)
+    share = shares(POINTS, frames.pixels[None], every_other)
+    assert share is not None
+    torch.testing.assert_close(share, torch.full((1, 40), 0.1, dtype=D), rtol=1e-12, atol=0)
+    corners = torch.zeros(1, 40, 54, dtype=torch.bool)
+    corners[..., [0, 8, 45, 53]] = True
+    assert bool((alike(POINTS, frames.pixels[None], corners)[0].sum(-1) == 10).all())
