@@ -73,6 +73,8 @@ def difference(kept: Pose, other: Pose, middle: Float[Tensor, "*#batch 3"]) -> F
 
 def widened(covariance: Covariance, kept: Pose, others: OtherPoses, middle: Tensor) -> Covariance:
     """The covariance with the doubt between the two poses of each view in it."""
-    kept = tuple(z.detach() for z in kept)
-    step = difference(kept, (others.R, others.t), middle.detach()) * others.probability.sqrt().unsqueeze(-1)
+    poses = [(R.detach(), t.detach()) for R, t in (kept, (others.R, others.t))]
+    if covariance.middle is not None:  # its poses turn about it
+        poses, middle = [(R, t + R @ covariance.middle) for R, t in poses], middle - covariance.middle
+    step = difference(*poses, middle.detach()) * others.probability.sqrt().unsqueeze(-1)
     return replace(covariance, _alone=covariance._alone + step.unsqueeze(-1) * step.unsqueeze(-2))

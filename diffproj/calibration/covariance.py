@@ -39,7 +39,8 @@ class Covariance:
     """Joint covariance of shared parameters and poses, for batch shape `*B`.
 
     A pose is perturbed by `R <- exp(omega) R`, `t <- t + tau`: its six coordinates are omega in radians (about the
-    camera's axes) and tau in world units.
+    camera's axes) and tau in world units. Far from the world's origin a small turn is a large shift, and the two
+    nearly cancel; `about_middle` has poses that turn about the target instead.
 
     Attributes:
         names: of the s shared parameters: `f_x f_y c_x c_y`, then those of the lens and of the bow.
@@ -49,6 +50,7 @@ class Covariance:
         dispersion: how many times larger the variances are than they would be if all corners erred independently of
             each other `(*B,)`, at least 1: how much more the views contradict each other than such corners would. The
             square root divides a deviation for a comparison with tools that do not look for it.
+        middle: the middle of the target `(3,)` in the world; `None` stands for the world's origin.
     """
 
     names: tuple[str, ...]
@@ -58,7 +60,14 @@ class Covariance:
     dispersion: Float[Tensor, "*batch"]
     _follow: Tensor  # F_v^T (*B, V, 6, s): minus the derivative of the pose by the shared parameters
     _mixed: Tensor  # Cov(W_v^-1 h_v, dx), (*B, V, 6, s)
-    _alone: Tensor  # Cov(W_v^-1 h_v), (*B, V, 6, 6)
+    _alone: Tensor  # Cov(W_v^-1 h_v), (*B, V, 6, 6); poses turn about the middle in these three
+    middle: Float[Tensor, "3"] | None = None
+    _arm: Tensor | None = None  # R_v middle (*B, V, 3), from the world's origin to the middle along the camera's axes
+
+    @property
+    def about_middle(self) -> "Covariance":
+        """The same of poses that turn about the middle of the target: `t + R middle <- t + R middle + tau`."""
+        return replace(self, middle=None, _arm=None)
 
     @property
     def deviations(self) -> dict[str, Float[Tensor, "*batch"]]:
@@ -74,6 +83,7 @@ class Covariance:
         same = view % self._alone.shape[-3] == other % self._alone.shape[-3]
         if same:
             blocks = blocks + self._alone[..., view, :, :]
+        blocks = self._turns[..., view, :, :] @ blocks @ self._turns[..., other, :, :].mT
         unknown = (self.undetermined_views[..., view] | self.undetermined_views[..., other])[..., None, None]
         infinite = torch.diag_embed(torch.full_like(blocks[..., 0], torch.inf))
         return torch.where(unknown, infinite if same else torch.zeros_like(blocks), blocks)
@@ -81,7 +91,7 @@ class Covariance:
     def cross(self, view: int) -> Float[Tensor, "*batch 6 s"]:
         """The cross-covariance of a pose (rows) and the shared parameters (columns)."""
         cross = self._mixed[..., view, :, :] - self._follow[..., view, :, :] @ zero_where_infinite(self.shared)
-        return torch.where(self.undetermined_views[..., view, None, None], 0.0, cross)
+        return torch.where(self.undetermined_views[..., view, None, None], 0.0, self._turns[..., view, :, :] @ cross)
 
     def view(self, view: int) -> Float[Tensor, "*batch sp sp"]:
         """The joint covariance of the shared parameters and the pose of one view, `(*B, s + 6, s + 6)`."""
@@ -111,7 +121,11 @@ class Covariance:
         poses = poses + torch.stack(
             [torch.nn.functional.pad(self._alone[..., v, :, :], (6 * v, 6 * (V - 1 - v))) for v in range(V)], dim=-3
         ).flatten(-3, -2)
-        cross = (Q - F @ zero_where_infinite(self.shared)) * known.unsqueeze(-1)
+        cross = Q - F @ zero_where_infinite(self.shared)
+        turn = torch.zeros_like(poses)
+        for v in range(V):
+            turn[..., 6 * v : 6 * v + 6, 6 * v : 6 * v + 6] = self._turns[..., v, :, :]
+        poses, cross = turn @ poses @ turn.mT, turn @ cross * known.unsqueeze(-1)
         poses = poses * known.unsqueeze(-1) * known.unsqueeze(-2)
         poses = poses + torch.diag_embed(torch.where(known > 0, 0.0, torch.inf))
         return torch.cat([torch.cat([self.shared, cross.mT], dim=-1), torch.cat([cross, poses], dim=-1)], dim=-2)
@@ -127,6 +141,8 @@ class Covariance:
             "undetermined": self.undetermined,
             "undetermined_views": self.undetermined_views,
         }
+        if self.middle is not None and self._arm is not None:
+            tensors |= {"middle": self.middle, "arm": self._arm}
         return {"names": list(self.names), **{key: tensor.tolist() for key, tensor in tensors.items()}}
 
     @classmethod
@@ -154,7 +170,23 @@ class Covariance:
         if "dispersion" in fields:
             dispersion = torch.tensor(fields["dispersion"], dtype=torch.float64)
         infinite = torch.diag_embed(torch.where(undetermined, torch.inf, 0.0).to(shared))
-        return cls(tuple(fields["names"]), shared + infinite, undetermined, undetermined_views, dispersion, *blocks)
+        middle = [torch.tensor(fields[key], dtype=torch.float64) for key in ("middle", "arm") if key in fields]
+        known = undetermined, undetermined_views, dispersion
+        return cls(tuple(fields["names"]), shared + infinite, *known, *blocks, *middle)
+
+    @property
+    def _turns(self) -> Tensor:
+        """From poses that turn about the middle to those about the world's origin `(*B, V, 6, 6)`.
+
+        The translation from the origin is `t = t_middle - R middle`, so that `tau = tau_middle + (R middle) x omega`.
+        """
+        turns = torch.eye(6, dtype=self._alone.dtype, device=self._alone.device).expand(self._alone.shape)
+        if self._arm is None:
+            return turns
+        x, y, z = self._arm.unbind(-1)
+        zero = torch.zeros_like(x)
+        cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+        return turns + torch.nn.functional.pad(cross, (0, 3, 3, 0))
 
 
 def zero_where_infinite(covariance: Tensor) -> Tensor:
@@ -179,6 +211,7 @@ def covariance(
     precision: Tensor | None = None,
     scores: Scores | None = None,
     dispersion: Tensor | None = None,
+    shares: Tensor | None = None,
 ) -> Covariance:
     """The covariance of P calibrations, from their normal equations.
 
@@ -190,6 +223,7 @@ def covariance(
         precision: the prior's `(P, s, s)`.
         scores: covariance of the scores, for the sandwich form.
         dispersion: factor on the covariance of the scores `(P,)`; 1 if left out.
+        shares: how much each view counts `(P, V)`; 1 if left out. U holds them, the blocks of the views do not.
     """
     dispersion = torch.ones_like(equations.U[:, 0, 0]) if dispersion is None else dispersion
     phi = dispersion[:, None, None]
@@ -202,7 +236,8 @@ def covariance(
             scores = Scores(T.unsqueeze(1) @ scores.U @ basis.unsqueeze(1), T.unsqueeze(1) @ scores.E, scores.W)
     inverse_W, unknown_views = local_inverse(W)
     F = E @ inverse_W  # (P, V, q, 6)
-    S = U - (F @ E.mT).sum(1)
+    share = torch.ones_like(E[..., :1, :1]) if shares is None else shares[..., None, None]
+    S = U - (share * (F @ E.mT)).sum(1)
     inverse_S, unknown = _inverse(S, U.diagonal(dim1=-2, dim2=-1))
     prior = torch.zeros_like(S) if precision is None else precision
     if scores is None:
@@ -213,7 +248,7 @@ def covariance(
     else:
         scores = Scores(*(phi.unsqueeze(1) * block for block in scores))
         leaning = F @ scores.E.mT
-        middle = (scores.U - leaning - leaning.mT + F @ scores.W @ F.mT).sum(1) + prior
+        middle = (share * (scores.U - leaning - leaning.mT + F @ scores.W @ F.mT)).sum(1) + prior
         mixed = inverse_W @ (scores.E.mT - scores.W @ F.mT) @ inverse_S.unsqueeze(1)
         alone = inverse_W @ scores.W @ inverse_W
     shared = inverse_S @ middle @ inverse_S

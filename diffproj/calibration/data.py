@@ -1,11 +1,13 @@
 """What calibration is given, checked: views, board and weights."""
 
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffproj._core.numerics import in_float64
+from diffproj.calibration.distinct import shares
 from diffproj.calibration.task import Task
 from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target
@@ -21,11 +23,13 @@ class Data:
     Attributes:
         views, target: as given.
         batch: `*B`.
-        points: the board's `(N, 3)`, without graph.
+        middle: the centroid of the points `(3,)`, without graph: the origin of the frame that is solved in. Poses
+            turn about it, so that it does not matter how far away the world's origin is.
+        points: the board's points about their middle `(N, 3)`, without graph.
         pixels: `(P, V, N, 2)`, without graph.
         used: `(P, V, N)`: seen, in a view with at least 4 corners.
         weights: `(P, V, N)`, without graph, or `None`.
-        given_points, given_pixels, given_weights: with graph, and with `*B` in front.
+        given_points, given_pixels, given_weights: with graph, and with `*B` in front; points in the world.
 
     Raises:
         TypeError: views are no `Views`.
@@ -50,7 +54,8 @@ class Data:
                 "do columns and rows of the board fit?"
             )
         _check_points(points)
-        self.points = points
+        self.middle = points.mean(0)
+        self.points = points - self.middle
         self.pixels = self.given_pixels.detach().reshape(-1, *views.pixels.shape[-3:])
         visible = views.visible
         self.given_weights, self.weights = None, None
@@ -70,6 +75,19 @@ class Data:
         visible = visible.reshape(self.pixels.shape[:-1])
         self.used = visible & (visible.sum(-1, keepdim=True) >= 4)
         _check_inside(views, self.pixels, self.used)
+
+    @cached_property
+    def shares(self) -> Tensor | None:
+        """How much each view counts in what all views share `(P, V)`; `None` where all count fully."""
+        return shares(self.points, self.pixels, self.used)
+
+    def about_middle(self, R: Tensor, t: Tensor) -> Tensor:
+        """Translations `(..., 3)` from the board's middle, of those from the world's origin."""
+        return t + R @ self.middle
+
+    def in_world(self, R: Tensor, t: Tensor) -> Tensor:
+        """Translations `(..., 3)` from the world's origin, of those from the board's middle."""
+        return t - R @ self.middle
 
     def task(self, model: LensModel, **options: Any) -> Task:
         """What is to be minimised on these corners."""

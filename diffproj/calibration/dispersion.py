@@ -76,24 +76,28 @@ def _between_over_within(
     u = torch.where(sound.unsqueeze(-1), u, 0.0)
     S, K = (torch.where(sound[..., None, None], M, 0.0) for M in (S, K))
 
+    share = torch.ones_like(u[..., 0]) if task.shares is None else task.shares
+
     # Where the minimum is another's, the plane objective's say, the pulls do not sum to 0: they are taken from where
     # they do. A prior's pull is among them, and what it determines costs no degree of freedom.
-    total, pull = S.sum(1), u.sum(1)
+    data = (share[..., None, None] * S).sum(1)
+    total, pull = data, (share.unsqueeze(-1) * u).sum(1)
     if task.prior is not None:
         Q, off = task.prior.precision, (task.prior.precision @ (shared - task.prior.mean).unsqueeze(-1)).squeeze(-1)
         T = torch.eye(len(Q[0]), dtype=Q.dtype, device=Q.device) if task.basis is None else task.basis
         total, pull = total + T.mT @ Q @ T, pull + (T.mT @ off.unsqueeze(-1)).squeeze(-1)
     inverse = torch.linalg.pinv(total, hermitian=True)
     u = u - (S @ (inverse @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
-    spent = (inverse * S.sum(1).mT).sum((-2, -1))
+    spent = (inverse * data.mT).sum((-2, -1))
 
     scale = K.diagonal(dim1=-2, dim2=-1).sum(1, keepdim=True).clamp(min=1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(K * scale.unsqueeze(-1) * scale.unsqueeze(-2))
     told = values > SINGULAR * values[..., -1:].clamp(min=1e-300)
     along = (vectors.mT @ (u * scale).unsqueeze(-1)).squeeze(-1)
-    squares = torch.where(told, along.square() / torch.where(told, values, 1.0), 0.0).sum((-2, -1))
-    spare = told.sum((-2, -1)) - spent
-    return squares / spare.clamp(min=1e-9), spare.clamp(min=1e-9), told.any(-1).sum(-1).to(squares)
+    squares = torch.where(told, along.square() / torch.where(told, values, 1.0), 0.0).sum(-1)
+    squares, told = (share * squares).sum(-1), share.unsqueeze(-1) * told
+    spare = (told.sum((-2, -1)) - spent).clamp(min=1e-9)
+    return squares / spare, spare, told.amax(-1).sum(-1)
 
 
 def _weighted(
@@ -117,5 +121,6 @@ def _weighted(
             squared = task.problem.linearise(shared, local)[:, :, -1].square().sum(2)
         slope = weight * slope_and_bend(task.loss, squared)[0]
     pulls = torch.where(weight > 0, slope.square() / torch.where(weight > 0, weight, 1.0), 0.0)
+    pulls = pulls if task.shares is None else pulls * task.shares.unsqueeze(-1)
     level = (pulls * residual.square().sum(2)).sum((-2, -1)) / redundant.clamp(min=1)
     return rows, residual, slope, weight * level[:, None, None]

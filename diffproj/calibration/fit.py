@@ -54,13 +54,16 @@ class Fit:
         if task.loss is not None:
             return _robust_sigma(image, task.used)
         spare = self.degrees_of_freedom()
-        return torch.where(spare > 0, image.square().sum((1, 2, 3)) / spare, torch.nan).sqrt()
+        squares = image.square().sum((2, 3))
+        squares = squares if task.shares is None else squares * task.shares
+        return torch.where(spare > 0, squares.sum(-1) / spare, torch.nan).sqrt()
 
     def degrees_of_freedom(self) -> Tensor:
-        """Number of residual components minus number of free parameters, `(P,)`."""
+        """Number of residual components minus number of free parameters, `(P,)`; views count by their shares."""
         used = self.task.used
         shared = self.task.names if self.task.basis is None else range(self.task.basis.shape[-1])
-        return 2 * used.sum((-2, -1)) - len(shared) - POSE * used.any(-1).sum(-1)
+        spare = 2 * used.sum(-1) - POSE * used.any(-1)
+        return (spare if self.task.shares is None else spare * self.task.shares).sum(-1) - len(shared)
 
     def plain_covariance(self) -> Covariance:
         """The covariance for least squares, whatever the loss and the objective: what verdicts go by."""
@@ -71,6 +74,7 @@ class Fit:
             self.residual_variance(),
             basis=self.task.basis,
             precision=None if prior is None else prior.precision,
+            shares=self.task.shares,
         )
 
 

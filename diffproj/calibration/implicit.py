@@ -38,7 +38,8 @@ def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
         H = torch.stack(
             [torch.autograd.grad(gradient[..., i].sum(), theta, retain_graph=True)[0] for i in range(s + POSE)], dim=-2
         ).detach()
-        U, g = H[..., :s, :s].sum(1), gradient[..., :s].sum(1)
+        share = torch.ones_like(H[..., :1, :1]) if task.shares is None else task.shares[..., None, None]
+        U, g = (share * H[..., :s, :s]).sum(1), (share.squeeze(-1) * gradient[..., :s]).sum(1)
         if prior is not None:
             U = U + prior.precision.detach()
             g = g + (prior.precision @ (solution.shared - prior.mean).unsqueeze(-1)).squeeze(-1)
@@ -49,8 +50,8 @@ def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
         # An unused view has W = 0 and h = 0: its pose has no gradient.
         unused = ~task.used.any(-1)[..., None, None] * torch.eye(POSE, dtype=W.dtype, device=W.device)
         F = torch.linalg.solve_ex((W + unused).mT, E.mT)[0].mT
-        S = U - (F @ E.mT).sum(1)
-        reduced = g - (F @ h.unsqueeze(-1)).squeeze(-1).sum(1)
+        S = U - (share * (F @ E.mT)).sum(1)
+        reduced = g - (share * (F @ h.unsqueeze(-1))).squeeze(-1).sum(1)
         dx = -torch.linalg.solve_ex(S, reduced.unsqueeze(-1))[0]
         dz = -torch.linalg.solve_ex(W + unused, h.unsqueeze(-1) + E.mT @ dx.unsqueeze(1))[0].squeeze(-1)
         if task.basis is not None:
@@ -72,9 +73,8 @@ def _costs(
     flat = shared.flatten(0, 1)
     local = tuple(z.unsqueeze(1) for z in moved(found.solution.local, step))
     cameras = task.parameters.unpack(flat, tuple(z.flatten(0, 2).unsqueeze(1) for z in local))
-    points = data.given_points.expand(len(flat), 1, -1, 3)
-    if task.bow:
-        points = bowed(data.given_points, flat[:, None, -2:])
+    centred = data.given_points - data.middle
+    points = bowed(centred, flat[:, None, -2:]) if task.bow else centred.expand(len(flat), 1, -1, 3)
     seen = torch.where(task.used.unsqueeze(-1), pixels, 0.0).flatten(0, 1).unsqueeze(1)
     error = put_back_minus_known if task.objective == "plane" else projected_minus_seen
     residual, _ = error(cameras, points, seen, task.used.flatten(0, 1).unsqueeze(1))

@@ -43,6 +43,7 @@ def minimised(
         model,
         bow=options.bow,
         loss=options.loss,
+        shares=data.shares,
         prior=None if prior is None else Prior(prior.mean.detach(), prior.precision.detach()),
         basis=free_basis(shared, parameters, options.fixed, options.tied_focal),
     )
@@ -76,7 +77,8 @@ def outcome(
         return tensor.reshape((*batch, *tensor.shape[1:]))
 
     lens = cameras.distortion
-    R, t = (shaped(z) for z in solution.local)
+    about_middle = solution.local
+    R, t = shaped(about_middle[0]), shaped(data.in_world(*about_middle))
     if lens is not None:
         lens = type(lens)(shaped(solution.shared[:, 4 : 4 + lens.coefficients.shape[-1]]))  # type: ignore
     camera = Camera.unchecked(shaped(cameras.K[:, 0]), R[..., 0, :, :], t[..., 0, :], lens, size).without_pose()
@@ -92,7 +94,7 @@ def outcome(
         camera,
         posed,
         data.views.to(torch.float64),
-        data.points,
+        data.given_points.detach(),
         shaped(task.used),
         shaped(found.rejected),
         shaped(status),
@@ -101,8 +103,9 @@ def outcome(
         task.objective,
         causes,
         shaped(noise.variance.sqrt()),
-        partial(_covariance, found, tuple(batch), before, known),
-        partial(_others, found, tuple(batch), before),
+        None if task.shares is None else shaped(task.shares),
+        partial(_covariance, found, data, before, known),
+        partial(_others, found, data, before),
         shaped(noise.freedom),
         None if known is None else known.region,
     )
@@ -111,15 +114,16 @@ def outcome(
     return calibration
 
 
-def _covariance(found: Fit, batch: tuple[int, ...], noise: Noise | None, known: Calibration | None) -> Covariance:
-    if known is None or not known.has_covariance:
-        return reshaped(covariance_of(found, noise), batch)
-    before = known.covariance_of_kept_poses
-    own = covariance_of(found, noise, before.dispersion.expand(batch).reshape(-1))
-    return reshaped(own, batch).following(before)
+def _covariance(found: Fit, data: Data, noise: Noise | None, known: Calibration | None) -> Covariance:
+    batch = tuple(data.batch)
+    before = None if known is None or not known.has_covariance else known.covariance_of_kept_poses
+    own = covariance_of(found, noise, None if before is None else before.dispersion.expand(batch).reshape(-1))
+    R = found.solution.local[0].detach()
+    own = replace(reshaped(own, batch), middle=data.middle, _arm=(R @ data.middle).reshape(*batch, -1, 3))
+    return own if before is None else own.following(before)
 
 
-def _others(found: Fit, batch: tuple[int, ...], noise: Noise | None) -> OtherPoses:
+def _others(found: Fit, data: Data, noise: Noise | None) -> OtherPoses:
     others = other_poses(found, noise)
-    R, t, ratio = (z.reshape(*batch, *z.shape[1:]) for z in (others.R, others.t, others.ratio))
-    return OtherPoses(R, t, ratio)
+    parts = others.R, data.in_world(others.R, others.t), others.ratio
+    return OtherPoses(*(part.reshape(*data.batch, *part.shape[1:]) for part in parts))

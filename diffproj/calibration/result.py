@@ -12,6 +12,7 @@ from torch import Tensor
 from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
 from diffproj.calibration.bow import bowed
 from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.distinct import alike, described
 from diffproj.calibration.parametrisation import BOW, Parametrisation
 from diffproj.calibration.region import covered_region
 from diffproj.calibration.solver import Status
@@ -72,6 +73,8 @@ class Calibration:
         degrees_of_freedom: how many independent residuals tell `pixel_sigma` `(*B,)`, and so the scale of the
             covariance; `None` where that is not known.
         lens_region: for what `locate` found with a calibration, the `region` of that one.
+        shares: how much each view counted for the camera `(*B, V)`: 1, or 1 over the number of views that show the
+            board as it does, to within 2 px, which bring nothing new. `None` where all counted fully.
     """
 
     camera: Camera
@@ -86,6 +89,7 @@ class Calibration:
     objective: Objective = "image"
     causes: tuple[str, ...] = ()
     pixel_sigma: Float[Tensor, "*batch"] | None = None
+    shares: Float[Tensor, "*batch v"] | None = None
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
     degrees_of_freedom: Float[Tensor, "*batch"] | None = None
@@ -309,6 +313,9 @@ class Calibration:
                 remark += f"  another pose is {odds[view]:.2g} times less likely"
             text = f"{rms:.4f} px{remark}" if used[view] else f"left out: {seen[view] - len(out)} corners, 4 are needed"
             lines.append(f"  {name:<{width}}  {text}")
+        if self.shares is not None:
+            same = alike(self.points, self.views.pixels.unsqueeze(0), self.used.unsqueeze(0))[0]
+            lines.append(described(same, self.views.names))
         return "\n".join([*lines, self.message])
 
     def _causes(self) -> tuple[str, ...]:

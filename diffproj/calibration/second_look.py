@@ -163,6 +163,7 @@ def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Ten
 def _profile(task: Task, straight: Straightened, f: Tensor, views: Tensor) -> Tensor:
     """The cost `(P,)` of some views `(P, v)` at focal lengths `(P,)`, each at the better of its poses."""
     costs, _ = _both_poses(task, straight, f, views)
+    costs = costs if task.shares is None else costs * task.shares.gather(1, views)
     return torch.where(task.used.any(-1).gather(1, views), costs, 0.0).sum(-1)
 
 
@@ -225,5 +226,7 @@ def _truncated(found: Fit, other: Fit, which: Tensor, reject: float) -> tuple[Te
         [torch.where(given.used, r, torch.nan).flatten(1).nanmedian(-1).values for r in residuals]
     ).amin(0)
     limit = (reject**2 * sigma / 1.386).clamp(min=1e-24)[:, None, None]  # the median of |e|^2 is 1.386 sigma^2
-    one, two = (torch.where(given.used, r.minimum(limit), 0.0).sum((1, 2)) for r in residuals)
-    return one, two
+    one, two = (torch.where(given.used, r.minimum(limit), 0.0).sum(-1) for r in residuals)
+    if given.shares is not None:
+        one, two = one * given.shares, two * given.shares
+    return one.sum(-1), two.sum(-1)

@@ -37,11 +37,8 @@ def from_camera(camera: Camera, data: Data, bow: bool) -> tuple[Tensor, tuple[Te
             f"with the poses to start from, got {shape}"
         ) from None
     if posed:
-        return (
-            shared,
-            (camera.R.reshape(-1, len(data.views), 3, 3), camera.t.reshape(-1, len(data.views), 3)),
-            parameters.lens,
-        )
+        R, t = camera.R.reshape(-1, len(data.views), 3, 3), camera.t.reshape(-1, len(data.views), 3)
+        return shared, (R, data.about_middle(R, t)), parameters.lens
     upright = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(*data.used.shape[:2], 3, 3)
     views = parameters.unpack(shared, (upright, torch.zeros_like(upright[..., 0])))
     direction, valid = views.directions(data.pixels)

@@ -33,6 +33,8 @@ class Task:
         lens, bow: the model.
         objective: residuals on the image or on the board.
         weights: of the corners `(P, V, N)`, or `None` for 1.
+        shares: how much each view counts in what all views share `(P, V)`, or `None` for 1: see `distinct.py`. A pose
+            is determined by all of its view's corners, whatever the view's share.
         loss: a robust loss, or `None` for least squares.
         prior: on the shared parameters.
         basis: of the shared parameters' free directions `(P, s, q)`, or `None` for all.
@@ -45,6 +47,7 @@ class Task:
     bow: bool = False
     objective: Objective = "image"
     weights: Tensor | None = None
+    shares: Tensor | None = None
     loss: Loss | None = None
     prior: Prior | None = None
     basis: Tensor | None = None
@@ -68,7 +71,8 @@ class Task:
     def part(self, where: slice | Tensor) -> "Task":
         """The task of some of the cameras."""
         cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}
-        cut |= {name: None if (whole := getattr(self, name)) is None else whole[where] for name in ("weights", "basis")}
+        optional = ("weights", "shares", "basis")
+        cut |= {name: None if (whole := getattr(self, name)) is None else whole[where] for name in optional}
         prior = None if self.prior is None else Prior(*(part[where] for part in self.prior))
         return replace(self, **cut, prior=prior)
 
@@ -102,18 +106,35 @@ def solved(
 def _solved(task: Task, shared: Tensor, local: tuple[Tensor, ...], **options: Any) -> Solution:
     size = task.used.sum((-2, -1)).amax().clamp(min=1).item()
     unit = NEGLIGIBLE_PX if task.objective == "image" else 1e-13 * float(task.points.abs().amax())
-    return solve(
+    weights = task.weights
+    if task.shares is not None:
+        weights = task.shares.unsqueeze(-1).expand(task.used.shape) * (1.0 if weights is None else weights)
+    solution = solve(
         task.problem,
         shared,
         local,
         local_size=POSE,
-        weights=task.weights,
+        weights=weights,
         loss=task.loss,
         prior=task.prior,
         basis=task.basis,
         negligible=size * unit**2,
         **options,
     )
+    if task.shares is None:
+        return solution
+    # The blocks of the views are those of all their corners; only what is summed over views holds their shares.
+    whole = {name: getattr(solution.equations, name) for name in ("E", "W", "h", "c")}
+    return solution._replace(
+        equations=solution.equations._replace(
+            **{name: block / shaped_like(task.shares, block) for name, block in whole.items()}
+        )
+    )
+
+
+def shaped_like(shares: Tensor, block: Tensor) -> Tensor:
+    """Shares `(P, V)` with as many axes as blocks of the views `(P, V, ...)`."""
+    return shares.reshape(*shares.shape, *(1,) * (block.ndim - 2))
 
 
 def _blocks(task: Task) -> list[slice]:

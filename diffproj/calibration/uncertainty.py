@@ -38,7 +38,13 @@ def covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = N
     task = found.task
     phi = dispersion(found) if phi is None else phi
     precision = None if task.prior is None else task.prior.precision
-    common = {"names": task.names, "basis": task.basis, "precision": precision, "dispersion": phi}
+    common = {
+        "names": task.names,
+        "basis": task.basis,
+        "precision": precision,
+        "dispersion": phi,
+        "shares": task.shares,
+    }
     if task.objective == "plane":
         equations, scores = _on_the_plane(found)
         return covariances.covariance(equations, variance=torch.ones_like(phi), scores=scores, **common)
@@ -57,6 +63,7 @@ def _robust(found: Fit) -> tuple[Equations, Tensor, Tensor]:
     squared = residual.square().sum(2)
     slope, bend = slope_and_bend(found.task.loss, squared)
     used = found.task.used.to(squared)
+    used = used if found.task.shares is None else used * found.task.shares.unsqueeze(-1)
     n = used.sum((-2, -1)).clamp(min=1)
     spare = found.degrees_of_freedom()
 
@@ -111,7 +118,8 @@ def _equations(found: Fit, rows: Tensor, weight: Tensor, more: Tensor | None = N
     flat, s = rows.flatten(-2), len(found.task.names)
     H = (flat * weight.unsqueeze(2).repeat(1, 1, 1, 2)) @ flat.mT
     H = H if more is None else H + more
-    U = H[..., :s, :s].sum(1)
+    U = H[..., :s, :s]
+    U = (U if found.task.shares is None else U * found.task.shares[..., None, None]).sum(1)
     prior = found.task.prior
     U = U if prior is None else U + prior.precision
     return Equations(U, H[..., :s, s:], H[..., s:, s:], *found.solution.equations[3:])

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.closed_form import homographies
+from diffproj.calibration.distinct import one_view
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
@@ -23,6 +24,12 @@ MIN_FORESHORTENING = 0.05
 PARALLEL_ANGLE = math.radians(15)
 """Angle between boards below which they count as parallel: they hardly determine the focal length, and the tilt
 found is arbitrary."""
+
+ONE_VIEW = (
+    "one view does not tell the focal length from the principal point, the lens and the unevenness of the board: add "
+    "views with the board tilted by 20 to 50 degrees about both axes, or let fixed or priors hold the principal point "
+    "and the lens (a known camera needs but one view to be located)"
+)
 
 
 def verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor, tuple[str, ...]]:
@@ -48,8 +55,9 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     redundant = (found.degrees_of_freedom() > 0) | (task.prior is not None)
     if task.basis is not None and task.basis.shape[-1] == 0:  # poses only: four corners leave two degrees of freedom
         unknown[:] = False
+    alone = _leans_on_one_view(task)
     status = solution.status
-    degenerate = none | mirrored.any(-1) | misfits.any(-1) | unknown.any(-1) | no_pose.any(-1) | ~redundant
+    degenerate = none | mirrored.any(-1) | misfits.any(-1) | unknown.any(-1) | no_pose.any(-1) | ~redundant | alone
     status = torch.where(degenerate & finite & (status != Status.DIVERGED), Status.DEGENERATE, status)
     causes = [""] * len(status)
     if not bool(status.any()):
@@ -80,12 +88,25 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
                 f"{_joined_names(names, mirrored[p])} show{'s' * (int(mirrored[p].sum()) == 1)} the board mirrored: "
                 "number the corners of each row from the other end"
             )
+        elif bool(alone[p]) and not (int(used[p].sum()) == 1 and bool(unknown[p].any())):
+            causes[p] = ONE_VIEW if int(used[p].sum()) == 1 else f"the views show the board alike, and {ONE_VIEW}"
         elif not bool(redundant[p]) or bool(unknown[p].any()):
             lacking = [name for name, lost in zip(task.names, unknown[p].tolist(), strict=True) if lost]
             seen = task.part(slice(p, p + 1))
             free = task.basis is None or bool(task.basis[p, 2:4].any())
             causes[p] = _undetermined(lacking, R[p, used[p]], _foreshortening(seen)[0, used[p]], free)
     return status, tuple(causes)
+
+
+def _leans_on_one_view(task: Task) -> Tensor:
+    """Which cameras have one view, or views alike, and more to be found than the focal lengths `(P,)`."""
+    free = torch.ones_like(task.pixels[:, 0, 0, :1]).expand(-1, len(task.names)) > 0
+    if task.basis is not None:
+        free = (task.basis != 0).any(-1)
+    if task.prior is not None:
+        free = free & (task.prior.precision.diagonal(dim1=-2, dim2=-1) == 0)
+    more = free[:, 2:].any(-1)
+    return more & one_view(task.points, task.pixels, task.used) if bool(more.any()) else more
 
 
 def _relative_error(found: Fit) -> Tensor:

@@ -74,9 +74,9 @@ def measure(
     """
     pixels = in_float64(check_tensor("pixels", pixels, "N", 2))
     if isinstance(calibration, Calibration):
-        camera, known, level = _at_view(calibration, view)
+        camera, known, level, middle = _at_view(calibration, view)
     else:
-        camera, known, level = as_camera(calibration), None, None
+        camera, known, level, middle = as_camera(calibration), None, None, None
     if pixel_sigma is None and level is None:
         source = "this calibration" if isinstance(calibration, Calibration) else "a camera alone"
         raise ValueError(f"pixel_sigma: want the noise of the pixels, for {source} does not know it")
@@ -84,7 +84,7 @@ def measure(
     points, valid = back_project(pixels, camera, plane)
     batch = points.shape[:-2]
     sigma = _expanded(level if pixel_sigma is None else pixel_sigma, like=points)
-    by_theta, by_point = _projection_derivatives(points, camera, known)
+    by_theta, by_point = _projection_derivatives(points, camera, known, middle)
     tangents = plane.tangents()
     T = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)  # (*B, N, 3, 2)
     D = torch.where(valid[..., None, None], T @ _inverse2(by_point @ T), 0.0)
@@ -136,14 +136,22 @@ def view_number(calibration: Calibration, view: int | str) -> int:
     return view % len(names)
 
 
-def _at_view(calibration: Calibration, view: int | str) -> tuple[Camera, Tensor | None, Tensor | None]:
-    """The camera at the pose of a view, the covariance of both, and the noise of a pixel `(*B, 1)`, where known."""
+def _at_view(calibration: Calibration, view: int | str) -> tuple[Camera, Tensor | None, Tensor | None, Tensor | None]:
+    """The camera at the pose of a view, the covariance of both, the noise of a pixel `(*B, 1)`, and a point `(3,)`.
+
+    In the covariance the pose turns about that point. What is not known is `None`.
+    """
     number = view_number(calibration, view)
     if not bool(calibration.used[..., number, :].any(-1).all()):
         raise ValueError(f"view: want one whose pose is known, got {view!r}, of which no corner was used")
-    known = calibration.covariance_of_kept_poses.view(number) if calibration.has_covariance else None
+    known, middle = None, None
+    if calibration.has_covariance:
+        known, middle = (
+            calibration.covariance_of_kept_poses.about_middle.view(number),
+            calibration.covariance_of_kept_poses.middle,
+        )
     level = None if calibration.pixel_sigma is None else calibration.pixel_sigma.unsqueeze(-1)
-    return calibration.cameras[..., number], known, level
+    return calibration.cameras[..., number], known, level, middle
 
 
 def _expanded(pixel_sigma: float | Tensor | None, like: Tensor) -> Tensor:
@@ -159,14 +167,21 @@ def _expanded(pixel_sigma: float | Tensor | None, like: Tensor) -> Tensor:
     return sigma
 
 
-def _projection_derivatives(points: Tensor, camera: Camera, known: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Derivatives of the pixels by theta `(*B, N, 2, s + 6)` (bow excluded: 0) and by the point `(*B, N, 2, 3)`."""
+def _projection_derivatives(
+    points: Tensor, camera: Camera, known: Tensor | None, middle: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Derivatives of the pixels by theta `(*B, N, 2, s + 6)` (bow excluded: 0) and by the point `(*B, N, 2, 3)`.
+
+    The pose turns about `middle (3,)`: about a distant origin a turn and a shift would nearly cancel.
+    """
     batch = points.shape[:-2]
     parameters = Parametrisation.of(camera)
     s = parameters.size
     shared = parameters.pack(camera).expand(*batch, s).reshape(-1, s)
     R, t = camera.R.expand(*batch, 3, 3).reshape(-1, 1, 3, 3), camera.t.expand(*batch, 3).reshape(-1, 1, 3)
     flat = points.reshape(len(shared), 1, -1, 3)
+    if middle is not None:
+        flat, t = flat - middle, t + R @ middle
     bow = 0 if known is None else known.shape[-1] - s - 6
 
     def project(step: Tensor) -> Tensor:

@@ -22,9 +22,9 @@ class CalibrationPrior(GeometryModule):
     """The negative log-likelihood of a camera under its calibration, `1/2 d^T C^-1 d`, up to a constant.
 
     `d` is how far the camera is from the calibrated one: focal lengths and principal point in pixels, the coefficients
-    of the lens, and with `view` the pose, as rotation vector of `R R_0^T` and `t - t_0`. `C` is the covariance of these
-    in the calibration. Added to a loss that is a negative log-likelihood itself, the prior makes the calibration's
-    corners count along with the new data.
+    of the lens, and with `view` the pose, as rotation vector of `R R_0^T` and shift of the target's middle along the
+    camera's axes. `C` is the covariance of these in the calibration. Added to a loss that is a negative log-likelihood
+    itself, the prior makes the calibration's corners count along with the new data.
 
     Directions without a finite, positive variance add nothing, however far the camera moves along them: what the
     calibration held fixed, the ratio of focal lengths that it tied (`tied_focal=True`), and what the corners did not
@@ -53,19 +53,22 @@ class CalibrationPrior(GeometryModule):
     center: Tensor
     precision: Tensor
     R_0: Tensor
+    middle: Tensor
 
     def __init__(self, calibration: Calibration, view: int | None = None) -> None:
         super().__init__()
         if calibration.views.batch_shape or not calibration.has_covariance:
             raise ValueError("calibration: want one camera with its covariance, as calibrate gives it")
         camera = (calibration.camera if view is None else calibration.cameras[view]).detach()
-        known, parameters = calibration.covariance, Parametrisation.of(camera)
+        known, parameters = calibration.covariance.about_middle, Parametrisation.of(camera)
+        middle = calibration.covariance.middle
         C = (known.shared if view is None else known.view(view)).detach()
         # The rows of C are the camera's parameters, the bow of the board, which is none of the camera's, and the pose.
         of_pose = range(len(known.names), len(known.names) + (0 if view is None else POSE))
         rows = torch.tensor([*range(parameters.size), *of_pose], device=C.device)
         self.lens, self.with_pose = parameters.lens, view is not None
         self.register_buffer("R_0", in_float64(camera.R).clone())
+        self.register_buffer("middle", torch.zeros_like(self.R_0[0]) if middle is None else middle.clone())
         self.register_buffer("center", self._vector(camera).clone())
         self.register_buffer("precision", _precision(in_float64(C[rows.unsqueeze(-1), rows])))
 
@@ -88,12 +91,12 @@ class CalibrationPrior(GeometryModule):
         return (off * (self.precision * off.unsqueeze(-2)).sum(-1)).sum(-1) / 2
 
     def _vector(self, camera: Camera) -> Tensor:
-        """The parameters of a camera `(*B, p)`: intrinsics and lens, then with a pose its rotation from R_0, and t."""
+        """The parameters of a camera `(*B, p)`: intrinsics and lens, with a pose its turn from R_0 and its place."""
         parts = [in_float64(Parametrisation.of(camera).pack(camera))]
         if self.with_pose:
             turn = (in_float64(camera.R).unsqueeze(-3) * self.R_0.unsqueeze(-2)).sum(-1).mT  # R R_0^T
             omega = rotation_matrix_to_axis_angle(turn.reshape(-1, 3, 3)).reshape(*turn.shape[:-2], 3)
-            parts += [omega, in_float64(camera.t)]
+            parts += [omega, in_float64(camera.t) + (in_float64(camera.R) * self.middle).sum(-1)]
         return torch.cat([part.expand(*camera.batch_shape, part.shape[-1]) for part in parts], dim=-1)
 
 

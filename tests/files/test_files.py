@@ -83,9 +83,8 @@ def test_covariance_comes_back(calibration: dp.Calibration) -> None:
     shared = shared + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(D))
     want = replace(calibration.covariance, shared=shared, undetermined=unknown)
     fields = want.to_fields()
-    assert list(fields) == [
-        *("names", "dispersion", "shared", "follow", "mixed", "alone", "undetermined", "undetermined_views")
-    ]
+    blocks = ["shared", "follow", "mixed", "alone", "undetermined", "undetermined_views", "middle", "arm"]
+    assert list(fields) == ["names", "dispersion", *blocks]
     found = dp.Covariance.from_fields(json.loads(json.dumps(fields, allow_nan=False)))
     assert found.names == want.names
     assert torch.equal(found.undetermined, want.undetermined)

@@ -34,7 +34,10 @@ def simulated(lens: str, views: int = 8) -> dp.Calibration:
 def redone(
     calibration: dp.Calibration, view: int, step: torch.Tensor, pixels: torch.Tensor, plane: dp.Plane
 ) -> torch.Tensor:
-    """The points with the camera's parameters and the view's pose moved by a step, by the public back-projection."""
+    """The points with the camera's parameters and the view's pose moved by a step, by the public back-projection.
+
+    The pose turns about the middle of the board.
+    """
     from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
     camera = calibration.cameras[view]
@@ -51,7 +54,9 @@ def redone(
     if lens is not None:
         lens = type(lens)(lens.coefficients + step[4:s])  # type: ignore[attr-defined, call-arg]
     R = axis_angle_to_rotation_matrix(step[None, s : s + 3])[0] @ camera.R
-    points, valid = dp.back_project(pixels, dp.Camera.unchecked(K, R, camera.t + step[s + 3 :], lens, None), plane)
+    middle = BOARD.points.to(D).mean(0)
+    t = camera.t + camera.R @ middle + step[s + 3 :] - R @ middle
+    points, valid = dp.back_project(pixels, dp.Camera.unchecked(K, R, t, lens, None), plane)
     assert valid.all()
     return points
 
