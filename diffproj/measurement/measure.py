@@ -146,10 +146,8 @@ def _at_view(calibration: Calibration, view: int | str) -> tuple[Camera, Tensor 
         raise ValueError(f"view: want one whose pose is known, got {view!r}, of which no corner was used")
     known, middle = None, None
     if calibration.has_covariance:
-        known, middle = (
-            calibration.covariance_of_kept_poses.about_middle.view(number),
-            calibration.covariance_of_kept_poses.middle,
-        )
+        covariance = calibration.covariance_of_kept_poses
+        known, middle = covariance.about_middle.view(number), covariance.middle
     level = None if calibration.pixel_sigma is None else calibration.pixel_sigma.unsqueeze(-1)
     return calibration.cameras[..., number], known, level, middle
 
