@@ -3,7 +3,7 @@
 A view of the plane z = 0 through a camera without distortion is a homography `H ~ K [r1 r2 t]` (Zhang 2000). That r1
 and r2 are orthogonal and of equal length gives two equations per view, linear in `1 / f_x^2` and `1 / f_y^2` once the
 principal point is fixed, here at the centre of the image; Zhang's full system, with the principal point as unknown, is
-more sensitive to lens distortion than it is useful. With K known, the columns of `K^-1 H` are the pose.
+more sensitive to lens distortion than it is useful, but for images that are a part cut out of a larger one. With K known, the columns of `K^-1 H` are the pose.
 
 Where these equations have no plausible solution (parallel views, strong distortion), the focal length is chosen from a
 coarse grid: the one under which the columns of `K^-1 H` are closest to orthonormal.
@@ -142,6 +142,44 @@ def focal_lengths(H: Tensor, principal_point: Tensor, size: float, enough: Tenso
     best = torch.where(plausible & skew.isfinite(), skew, torch.inf).argmin(-1)
     best = torch.where(plausible.any(-1), best, solved_count + FOCAL_SCALE.index(1.0))
     return f[torch.arange(len(f), device=f.device), best] * size
+
+
+def intrinsics(H: Tensor, middle: Tensor, size: float, enough: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Focal lengths and principal point of a camera without lens, by Zhang's full system without skew.
+
+    Args:
+        H: homographies `(P, V, 3, 3)` to pixels.
+        middle: the middle of the image `(P, 2)`, in px.
+        size: the image's longer side in pixels.
+        enough: which views have enough corners `(P, V)`.
+
+    Returns:
+        Focal lengths `(P, 2)`, principal point `(P, 2)`, and whether the system has such a solution `(P,)`.
+    """
+    h1, h2 = _centred_columns(H, middle, size)
+
+    def row(a: Tensor, b: Tensor) -> Tensor:
+        """What `a^T B b` multiplies of (B_11, B_22, B_13, B_23, B_33), for B = K^-T K^-1."""
+        return torch.stack(
+            [
+                a[..., 0] * b[..., 0],
+                a[..., 1] * b[..., 1],
+                a[..., 0] * b[..., 2] + a[..., 2] * b[..., 0],
+                a[..., 1] * b[..., 2] + a[..., 2] * b[..., 1],
+                a[..., 2] * b[..., 2],
+            ],
+            dim=-1,
+        )
+
+    rows = torch.stack([row(h1, h2), row(h1 + h2, h1 - h2) / 2], dim=2)
+    sound = (enough & rows.isfinite().all(-1).all(-1))[..., None, None]
+    A = torch.where(sound, rows, 0.0).flatten(1, 2)
+    B = torch.linalg.eigh(A.mT @ A).eigenvectors[..., 0]
+    c = -B[:, 2:4] / B[:, :2]
+    inverse = B[:, :2] / (B[:, 4:] + (B[:, 2:4] * c).sum(-1, keepdim=True))  # 1 / f^2
+    plausible = (inverse > 0).all(-1) & (inverse < 100).all(-1) & (c.abs() < 20).all(-1)
+    f = torch.where(plausible.unsqueeze(-1), inverse, 1.0).rsqrt()
+    return f * size, middle + torch.where(plausible.unsqueeze(-1), c, 0.0) * size, plausible
 
 
 def poses(H: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:

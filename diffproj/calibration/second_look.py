@@ -91,6 +91,8 @@ def second_look(
         lenses = [straight.part(which)]
         if bool(straight.lam.any()):
             lenses.append(lenses[0].without_lens())
+        if straight.lens == "none":
+            lenses.append(lenses[0].elsewhere(task))
         starts = [start for lens in lenses for start in _starts(task, first, lens)]
         every = torch.arange(len(which), device=which.device).repeat(len(starts))
         shared = torch.cat([shared for shared, _ in starts])

@@ -10,6 +10,7 @@ from diffproj.calibration import closed_form
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import normal_tensors
 from diffproj.calibration.parametrisation import Parametrisation, Pose
+from diffproj.calibration.task import Task
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.intrinsics import check_no_skew
 from diffproj.lens.models import MODELS, LensModel
@@ -56,6 +57,7 @@ class Straightened:
         middle: the middle of the image `(P, 2)`, which stands for the principal point.
         lam: the lens as the one number `(P,)` of the division model; 0 for a fisheye, which is taken as equidistant.
         size: `(width, height)` of the image.
+        aspect: `f_y / f_x` `(P,)`.
     """
 
     model: LensModel
@@ -63,6 +65,7 @@ class Straightened:
     middle: Tensor
     lam: Tensor
     size: tuple[int, int]
+    aspect: Tensor
 
     @property
     def longer(self) -> float:
@@ -86,22 +89,30 @@ class Straightened:
 
     def part(self, which: Tensor) -> "Straightened":
         """That of some of the cameras `(n,)`."""
-        return replace(self, seen=self.seen[which], middle=self.middle[which], lam=self.lam[which])
+        cut = {name: getattr(self, name)[which] for name in ("seen", "middle", "lam", "aspect")}
+        return replace(self, **cut)
 
     def without_lens(self) -> "Straightened":
         """The same with no lens estimated."""
         return replace(self, lam=torch.zeros_like(self.lam))
 
+    def elsewhere(self, task: Task) -> "Straightened":
+        """The same with no lens estimated, and with principal point and ratio of focal lengths by Zhang's equations."""
+        H = closed_form.homographies(task.points, self.seen, task.used)
+        f, middle, _ = closed_form.intrinsics(H, self.middle, self.longer, task.used.any(-1))
+        return replace(self.without_lens(), middle=middle, aspect=f[:, 1] / f[:, 0])
+
     def rays(self, f: Tensor) -> tuple[Tensor, Tensor]:
         """Points `(P, V, N, 2)` of the normalised plane at focal lengths `(P,)`, and which are not too far out."""
         if self.lens == "fisheye":
             return closed_form.equidistant_rays(self.seen, self.middle, f)
-        xy = (self.pixels - self.middle[:, None, None]) / f[:, None, None, None]
+        f = torch.stack([f, f * self.aspect], dim=-1)
+        xy = (self.pixels - self.middle[:, None, None]) / f[:, None, None]
         return xy, torch.ones_like(xy[..., 0], dtype=torch.bool)
 
     def held(self, f: Tensor) -> Tensor:
         """Shared parameters of `lens` at focal lengths `(P, 2)` or `(P,)`: the camera of the straightened corners."""
-        f = f if f.ndim == 2 else f.unsqueeze(-1).expand(-1, 2)
+        f = f if f.ndim == 2 else torch.stack([f, f * self.aspect], dim=-1)
         return torch.cat([f, self.middle, f.new_zeros(len(f), MODELS[self.lens].count)], dim=-1)
 
     def shared(self, f: Tensor, size: int) -> Tensor:
@@ -121,7 +132,8 @@ def from_nothing(
     """Shared parameters and poses to start from, with nothing known but the size of the image."""
     with torch.inference_mode():
         middle = data.pixels.new_tensor([(size[0] - 1) / 2, (size[1] - 1) / 2]).expand(len(data.pixels), 2)
-        straight = Straightened(model, data.pixels, middle, torch.zeros_like(middle[:, 0]), size)
+        zero = torch.zeros_like(middle[:, 0])
+        straight = Straightened(model, data.pixels, middle, zero, size, zero + 1)
         count = Parametrisation(model, bow).size
         if straight.lens == "fisheye":
             shared, pose = _fisheye(data, straight, count, bow)
