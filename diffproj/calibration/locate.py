@@ -59,12 +59,7 @@ def locate(
         known = camera.covariance if camera.has_covariance else None
         camera = camera.camera
     camera = as_camera(camera)
-    if len(camera.batch_shape) > len(data.batch):
-        raise ValueError(
-            f"camera: want a batch shape that broadcasts to {tuple(data.batch)}, got {tuple(camera.batch_shape)}; "
-            "index it, or take calibration.camera"
-        )
-    shared, (R, t), model = start.from_camera(camera, data, bow=False)
+    shared, (R, t), model = start.from_camera(camera, data, bow=False, with_poses=False)
     # Each view is a problem of its own, with a step and an end of its own, from each of its two starts.
     V = len(views)
     single = Task(

@@ -29,8 +29,8 @@ def refine(
         views: corners `(*B, V, N, 2)`.
         target: anything with `.points (N, 3)` on z = 0.
         camera: the start: its lens says which lens is fitted, and fixed parameters keep its values. With a batch shape
-            that broadcasts to `*B`, poses are found from the corners; with `(*B, V)`, its poses are the start, and its
-            intrinsics are those of the first view.
+            that broadcasts to `*B`, poses are found from the corners; with another that broadcasts to `(*B, V)`, its
+            poses are the start, and its intrinsics are those of the first view.
         differentiable: carry gradients through the minimum: those of cameras and bow with respect to the views'
             pixels, the target's points, the weights and tensors among the priors are those of the minimiser (implicit
             function theorem, exact Hessian). To first order.

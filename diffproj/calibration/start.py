@@ -1,6 +1,7 @@
 """The solver's starting point: from a camera that is known roughly, or from nothing but the size of the image."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,38 +11,53 @@ from diffproj.calibration import closed_form
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import normal_tensors
 from diffproj.calibration.parametrisation import Parametrisation, Pose
-from diffproj.geometry.camera import Camera
+from diffproj.geometry.camera import Camera, is_rotation
 from diffproj.geometry.intrinsics import check_no_skew
 from diffproj.lens.models import MODELS, LensModel
 
 
-def from_camera(camera: Camera, data: Data, bow: bool) -> tuple[Tensor, tuple[Tensor, Tensor], LensModel]:
-    """Shared parameters and poses to start from."""
+def from_camera(
+    camera: Camera, data: Data, bow: bool, with_poses: bool = True
+) -> tuple[Tensor, tuple[Tensor, Tensor], LensModel]:
+    """Shared parameters and poses to start from.
+
+    Args:
+        camera: where its batch shape broadcasts to the views' `*B`, it gives intrinsics alone; where it broadcasts to
+            `(*B, V)` instead, poses too, and the intrinsics are those of its first view.
+        data: the views.
+        bow: whether the board's bow is among the parameters.
+        with_poses: whether the camera may bring poses.
+
+    Raises:
+        TypeError: the lens is of another package.
+        ValueError: sizes or shapes do not fit, K has skew, or values that are needed are not a camera's.
+    """
     parameters = Parametrisation.of(camera, bow)
     if None not in (camera.size, data.views.size) and camera.size != data.views.size:
         raise ValueError(
             f"camera: want the size of the photographs, {data.views.size}, got {camera.size}; see resized()"
         )
     camera = camera.detach().to(data.points.device, data.points.dtype)
-    check_no_skew(camera.K)
-    posed = len(camera.batch_shape) == len(data.batch) + 1
-    intrinsics = camera[..., 0] if posed else camera
-    try:
-        if posed:
-            camera = camera.at(camera.R.expand(*data.batch, len(data.views), 3, 3), camera.t)
-        shared = parameters.pack(intrinsics).expand(*data.batch, -1).reshape(-1, parameters.size)
-    except (RuntimeError, ValueError):
-        shape = tuple(camera.batch_shape)
+    batch, V = tuple(data.batch), len(data.views)
+    posed = not _broadcasts(camera.batch_shape, batch)
+    if posed and not (with_poses and _broadcasts(camera.batch_shape, (*batch, V))):
+        ways = f", or to {(*batch, V)} with the poses to start from" if with_poses else ""
+        remedy = "" if with_poses else "; index it, or take calibration.camera"
         raise ValueError(
-            f"camera: want a batch shape that broadcasts to {tuple(data.batch)} or is {(*data.batch, len(data.views))} "
-            f"with the poses to start from, got {shape}"
-        ) from None
-    if posed:
-        return (
-            shared,
-            (camera.R.reshape(-1, len(data.views), 3, 3), camera.t.reshape(-1, len(data.views), 3)),
-            parameters.lens,
+            f"camera: want a batch shape that broadcasts to {batch}{ways}, got {tuple(camera.batch_shape)}{remedy}"
         )
+    intrinsics = camera[..., 0] if posed else camera
+    _check_finite(intrinsics.K)
+    check_no_skew(camera.K)
+    shared = parameters.pack(intrinsics).expand(*batch, -1).reshape(-1, parameters.size)
+    if posed:
+        R, t = camera.R.expand(*batch, V, 3, 3), camera.t.expand(*batch, V, 3)
+        # A view without enough corners takes no part: its pose may be anything.
+        idle = ~data.used.any(-1).reshape(*batch, V, 1)
+        R = torch.where(idle.unsqueeze(-1), torch.eye(3, dtype=R.dtype, device=R.device), R)
+        t = torch.where(idle, t.new_tensor([0.0, 0, 1]), t)
+        _check_poses(R, t, data.views.names)
+        return shared, (R.reshape(-1, V, 3, 3), t.reshape(-1, V, 3)), parameters.lens
     upright = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(*data.used.shape[:2], 3, 3)
     views = parameters.unpack(shared, (upright, torch.zeros_like(upright[..., 0])))
     direction, valid = views.directions(data.pixels)
@@ -49,6 +65,50 @@ def from_camera(camera: Camera, data: Data, bow: bool) -> tuple[Tensor, tuple[Te
     xy = direction[..., :2] / torch.where(ahead, direction[..., 2], 1.0).unsqueeze(-1)
     H = closed_form.homographies(data.points, xy, data.used & ahead)
     return shared, closed_form.poses(H, data.points), parameters.lens
+
+
+def _broadcasts(shape: Sequence[int], to: Sequence[int]) -> bool:
+    """Whether a tensor of that shape expands to the other."""
+    if len(shape) > len(to):
+        return False
+    return all(mine in (1, theirs) for mine, theirs in zip(reversed(shape), reversed(to), strict=False))
+
+
+def _check_finite(K: Tensor) -> None:
+    """Check intrinsics `(*B, 3, 3)` that may come from a calibration that failed.
+
+    Raises:
+        ValueError: they are not finite.
+    """
+    lacking = ~K.isfinite().all(-1).all(-1)
+    if bool(lacking.any()):
+        where = f" in camera {', '.join(map(str, lacking.nonzero()[0].tolist()))}" * bool(lacking.ndim)
+        raise ValueError(
+            f"camera: want finite intrinsics, got NaN or infinity{where}; a calibration that did not converge is no "
+            "start"
+        )
+
+
+def _check_poses(R: Tensor, t: Tensor, names: Sequence[str]) -> None:
+    """Check poses to start from.
+
+    Raises:
+        ValueError: they are not finite, or no rotations.
+    """
+    finite = R.isfinite().all(-1).all(-1) & t.isfinite().all(-1)
+    rotation = is_rotation(R)
+    for sound, want, got in (
+        (finite, "finite poses", "NaN or infinity"),
+        (rotation, "poses with rotation matrices (orthonormal to 1e-5, determinant +1)", "others"),
+    ):
+        if not bool(sound.all()):
+            *camera, view = (~sound).nonzero()[0].tolist()
+            where = f" of camera {', '.join(map(str, camera))}" * bool(camera)
+            raise ValueError(
+                f"camera: want {want} to start from, got {got} for {int((~sound).sum())} of {sound.numel()} views, "
+                f"the first {names[view]!r}{where}; a camera without them, such as calibration.camera, starts from "
+                "the corners alone"
+            )
 
 
 @dataclass(frozen=True, eq=False)

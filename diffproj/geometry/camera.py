@@ -358,11 +358,16 @@ def _pinhole(direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
     return [torch.where(valid, component, 0.0) * inverse_depth for component in (x, y)], valid
 
 
+def is_rotation(R: Float[Tensor, "*shape 3 3"]) -> Bool[Tensor, "*shape"]:
+    """Which matrices are rotations, to `ROTATION_TOLERANCE`."""
+    error = (R.mT @ R - torch.eye(3, dtype=R.dtype, device=R.device)).abs()
+    return (error <= ROTATION_TOLERANCE).all(-1).all(-1) & (torch.linalg.det(R) > 0)
+
+
 def _check_pose(R: Tensor, t: Tensor) -> None:
     if not bool(t.isfinite().all()):
         raise ValueError("t: want finite values, got NaN or infinity")
-    error = (R.mT @ R - torch.eye(3, dtype=R.dtype, device=R.device)).abs()
-    if not bool((error <= ROTATION_TOLERANCE).all() and (torch.linalg.det(R) > 0).all()):
+    if not bool(is_rotation(R).all()):
         raise ValueError(
             "R: want rotation matrices (orthonormal to 1e-5, determinant +1), got others; "
             "kornia's axis_angle_to_rotation_matrix makes them from rotation vectors"
