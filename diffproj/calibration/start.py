@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from diffproj.calibration import closed_form
+from diffproj.calibration import closed_form, given
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import normal_tensors
 from diffproj.calibration.parametrisation import Parametrisation, Pose
-from diffproj.geometry.camera import Camera, is_rotation
+from diffproj.geometry.camera import Camera
 from diffproj.geometry.intrinsics import check_no_skew
 from diffproj.lens.models import MODELS, LensModel
 
@@ -33,10 +33,7 @@ def from_camera(
         ValueError: sizes or shapes do not fit, K has skew, or values that are needed are not a camera's.
     """
     parameters = Parametrisation.of(camera, bow)
-    if None not in (camera.size, data.views.size) and camera.size != data.views.size:
-        raise ValueError(
-            f"camera: want the size of the photographs, {data.views.size}, got {camera.size}; see resized()"
-        )
+    given.check_size(camera.size, data.views.size)
     camera = camera.detach().to(data.points.device, data.points.dtype)
     batch, V = tuple(data.batch), len(data.views)
     posed = not _broadcasts(camera.batch_shape, batch)
@@ -47,16 +44,18 @@ def from_camera(
             f"camera: want a batch shape that broadcasts to {batch}{ways}, got {tuple(camera.batch_shape)}{remedy}"
         )
     intrinsics = camera[..., 0] if posed else camera
-    _check_finite(intrinsics.K)
+    given.check_finite(intrinsics.K)
     check_no_skew(camera.K)
     shared = parameters.pack(intrinsics).expand(*batch, -1).reshape(-1, parameters.size)
+    centers = intrinsics.K[..., :2, 2].expand(*batch, 2).reshape(-1, 2)
+    given.check_resolution(centers, data.pixels, data.used, camera.size, data.views.size)
     if posed:
         R, t = camera.R.expand(*batch, V, 3, 3), camera.t.expand(*batch, V, 3)
         # A view without enough corners takes no part: its pose may be anything.
         idle = ~data.used.any(-1).reshape(*batch, V, 1)
         R = torch.where(idle.unsqueeze(-1), torch.eye(3, dtype=R.dtype, device=R.device), R)
         t = torch.where(idle, t.new_tensor([0.0, 0, 1]), t)
-        _check_poses(R, t, data.views.names)
+        given.check_poses(R, t, data.views.names)
         return shared, (R.reshape(-1, V, 3, 3), t.reshape(-1, V, 3)), parameters.lens
     upright = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(*data.used.shape[:2], 3, 3)
     views = parameters.unpack(shared, (upright, torch.zeros_like(upright[..., 0])))
@@ -72,43 +71,6 @@ def _broadcasts(shape: Sequence[int], to: Sequence[int]) -> bool:
     if len(shape) > len(to):
         return False
     return all(mine in (1, theirs) for mine, theirs in zip(reversed(shape), reversed(to), strict=False))
-
-
-def _check_finite(K: Tensor) -> None:
-    """Check intrinsics `(*B, 3, 3)` that may come from a calibration that failed.
-
-    Raises:
-        ValueError: they are not finite.
-    """
-    lacking = ~K.isfinite().all(-1).all(-1)
-    if bool(lacking.any()):
-        where = f" in camera {', '.join(map(str, lacking.nonzero()[0].tolist()))}" * bool(lacking.ndim)
-        raise ValueError(
-            f"camera: want finite intrinsics, got NaN or infinity{where}; a calibration that did not converge is no "
-            "start"
-        )
-
-
-def _check_poses(R: Tensor, t: Tensor, names: Sequence[str]) -> None:
-    """Check poses to start from.
-
-    Raises:
-        ValueError: they are not finite, or no rotations.
-    """
-    finite = R.isfinite().all(-1).all(-1) & t.isfinite().all(-1)
-    rotation = is_rotation(R)
-    for sound, want, got in (
-        (finite, "finite poses", "NaN or infinity"),
-        (rotation, "poses with rotation matrices (orthonormal to 1e-5, determinant +1)", "others"),
-    ):
-        if not bool(sound.all()):
-            *camera, view = (~sound).nonzero()[0].tolist()
-            where = f" of camera {', '.join(map(str, camera))}" * bool(camera)
-            raise ValueError(
-                f"camera: want {want} to start from, got {got} for {int((~sound).sum())} of {sound.numel()} views, "
-                f"the first {names[view]!r}{where}; a camera without them, such as calibration.camera, starts from "
-                "the corners alone"
-            )
 
 
 @dataclass(frozen=True, eq=False)

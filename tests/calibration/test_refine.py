@@ -84,3 +84,55 @@ def test_the_pose_of_a_view_without_corners_does_not_matter(seen: tuple[dp.Camer
     found = dp.refine(dp.Views(views.pixels, hidden, size=views.size), BOARD, start)
     assert found.converged.all()
     assert found.cameras.t.isfinite().all()
+
+
+# ------------------------------------------------------------------------------------------- another resolution's K
+
+
+def without_size(views: dp.Views) -> dp.Views:
+    return dp.Views(views.pixels, views.visible)
+
+
+@pytest.mark.parametrize("factor", [1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0])
+def test_intrinsics_of_another_resolution_are_warned_of(factor: float) -> None:
+    views = dp.example_views("left")
+    other = dp.Camera(K * torch.tensor([[factor], [factor], [1.0]], dtype=D))
+    with pytest.warns(UserWarning, match=r"camera: its principal point .* photographs of 640 x 480 px, as if"):
+        dp.locate(views, BOARD, other, throw=False)
+    if factor in (1 / 3, 2.0):  # otherwise corners alone do not tell
+        for act in (dp.locate, dp.refine):
+            with pytest.warns(UserWarning, match=r"corners from \(\d+, \d+\) to \(\d+, \d+\), as if K were"):
+                act(without_size(views), BOARD, other, throw=False)
+
+
+@pytest.mark.plain
+def test_the_warning_points_at_the_caller() -> None:
+    half = dp.Camera(K * torch.tensor([[0.5], [0.5], [1.0]], dtype=D))
+    for act in (dp.locate, dp.refine):
+        with pytest.warns(UserWarning, match="principal point") as seen:
+            act(dp.example_views("left"), BOARD, half, throw=False)
+        assert [warning.filename for warning in seen] == [__file__]
+
+
+def test_plausible_intrinsics_are_not_warned_of(seen: tuple[dp.Camera, dp.Views]) -> None:
+    truth, views = seen
+    for off in ((0, 0), (50, -40), (-60, 45)):
+        moved = K + torch.tensor([[0.0, 0, off[0]], [0, 0, off[1]], [0, 0, 0]], dtype=D)
+        for given in (views, without_size(views)):
+            dp.locate(given, BOARD, dp.Camera(moved, distortion=truth.distortion[0, 0]))
+    # One view of a board in a corner of the image, part of a photograph, and points of the normalised plane.
+    camera = dp.Camera(K)
+    corner = camera.at(torch.eye(3, dtype=D), torch.tensor([-300.0, -250, 700], dtype=D))
+    alone = synthetic.corner_views(corner.expand(1), dp.Chessboard(4, 4, 20.0))
+    dp.locate(alone, dp.Chessboard(4, 4, 20.0), camera)
+    part = dp.Views(views.pixels - 200)
+    dp.locate(part, BOARD, dp.Camera(camera.cropped(200, 200, 440, 280).K, distortion=truth.distortion[0, 0]))
+    xy = truth.directions(views.pixels)[0]
+    dp.locate(dp.Views(xy[..., :2] / xy[..., 2:]), BOARD, dp.Camera(torch.eye(3, dtype=D)))
+
+
+def test_corners_outside_the_cameras_image_are_refused(seen: tuple[dp.Camera, dp.Views]) -> None:
+    _, views = seen
+    small = dp.Camera(K, size=(640, 480)).resized((320, 240))
+    with pytest.raises(ValueError, match="camera: want that of the photographs, got one of 320 x 240 px, and corners"):
+        dp.locate(without_size(views), BOARD, small)
