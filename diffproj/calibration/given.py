@@ -1,10 +1,10 @@
 """A camera that is handed to `refine` or `locate`, looked at: values, poses, and whether it is of these photographs."""
 
-import warnings
 from collections.abc import Sequence
 
 from torch import Tensor
 
+from diffproj._core.warn import warn_caller
 from diffproj.geometry.camera import is_rotation
 
 Size = tuple[int, int] | None
@@ -107,8 +107,7 @@ def check_resolution(center: Tensor, pixels: Tensor, used: Tensor, size: Size, o
     seen = f"corners from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f})"
     if of_photographs is not None:
         seen = f"photographs of {of_photographs[0]} x {of_photographs[1]} px"
-    warnings.warn(
+    warn_caller(
         f"camera: its principal point ({c_x:.0f}, {c_y:.0f}) is not near the middle of {seen}, as if K were that of "
         "another resolution; give Camera(..., size=(width, height)), and resized() where it is another",
-        stacklevel=4,
     )

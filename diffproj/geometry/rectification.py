@@ -24,6 +24,7 @@ from torch.nn.functional import grid_sample
 from diffproj._core.numerics import BLOCK_POINTS, broadcast_batches, check_tensor
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.float32 import warn_if_rounded
 from diffproj.geometry.grid import checked_size, inside, pixel_grid
 from diffproj.geometry.plane import Plane
 
@@ -100,6 +101,7 @@ def rectify(
     plane = plane.like(camera.K)
     origin, along_s, along_t = axes or plane_axes(plane)
     broadcast_batches(image=image.shape[:-3], camera=camera.batch_shape, plane=plane.batch_shape)
+    warn_if_rounded(camera, plane)
     H, W = image.shape[-2:]
     low, unit = _corner_and_pixel(extent, (rows, columns), camera.K)
 

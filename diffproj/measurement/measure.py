@@ -29,6 +29,7 @@ from diffproj.calibration.parametrisation import Parametrisation, moved
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.float32 import warn_if_rounded
 from diffproj.geometry.plane import Plane
 
 SIGNIFICANT = 3.0
@@ -246,6 +247,7 @@ def measure(
     if pixel_sigma is None and level is None:
         source = "this calibration" if isinstance(calibration, Calibration) else "a camera alone"
         raise ValueError(f"pixel_sigma: want the noise of the pixels, for {source} does not know it")
+    warn_if_rounded(camera, plane)
     camera, plane = camera.to(torch.float64), plane.to(torch.float64)
     points, valid = back_project(pixels, camera, plane)
     batch = points.shape[:-2]
