@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.numerics import in_float64
+from diffproj._core.numerics import in_float64, rounding
 
 
 def intrinsic_matrix(
@@ -30,6 +30,26 @@ def pixel_to_normalized(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch
     a, b, c, d = K[..., :2, :2].flatten(-2).unbind(-1)
     determinant = torch.addcmul(a * d, b, c, value=-1)
     return (torch.stack([d, -b, -c, a], dim=-1) / determinant.unsqueeze(-1)).unflatten(-1, (2, 2))
+
+
+def upright(
+    K: Float[Tensor, "*batch 3 3"],
+) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """An upper triangular K and the turn of the image that it leaves out: `F = F_upper q`, q a rotation.
+
+    Returns:
+        `K_upper (*B, 3, 3)`, with positive focal lengths unless the image is mirrored, and cosine and sine of the angle
+        that q turns by, from x towards y `(*B,)`. A turn by a right angle that rounding has spoilt is one again.
+    """
+    a, b, c, d = K[..., :2, :2].flatten(-2).unbind(-1)
+    mirrored = a * d < b * c
+    f_y = torch.hypot(c, d) * torch.where(mirrored & (d < 0), -1.0, 1.0)
+    cosine, sine = d / f_y, c / f_y
+    f_x, skew = a * cosine - b * sine, a * sine + b * cosine
+    skew = torch.where(skew.abs() <= rounding(K.dtype) * (f_x.abs() + f_y.abs()), 0.0, skew)
+    zero = torch.zeros_like(f_x)
+    F = torch.stack([f_x, skew, zero, f_y], dim=-1).unflatten(-1, (2, 2))
+    return torch.cat([torch.cat([F, K[..., :2, 2:]], dim=-1), K[..., 2:, :]], dim=-2), cosine, sine
 
 
 def warped(
