@@ -10,6 +10,7 @@ from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.options import LocateOptions, locate_options
 from diffproj.calibration.outcome import outcome
+from diffproj.calibration.parametrisation import SKEW
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.solver import Solution, Status, select
 from diffproj.calibration.task import Task
@@ -34,12 +35,14 @@ def locate(
         options: `weights`, `loss`, `max_iterations`, `tolerance`, `progress` and `throw`: see `LocateOptions`.
 
     Returns:
-        A calibration with the given intrinsics and the poses found, in float64. Its covariance holds the noise of the
-        corners; and, where a calibration with a covariance was given, that of the intrinsics, which the poses follow.
+        A calibration with the given intrinsics and the poses found, in float64; where the image is turned, with those
+        of the camera that is turned itself, which sees the same (`Camera.upright`). Its covariance holds the noise of
+        the corners; and, where a calibration with a covariance was given, that of the intrinsics, which the poses
+        follow.
 
     Raises:
         TypeError: views are no `dp.Views`, the camera has a lens of another library, or an option is unknown.
-        ValueError: views, target and camera do not fit together, or K has skew.
+        ValueError: views, target and camera do not fit together, or the image is turned against a tilted sensor.
         CalibrationError: no pose explains a view.
 
     Example:
@@ -59,14 +62,16 @@ def locate(
         known = camera.covariance if camera.has_covariance else None
         camera = camera.camera
     camera = as_camera(camera)
-    shared, (R, t), model = start.from_camera(camera, data, bow=False, with_poses=False)
+    skew = known is not None and SKEW in known.names
+    shared, (R, t), parameters = start.from_camera(camera, data, bow=False, skew=skew, with_poses=False)
     # Each view is a problem of its own, with a step and an end of its own, from each of its two starts.
     V = len(views)
     single = Task(
         data.points,
         data.pixels.flatten(0, 1).unsqueeze(1),
         data.used.flatten(0, 1).unsqueeze(1),
-        model,
+        parameters.lens,
+        skew=parameters.skew,
         weights=None if data.weights is None else data.weights.flatten(0, 1).unsqueeze(1),
         loss=loss,
         basis=shared.new_zeros(len(shared) * V, shared.shape[-1], 0),
@@ -88,7 +93,7 @@ def locate(
         one.cost.isfinite(), one.cost, torch.inf
     )
     best = select(better.numpy(force=True), other, one)
-    task = data.task(model, loss=loss, basis=shared.new_zeros(*shared.shape, 0))
+    task = data.task(parameters.lens, skew=parameters.skew, loss=loss, basis=shared.new_zeros(*shared.shape, 0))
     seen = data.used.any(-1)
     status = torch.where(seen, best.status.reshape(seen.shape), Status.CONVERGED)
     equations = best.equations

@@ -11,36 +11,37 @@ from diffproj.calibration.covariance import Covariance, reshaped
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.options import Options
-from diffproj.calibration.parametrisation import Parametrisation
+from diffproj.calibration.parametrisation import SKEW, Parametrisation
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Prior, Status
 from diffproj.calibration.verdict import verdicts
 from diffproj.geometry.camera import Camera
-from diffproj.lens.models import LensModel
 
 
 def minimised(
     data: Data,
     options: Options,
-    model: LensModel,
+    parameters: Parametrisation,
     shared: Tensor,
     local: tuple[Tensor, ...],
     reference: Tensor,
 ) -> tuple[Fit, Prior | None]:
     """Where the solver ends from that start, and the prior with its graph.
 
-    `reference (P, s)` is what fixed parameters keep and priors without a mean are about; NaN where nothing is known.
+    Skew that is not to be fitted is held. `reference (P, s)` is what fixed parameters keep and priors without a mean
+    are about; NaN where nothing is known.
     """
-    parameters = Parametrisation(model, options.bow)
+    fixed = options.fixed if options.skew or not parameters.skew else (*options.fixed, SKEW)
     steps = {name: getattr(options, name) for name in ("max_iterations", "tolerance", "progress")}
     prior = make_prior(options.priors, reference, parameters, data.batch)
-    shared = held_at(reference, shared, parameters, options.fixed)
+    shared = held_at(reference, shared, parameters, fixed)
     task = data.task(
-        model,
-        bow=options.bow,
+        parameters.lens,
+        bow=parameters.bow,
+        skew=parameters.skew,
         loss=options.loss,
         prior=None if prior is None else Prior(prior.mean.detach(), prior.precision.detach()),
-        basis=free_basis(shared, parameters, options.fixed, options.tied_focal),
+        basis=free_basis(shared, parameters, fixed, options.tied_focal),
     )
     if options.objective == "plane":
         # From a rough start a pixel may miss the board; the image objective bears that.
@@ -91,6 +92,7 @@ def outcome(
         task.objective,
         causes,
         shaped(found.pixel_sigma()),
+        task.skew,
         partial(_covariance, found, tuple(batch), known),
     )
     if throw and bool((status != Status.CONVERGED).any()):

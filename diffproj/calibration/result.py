@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffproj.calibration.bow import bowed
 from diffproj.calibration.covariance import Covariance
-from diffproj.calibration.parametrisation import BOW, Parametrisation
+from diffproj.calibration.parametrisation import BOW, SKEW, Parametrisation
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
 from diffproj.targets.residuals import projected_minus_seen
@@ -62,6 +62,7 @@ class Calibration:
         causes: for each camera that did not converge, the cause in words; `*B` flattened.
         pixel_sigma: the standard deviation of a corner's coordinate in pixels, as the residuals tell it `(*B,)`: their
             root mean square over the degrees of freedom; under a robust loss, 1.4826 times their median.
+        skew: whether the skew of K is among the parameters: it was fitted, or K had some that was held.
     """
 
     camera: Camera
@@ -76,6 +77,7 @@ class Calibration:
     objective: Objective = "image"
     causes: tuple[str, ...] = ()
     pixel_sigma: Float[Tensor, "*batch"] | None = None
+    skew: bool = False
     _covariance: Callable[[], Covariance] | None = None
 
     @property
@@ -88,7 +90,7 @@ class Calibration:
     @property
     def parameters(self) -> Parametrisation:
         """The names and the order of the shared parameters."""
-        return Parametrisation.of(self.camera, self.bow is not None)
+        return Parametrisation.of(self.camera, self.bow is not None, self.skew)
 
     @property
     def shared(self) -> Float[Tensor, "*batch s"]:
@@ -183,6 +185,8 @@ class Calibration:
             line("principal point", ("c_x", "c_y"), "10.3f", " px"),
             *(line(f"lens {name}", (name,), "10.5f", "") for name in self.parameters.coefficient_names),
         ]
+        if self.parameters.skew:
+            lines.append(line("skew", (SKEW,), "10.3f", " px"))
         if self.bow is not None:
             lines.append(line("bow along x, y", BOW, "10.4f", " world units"))
         lines.append(f"{'RMS':<16}{self.rms.item():10.4f} px over {int(self.used.sum())} corners")

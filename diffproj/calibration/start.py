@@ -12,27 +12,30 @@ from diffproj.calibration.data import Data
 from diffproj.calibration.fit import normal_tensors
 from diffproj.calibration.parametrisation import Parametrisation, Pose
 from diffproj.geometry.camera import Camera
-from diffproj.geometry.intrinsics import check_no_skew
-from diffproj.lens.models import MODELS, LensModel
+from diffproj.lens.models import MODELS, LensModel, model_of
 
 
 def from_camera(
-    camera: Camera, data: Data, bow: bool, with_poses: bool = True
-) -> tuple[Tensor, tuple[Tensor, Tensor], LensModel]:
-    """Shared parameters and poses to start from.
+    camera: Camera, data: Data, bow: bool, skew: bool = False, with_poses: bool = True
+) -> tuple[Tensor, tuple[Tensor, Tensor], Parametrisation]:
+    """Shared parameters and poses to start from, and which parameters they are.
+
+    A camera whose image is turned is replaced by the one that is turned itself, and sees the same.
 
     Args:
         camera: where its batch shape broadcasts to the views' `*B`, it gives intrinsics alone; where it broadcasts to
             `(*B, V)` instead, poses too, and the intrinsics are those of its first view.
         data: the views.
         bow: whether the board's bow is among the parameters.
+        skew: whether the skew is, even where K has none.
         with_poses: whether the camera may bring poses.
 
     Raises:
         TypeError: the lens is of another package.
-        ValueError: sizes or shapes do not fit, K has skew, or values that are needed are not a camera's.
+        ValueError: sizes or shapes do not fit, the image is turned against a tilted sensor, or values that are needed
+            are not a camera's.
     """
-    parameters = Parametrisation.of(camera, bow)
+    model_of(camera.distortion)
     given.check_size(camera.size, data.views.size)
     camera = camera.detach().to(data.points.device, data.points.dtype)
     batch, V = tuple(data.batch), len(data.views)
@@ -45,7 +48,10 @@ def from_camera(
         )
     intrinsics = camera[..., 0] if posed else camera
     given.check_finite(intrinsics.K)
-    check_no_skew(camera.K)
+    if bool((camera.K[..., 1, 0] != 0).any()) or bool((camera.K[..., [0, 1], [0, 1]] < 0).all(-1).any()):
+        camera = camera.upright()
+        intrinsics = camera[..., 0] if posed else camera
+    parameters = Parametrisation.of(intrinsics, bow, skew)
     shared = parameters.pack(intrinsics).expand(*batch, -1).reshape(-1, parameters.size)
     centers = intrinsics.K[..., :2, 2].expand(*batch, 2).reshape(-1, 2)
     given.check_resolution(centers, data.pixels, data.used, camera.size, data.views.size)
@@ -56,14 +62,14 @@ def from_camera(
         R = torch.where(idle.unsqueeze(-1), torch.eye(3, dtype=R.dtype, device=R.device), R)
         t = torch.where(idle, t.new_tensor([0.0, 0, 1]), t)
         given.check_poses(R, t, data.views.names)
-        return shared, (R.reshape(-1, V, 3, 3), t.reshape(-1, V, 3)), parameters.lens
+        return shared, (R.reshape(-1, V, 3, 3), t.reshape(-1, V, 3)), parameters
     upright = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(*data.used.shape[:2], 3, 3)
     views = parameters.unpack(shared, (upright, torch.zeros_like(upright[..., 0])))
     direction, valid = views.directions(data.pixels)
     ahead = valid & (direction[..., 2] > 0.25 * direction.norm(dim=-1))
     xy = direction[..., :2] / torch.where(ahead, direction[..., 2], 1.0).unsqueeze(-1)
     H = closed_form.homographies(data.points, xy, data.used & ahead)
-    return shared, closed_form.poses(H, data.points), parameters.lens
+    return shared, closed_form.poses(H, data.points), parameters
 
 
 def _broadcasts(shape: Sequence[int], to: Sequence[int]) -> bool:
@@ -143,15 +149,15 @@ class Straightened:
 
 
 def from_nothing(
-    data: Data, model: LensModel, size: tuple[int, int], tied: bool, bow: bool
+    data: Data, size: tuple[int, int], tied: bool, parameters: Parametrisation
 ) -> tuple[Tensor, Pose, Straightened]:
     """Shared parameters and poses to start from, with nothing known but the size of the image."""
     with torch.inference_mode():
         middle = data.pixels.new_tensor([(size[0] - 1) / 2, (size[1] - 1) / 2]).expand(len(data.pixels), 2)
-        straight = Straightened(model, data.pixels, middle, torch.zeros_like(middle[:, 0]), size)
-        count = Parametrisation(model, bow).size
+        straight = Straightened(parameters.lens, data.pixels, middle, torch.zeros_like(middle[:, 0]), size)
+        count = parameters.size
         if straight.lens == "fisheye":
-            shared, pose = _fisheye(data, straight, count, bow)
+            shared, pose = _fisheye(data, straight, parameters)
         else:
             shared, pose, straight = _perspective(data, straight, count, tied)
     return (*normal_tensors((shared, pose)), straight)
@@ -171,15 +177,15 @@ def _perspective(data: Data, straight: Straightened, count: int, tied: bool) -> 
     return straight.shared(f, count), pose, straight
 
 
-def _fisheye(data: Data, straight: Straightened, count: int, bow: bool) -> tuple[Tensor, Pose]:
+def _fisheye(data: Data, straight: Straightened, parameters: Parametrisation) -> tuple[Tensor, Pose]:
     """Of equidistant lenses with several focal lengths, the one whose poses explain the corners best."""
-    problem = data.task("fisheye", bow=bow).problem
+    problem = data.task("fisheye", bow=parameters.bow, skew=parameters.skew).problem
     tries = []
     for scale in closed_form.FISHEYE_SCALE:
         f = straight.middle.new_full((len(straight.middle),), scale * straight.longer / torch.pi)
         xy, inside = straight.rays(f)
         pose = closed_form.poses(closed_form.homographies(data.points, xy, data.used & inside), data.points)
-        shared = straight.shared(f, count)
+        shared = straight.shared(f, parameters.size)
         cost = problem.linearise(shared, pose)[:, :, -1].square().sum((1, 2, 3))
         tries.append((torch.where(cost.isfinite(), cost, torch.inf), shared, *pose))
     costs, *starts = (torch.stack(parts) for parts in zip(*tries, strict=True))

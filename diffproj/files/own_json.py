@@ -86,6 +86,7 @@ def read_calibration(path: Path) -> Calibration | None:
             found["objective"],
             tuple(found["causes"]),
             None if found["pixel_sigma"] is None else _tensor(_with_nan(found["pixel_sigma"]), torch.float64),
+            found.get("skew", False),
             None if covariance is None else partial(_same, covariance),
         )
     except (KeyError, TypeError, ValueError) as error:
@@ -114,6 +115,7 @@ def _calibration_fields(item: Calibration) -> dict[str, Any]:
         "status": item.status.tolist(),
         "iterations": item.iterations.tolist(),
         "objective": item.objective,
+        "skew": item.skew,
         "bow": None if item.bow is None else item.bow.tolist(),
         "R": item.cameras.R.tolist(),
         "t": item.cameras.t.tolist(),

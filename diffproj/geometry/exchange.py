@@ -73,7 +73,8 @@ class Exchange:
         The focal lengths are positive unless the image is mirrored. Where the image is not turned, the same numbers.
 
         Raises:
-            ValueError: another library's lens, or a tilted sensor's image that is turned by other than half turns, or
+            TypeError: a lens of another package.
+            ValueError: a tilted sensor's image that is turned by other than half turns, or
                 quarter turns where it is tilted about one axis only: no coefficients describe it.
 
         Example:
@@ -88,7 +89,7 @@ class Exchange:
         lens = self.distortion
         if lens is not None:
             if not isinstance(lens, CoefficientLens):
-                raise ValueError(f"distortion: want a lens of diffproj to turn, got {type(lens).__name__}")
+                raise TypeError(f"distortion: want a lens of diffproj to turn, got {type(lens).__name__}")
             lens, exact = lens.turned(cosine, sine)
             if has_values(exact) and not bool(exact.all()):
                 raise ValueError(

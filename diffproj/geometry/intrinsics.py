@@ -12,16 +12,17 @@ from diffproj._core.numerics import in_float64, rounding
 
 
 def intrinsic_matrix(
-    focal: Float[Tensor, "*batch 2"], center: Float[Tensor, "*batch 2"]
+    focal: Float[Tensor, "*batch 2"], center: Float[Tensor, "*batch 2"], skew: Float[Tensor, "*batch"] | None = None
 ) -> Float[Tensor, "*batch 3 3"]:
-    """K from focal lengths and principal point, in px."""
+    """K from focal lengths, principal point and skew, in px."""
     (f_x, f_y), (c_x, c_y) = focal.unbind(-1), center.unbind(-1)
     zero, one = torch.zeros_like(f_x), torch.ones_like(f_x)
-    return torch.stack([f_x, zero, c_x, zero, f_y, c_y, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
+    row = [f_x, zero if skew is None else skew, c_x]
+    return torch.stack([*row, zero, f_y, c_y, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
 
 
 def focal_and_center(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """`f_x f_y c_x c_y` from a K without skew: the inverse of `intrinsic_matrix`."""
+    """`f_x f_y c_x c_y` from an upper triangular K: the inverse of `intrinsic_matrix`, but for the skew."""
     return torch.cat([K.diagonal(dim1=-2, dim2=-1)[..., :2], K[..., :2, 2]], dim=-1)
 
 
@@ -104,16 +105,6 @@ def check_intrinsics(K: Tensor) -> None:
     determinant = F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0]
     if bool((determinant.abs() <= 8 * torch.finfo(K.dtype).eps * F.square().sum(dim=(-2, -1))).any()):
         raise ValueError("K: want an invertible matrix, got a singular one; are both focal lengths set?")
-
-
-def check_no_skew(K: Tensor) -> None:
-    """Check that F is diagonal, so that f_x, f_y, c_x and c_y represent K completely.
-
-    Raises:
-        ValueError: F is not diagonal.
-    """
-    if bool((K[..., 0, 1] != 0).any() or (K[..., 1, 0] != 0).any()):
-        raise ValueError("camera: want no skew, got K[..., 0, 1] or K[..., 1, 0] other than 0")
 
 
 def check_warp(matrix: Tensor, K: Tensor, behind_lens: bool) -> None:

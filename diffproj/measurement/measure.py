@@ -16,7 +16,7 @@ small beside the distance. The covariance of all pairs of points is computed onl
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -242,8 +242,10 @@ def measure(
     pixels = in_float64(check_tensor("pixels", pixels, "N", 2))
     if isinstance(calibration, Calibration):
         camera, known, level = _at_view(calibration, view)
+        parameters = replace(calibration.parameters, bow=False)
     else:
-        camera, known, level = as_camera(calibration), None, None
+        camera, known, level = as_camera(calibration).upright(), None, None
+        parameters = Parametrisation.of(camera)
     if pixel_sigma is None and level is None:
         source = "this calibration" if isinstance(calibration, Calibration) else "a camera alone"
         raise ValueError(f"pixel_sigma: want the noise of the pixels, for {source} does not know it")
@@ -252,7 +254,7 @@ def measure(
     points, valid = back_project(pixels, camera, plane)
     batch = points.shape[:-2]
     sigma = _expanded(level if pixel_sigma is None else pixel_sigma, like=points)
-    by_theta, by_point = _projection_derivatives(points, camera, known)
+    by_theta, by_point = _projection_derivatives(points, camera, parameters, known)
     tangents = plane.tangents()
     T = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)  # (*B, N, 3, 2)
     D = torch.where(valid[..., None, None], T @ _inverse2(by_point @ T), 0.0)
@@ -315,10 +317,11 @@ def _expanded(pixel_sigma: float | Tensor | None, like: Tensor) -> Tensor:
     return sigma
 
 
-def _projection_derivatives(points: Tensor, camera: Camera, known: Tensor | None) -> tuple[Tensor, Tensor]:
+def _projection_derivatives(
+    points: Tensor, camera: Camera, parameters: Parametrisation, known: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """Derivatives of the pixels by theta `(*B, N, 2, s + 6)` (bow excluded: 0) and by the point `(*B, N, 2, 3)`."""
     batch = points.shape[:-2]
-    parameters = Parametrisation.of(camera)
     s = parameters.size
     shared = parameters.pack(camera).expand(*batch, s).reshape(-1, s)
     R, t = camera.R.expand(*batch, 3, 3).reshape(-1, 1, 3, 3), camera.t.expand(*batch, 3).reshape(-1, 1, 3)
