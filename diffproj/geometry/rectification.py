@@ -184,7 +184,7 @@ def _resampled(
     with torch.no_grad():
         places, valid = look_up((corners + 0.5).reshape(-1, 2))
         shown = (valid & inside(places, size)).unflatten(-1, shape)
-        right, down = _supersampling(places.unflatten(-2, shape), shown)
+        right, down = (_samples(look_up, corners, places.unflatten(-2, shape), shown, axis) for axis in (-1, -2))
     # A target may reach far beyond the source: only the part about what is shown is sampled.
     (top, bottom), (left, end) = (_range_of(shown.transpose(-1, axis).flatten(0, -2).any(0)) for axis in (-2, -1))
     corners = corners[top:bottom, left:end]
@@ -208,23 +208,27 @@ def _range_of(lines: Tensor) -> tuple[int, int]:
     return (max(0, int(where[0]) - 1), min(len(lines), int(where[-1]) + 2)) if len(where) else (0, len(lines))
 
 
-def _supersampling(places: Tensor, shown: Tensor) -> tuple[int, int]:
-    """Samples of a pixel `(to the right, down)`, as many as its footprint in the source has pixels along that side.
+def _samples(look_up: LookUp, corners: Tensor, places: Tensor, shown: Tensor, axis: int) -> int:
+    """Samples along a pixel's side, as many as its footprint in the source has pixels, at most `MAX_SUPERSAMPLING`.
 
-    The footprint is the 90th percentile over the target's pixels that are shown. From a footprint of `n + 1/4` pixels
-    on there are n + 1 samples, at most `MAX_SUPERSAMPLING`.
+    The footprint is the 90th percentile over the target's pixels that are shown, from neighbour to neighbour, or, where
+    there are none, from edge to edge. From a footprint of `n + 1/4` pixels on there are n + 1 samples.
 
     Args:
-        places: of the target's pixels in the source `(*B, rows, columns, 2)`.
-        shown: which of them lie in the source `(*B, rows, columns)`.
+        look_up: where places of the target are in the source.
+        corners: of the target's pixels `(rows, columns, 2)`.
+        places: of their middles in the source `(*B, rows, columns, 2)`.
+        shown: which of these lie in the source `(*B, rows, columns)`.
+        axis: along which: -1 to the right, -2 down.
     """
-    counts = []
-    for axis in (-1, -2):
-        step, pairs = places.diff(dim=axis - 1).norm(dim=-1), shown.shape[axis] - 1
-        step = step[shown.narrow(axis, 0, pairs) & shown.narrow(axis, 1, pairs)]
-        footprint = float(step[:: 1 + len(step) // 100_000].quantile(0.9)) if len(step) else 1.0
-        counts.append(min(MAX_SUPERSAMPLING, max(1, math.ceil(footprint - 0.25))))
-    return counts[0], counts[1]
+    step, pairs = places.diff(dim=axis - 1).norm(dim=-1), shown.shape[axis] - 1
+    step = step[shown.narrow(axis, 0, pairs) & shown.narrow(axis, 1, pairs)]
+    if len(step) == 0:
+        half = corners.new_tensor([0.5, 0.0] if axis == -1 else [0.0, 0.5])
+        (first, seen), (last, too) = (look_up((corners + 0.5 + side * half).reshape(-1, 2)) for side in (-1, 1))
+        step = (last - first).norm(dim=-1)[seen & too & shown.flatten(-2)]
+    footprint = float(step[:: 1 + len(step) // 100_000].quantile(0.9)) if len(step) else 1.0
+    return min(MAX_SUPERSAMPLING, max(1, math.ceil(footprint - 0.25)))
 
 
 def _sampled(

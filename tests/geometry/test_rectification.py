@@ -102,6 +102,16 @@ def test_a_pixel_of_a_coarse_view_that_cuts_pixels(side: float, share: float) ->
     assert (top[0] - want).square().mean().sqrt() < share * want.std()
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 1)])
+def test_views_of_a_single_row_or_column_do_not_alias(shape: tuple[int, int]) -> None:
+    rows, columns = shape
+    image = torch.rand(1, 40 * rows, 40 * columns, dtype=D)
+    extent = (-20 * columns, -20 * rows, 20 * columns, 20 * rows)
+    top, valid = dp.rectify(image, facing(40 * columns, 40 * rows), dp.Plane.z(0.0), extent, 40.0)
+    assert valid.all()
+    assert (top - torch.nn.functional.avg_pool2d(image, 40)).abs().max() < 1e-9
+
+
 def test_footprints_are_measured_along_each_side() -> None:
     """Pixels 40 px wide and 1 px high take the mean over their width only."""
     image = torch.rand(1, 60, 400, dtype=D)
