@@ -12,6 +12,7 @@ from diffproj.calibration import start
 from diffproj.calibration.data import Data
 from diffproj.calibration.options import CalibrationOptions, calibration_options
 from diffproj.calibration.outcome import minimised, outcome
+from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.second_look import second_look
 from diffproj.lens.models import LensModel, model_named
@@ -30,7 +31,7 @@ def calibrate(
         target: anything with `.points (N, 3)` on z = 0, such as `Chessboard`; its unit is the world's.
         distortion: which lens to fit: `"none"`, `"brown4"`, `"brown5"`, `"brown8"`, `"brown12"`, `"brown14"` or
             `"fisheye"`.
-        options: `objective`, `bow`, `fixed`, `tied_focal`, `priors`, `weights`, `loss`, `reject_outliers`,
+        options: `objective`, `bow`, `skew`, `fixed`, `tied_focal`, `priors`, `weights`, `loss`, `reject_outliers`,
             `max_iterations`, `tolerance`, `progress` and `throw`: see `CalibrationOptions`.
 
     Returns:
@@ -52,7 +53,8 @@ def calibrate(
     data = Data(views, target, chosen.weights)
     if views.size is None:
         raise ValueError("views: want the photographs' size, got None; give Views(..., size=(width, height))")
-    shared, local, straight = start.from_nothing(data, distortion, views.size, chosen.tied_focal, chosen.bow)
+    parameters = Parametrisation(distortion, chosen.bow, chosen.skew)
+    shared, local, straight = start.from_nothing(data, views.size, chosen.tied_focal, parameters)
     # The start is a guess from the corners; what is held, or known, is not.
     reference = shared.clone()
     reference[:, :2], reference[:, 4:] = torch.nan, 0.0
@@ -64,9 +66,9 @@ def calibrate(
             reject_outliers=False,
             loss=None if chosen.objective == "plane" else chosen.loss,  # its scale is in world units
         )
-        near, _ = minimised(data, early, distortion, shared, local, reference)
+        near, _ = minimised(data, early, parameters, shared, local, reference)
         shared, local = near.solution.shared, near.solution.local
-    found, _ = minimised(data, chosen, distortion, shared, local, reference)
+    found, _ = minimised(data, chosen, parameters, shared, local, reference)
     limits = {"max_iterations": chosen.max_iterations, "tolerance": chosen.tolerance}
     found = second_look(found, straight, reject=chosen.outlier_limit, **limits)
     return outcome("calibrate", data, found, views.size, chosen.throw)

@@ -44,12 +44,14 @@ def locate(
         options: `weights`, `loss`, `max_iterations`, `tolerance`, `progress` and `throw`: see `LocateOptions`.
 
     Returns:
-        A calibration with the given intrinsics and the poses found, in float64. Its covariance holds the noise of the
-        corners; and, where a calibration with a covariance was given, that of the intrinsics, which the poses follow.
+        A calibration with the given intrinsics and the poses found, in float64; where the image is turned, with those
+        of the camera that is turned itself, which sees the same (`Camera.upright`). Its covariance holds the noise of
+        the corners; and, where a calibration with a covariance was given, that of the intrinsics, which the poses
+        follow.
 
     Raises:
         TypeError: views are no `dp.Views`, the camera has a lens of another library, or an option is unknown.
-        ValueError: views, target and camera do not fit together, or K has skew.
+        ValueError: views, target and camera do not fit together, or the image is turned against a tilted sensor.
         CalibrationError: no pose explains a view.
 
     Example:
@@ -78,19 +80,16 @@ def located(
     if isinstance(camera, Calibration):
         camera = camera.camera
     camera = as_camera(camera)
-    if len(camera.batch_shape) > len(data.batch):
-        raise ValueError(
-            f"camera: want a batch shape that broadcasts to {tuple(data.batch)}, got {tuple(camera.batch_shape)}; "
-            "index it, or take calibration.camera"
-        )
-    shared, (R, t), model = start.from_camera(camera, data, bow=False)
+    skew = calibration is not None and calibration.skew
+    shared, (R, t), parameters = start.from_camera(camera, data, bow=False, skew=skew, with_poses=False)
     # Each view is a problem of its own, with a step and an end of its own, from each of its two starts.
     V = len(views)
     single = Task(
         data.points,
         data.pixels.flatten(0, 1).unsqueeze(1),
         data.used.flatten(0, 1).unsqueeze(1),
-        model,
+        parameters.lens,
+        skew=parameters.skew,
         weights=None if data.weights is None else data.weights.flatten(0, 1).unsqueeze(1),
         loss=loss,
         basis=shared.new_zeros(len(shared) * V, shared.shape[-1], 0),
@@ -112,7 +111,7 @@ def located(
         one.cost.isfinite(), one.cost, torch.inf
     )
     best = select(better.numpy(force=True), other, one)
-    task = data.task(model, loss=loss, basis=shared.new_zeros(*shared.shape, 0))
+    task = data.task(parameters.lens, skew=parameters.skew, loss=loss, basis=shared.new_zeros(*shared.shape, 0))
     seen = data.used.any(-1)
     status = torch.where(seen, best.status.reshape(seen.shape), Status.CONVERGED)
     equations = best.equations

@@ -50,6 +50,8 @@ class CalibrationOptions(LocateOptions, TypedDict, total=False):
             units.
         bow: fit the board's bow too, a paraboloid of two parameters. Not with the plane objective, for a bowed board
             has no plane. False if left out.
+        skew: fit the skew of K too, `K[0, 1]`, for sensors whose rows and columns are not at right angles. False if
+            left out: it stays what it is, 0 in `calibrate`.
         fixed: names of parameters or groups (`"principal_point"`, `"distortion"`, `"k3"`, ...) that keep their starting
             values: those of the camera in `refine`; in `calibrate` the middle of the image, and 0 for the lens. (A
             known focal length is for `refine`.)
@@ -63,6 +65,7 @@ class CalibrationOptions(LocateOptions, TypedDict, total=False):
 
     objective: Objective
     bow: bool
+    skew: bool
     fixed: Sequence[str]
     tied_focal: bool
     priors: Priors | None
@@ -81,6 +84,7 @@ _CALIBRATION: CalibrationOptions = {
     **_LOCATE,
     "objective": "image",
     "bow": False,
+    "skew": False,
     "fixed": (),
     "tied_focal": False,
     "priors": None,

@@ -14,38 +14,39 @@ from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.noise import Noise, level, noise_of
 from diffproj.calibration.options import Options
 from diffproj.calibration.other_poses import other_poses
-from diffproj.calibration.parametrisation import Parametrisation
+from diffproj.calibration.parametrisation import SKEW, Parametrisation
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Prior, Status
 from diffproj.calibration.uncertainty import covariance_of
 from diffproj.calibration.verdict import verdicts
 from diffproj.geometry.camera import Camera
-from diffproj.lens.models import LensModel
 
 
 def minimised(
     data: Data,
     options: Options,
-    model: LensModel,
+    parameters: Parametrisation,
     shared: Tensor,
     local: tuple[Tensor, ...],
     reference: Tensor,
 ) -> tuple[Fit, Prior | None]:
     """Where the solver ends from that start, and the prior with its graph.
 
-    `reference (P, s)` is what fixed parameters keep and priors without a mean are about; NaN where nothing is known.
+    Skew that is not to be fitted is held. `reference (P, s)` is what fixed parameters keep and priors without a mean
+    are about; NaN where nothing is known.
     """
-    parameters = Parametrisation(model, options.bow)
+    fixed = options.fixed if options.skew or not parameters.skew else (*options.fixed, SKEW)
     steps = {name: getattr(options, name) for name in ("max_iterations", "tolerance", "progress")}
     prior = make_prior(options.priors, reference, parameters, data.batch)
-    shared = held_at(reference, shared, parameters, options.fixed)
+    shared = held_at(reference, shared, parameters, fixed)
     task = data.task(
-        model,
-        bow=options.bow,
+        parameters.lens,
+        bow=parameters.bow,
+        skew=parameters.skew,
         loss=options.loss,
         shares=data.shares,
         prior=None if prior is None else Prior(prior.mean.detach(), prior.precision.detach()),
-        basis=free_basis(shared, parameters, options.fixed, options.tied_focal),
+        basis=free_basis(shared, parameters, fixed, options.tied_focal),
     )
     if options.objective == "plane":
         # From a rough start a pixel may miss the board; the image objective bears that.
@@ -104,6 +105,7 @@ def outcome(
         causes,
         shaped(noise.variance.sqrt()),
         None if task.shares is None else shaped(task.shares),
+        task.skew,
         partial(_covariance, found, data, before, known),
         partial(_others, found, data, before),
         shaped(noise.freedom),

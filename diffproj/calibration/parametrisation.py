@@ -2,9 +2,10 @@
 
 The views of a camera share
 
-    f_x f_y c_x c_y | coefficients of the lens | bow_x bow_y
+    f_x f_y c_x c_y | coefficients of the lens | skew | bow_x bow_y
 
-in pixels, without unit, and in world units. Each view has a pose of its own, `(R, t)`, which moves by six numbers, in
+in pixels, without unit, in pixels, and in world units. The skew is `K[0, 1]`; it and the bow are there only where they
+are fitted, or where K has skew that is held. Each view has a pose of its own, `(R, t)`, which moves by six numbers, in
 radians about the camera's axes and in world units:
 
     omega (3) | tau (3)        R <- exp(omega) R, t <- t + tau
@@ -19,6 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffproj._core.numerics import has_values
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.cayley import turned
 from diffproj.geometry.intrinsics import focal_and_center, intrinsic_matrix
@@ -27,6 +29,7 @@ from diffproj.lens.models import MODELS, LensModel, coefficients_of, model_of
 POSE = 6
 """Coordinates of a pose: omega and tau."""
 INTRINSICS = ("f_x", "f_y", "c_x", "c_y")
+SKEW = "skew"
 BOW = ("bow_x", "bow_y")
 
 Pose = tuple[Tensor, ...]
@@ -40,6 +43,7 @@ class Parametrisation:
     Attributes:
         lens: the lens model.
         bow: whether the board's bow is among them.
+        skew: whether the skew of K is.
 
     Example:
         >>> import diffproj as dp
@@ -54,15 +58,18 @@ class Parametrisation:
 
     lens: LensModel
     bow: bool = False
+    skew: bool = False
 
     @classmethod
-    def of(cls, camera: Camera, bow: bool = False) -> "Parametrisation":
-        """That of a camera.
+    def of(cls, camera: Camera, bow: bool = False, skew: bool = False) -> "Parametrisation":
+        """That of a camera, with the skew also where its K has some.
 
         Raises:
             TypeError: its lens is of another package.
         """
-        return cls(model_of(camera.distortion).name, bow)
+        model = model_of(camera.distortion)
+        skewed = has_values(camera.K) and bool((camera.K[..., 0, 1] != 0).any())
+        return cls(model.name, bow, skew or skewed)
 
     @property
     def coefficient_names(self) -> tuple[str, ...]:
@@ -72,20 +79,22 @@ class Parametrisation:
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the s shared parameters in their order."""
-        return (*INTRINSICS, *self.coefficient_names, *(BOW if self.bow else ()))
+        return (*INTRINSICS, *self.coefficient_names, *([SKEW] if self.skew else ()), *(BOW if self.bow else ()))
 
     @property
     def size(self) -> int:
         """s, how many there are."""
-        return self.lens_end + 2 * self.bow
+        return self.lens_end + self.skew + 2 * self.bow
 
     @property
     def lens_end(self) -> int:
-        """How many there are without the bow."""
+        """How many there are without the skew and the bow."""
         return len(INTRINSICS) + MODELS[self.lens].count
 
     def pack(self, camera: Camera, bow: Float[Tensor, "*batch 2"] | None = None) -> Float[Tensor, "*batch s"]:
-        """The shared parameters `(*B, s)` of a camera without skew; no bow counts as a flat board.
+        """The shared parameters `(*B, s)` of a camera with an upper triangular K; no bow counts as a flat board.
+
+        Skew that is not among the parameters is left out.
 
         Raises:
             TypeError: its lens is of another package.
@@ -93,6 +102,8 @@ class Parametrisation:
         intrinsics = focal_and_center(camera.K)
         coefficients = coefficients_of(camera.distortion, intrinsics)
         parts = [intrinsics, coefficients.expand(*camera.batch_shape, coefficients.shape[-1])]
+        if self.skew:
+            parts.append(camera.K[..., 0, 1:2])
         if self.bow:
             parts.append(intrinsics.new_zeros(*camera.batch_shape, 2) if bow is None else bow.to(intrinsics))
         return torch.cat(parts, dim=-1)
@@ -107,7 +118,8 @@ class Parametrisation:
         R, t = pose
         batch = R.shape[:-2]
         shared = shared.reshape(*shared.shape[:-1], *(1,) * (R.ndim - 1 - shared.ndim), shared.shape[-1])
-        K = intrinsic_matrix(shared[..., :2], shared[..., 2:4])
+        skew = shared[..., self.lens_end] if self.skew else None
+        K = intrinsic_matrix(shared[..., :2], shared[..., 2:4], skew)
         lens = MODELS[self.lens].lens(shared[..., len(INTRINSICS) : self.lens_end])
         return Camera.unchecked(K.expand(*batch, 3, 3), R, t, None if lens is None else lens.expand(*batch), None)
 

@@ -29,8 +29,9 @@ def refine(
         views: corners `(*B, V, N, 2)`.
         target: anything with `.points (N, 3)` on z = 0.
         camera: the start: its lens says which lens is fitted, and fixed parameters keep its values. With a batch shape
-            that broadcasts to `*B`, poses are found from the corners; with `(*B, V)`, its poses are the start, and its
-            intrinsics are those of the first view.
+            that broadcasts to `*B`, poses are found from the corners; with another that broadcasts to `(*B, V)`, its
+            poses are the start, and its intrinsics are those of the first view. Where its image is turned, the camera
+            that is turned itself is fitted, which sees the same (`Camera.upright`).
         differentiable: carry gradients through the minimum: those of cameras and bow with respect to the views'
             pixels, the target's points, the weights and tensors among the priors are those of the minimiser (implicit
             function theorem, exact Hessian). To first order.
@@ -41,7 +42,8 @@ def refine(
 
     Raises:
         TypeError: views are no `dp.Views`, the camera has a lens of another library, or an option is unknown.
-        ValueError: views, target, camera and options do not fit together, or K has skew.
+        ValueError: views, target, camera and options do not fit together, or the image is turned against a tilted
+            sensor.
         CalibrationError: a camera did not converge, or its views do not determine it.
 
     Example:
@@ -57,8 +59,8 @@ def refine(
     chosen = calibration_options("refine", options)
     data = Data(views, target, chosen.weights)
     camera = as_camera(camera)
-    shared, local, model = start.from_camera(camera, data, chosen.bow)
-    found, prior = minimised(data, chosen, model, shared, local, shared)
+    shared, local, parameters = start.from_camera(camera, data, chosen.bow, chosen.skew)
+    found, prior = minimised(data, chosen, parameters, shared, local, shared)
     if differentiable:
         found = differentiated(found, data, prior)
     return outcome("refine", data, found, camera.size or views.size, chosen.throw)

@@ -3,7 +3,7 @@
 For each of P cameras with V views of N board points, a panel `(P, V, s + 7, 2, N)` whose rows are, each with its two
 components over the points,
 
-    f_x f_y c_x c_y | lens coefficients | bow_x bow_y | omega (3) | tau (3) | residual
+    f_x f_y c_x c_y | lens coefficients | skew | bow_x bow_y | omega (3) | tau (3) | residual
 
 derivatives of the residual `projected - seen` in pixels, and the residual itself. With `q = R X`, `X_cam = q + t` and
 `J = d(uv) / d(X_cam)`, the pose moves by `R <- exp(omega) R`, `t <- t + tau`, so that its rows are
@@ -35,6 +35,7 @@ class Reprojection:
         used: which of them count `(P, V, N)`; a corner that counts must be in front of a perspective camera.
         lens: the lens that is fitted.
         bow: whether the board's bow is among the shared parameters.
+        skew: whether the skew of K is.
     """
 
     points: Tensor
@@ -42,6 +43,7 @@ class Reprojection:
     used: Tensor
     lens: LensModel
     bow: bool = False
+    skew: bool = False
     parameters: Parametrisation = field(init=False, repr=False)
     _panel: Tensor = field(init=False, repr=False)
     _plane_points: Tensor = field(init=False, repr=False)
@@ -51,7 +53,7 @@ class Reprojection:
 
     def __post_init__(self) -> None:
         P, V, N, _ = self.pixels.shape
-        self.parameters = Parametrisation(self.lens, self.bow)
+        self.parameters = Parametrisation(self.lens, self.bow, self.skew)
         self._panel = self.pixels.new_zeros(P, V, self.parameters.size + POSE + 1, 2, N)
         self._panel[:, :, 2, 0], self._panel[:, :, 3, 1] = 1.0, 1.0  # by c_x, c_y
         self._plane_points = self.points.mT.contiguous()
@@ -80,19 +82,25 @@ class Reprojection:
         distorted = DERIVATIVES[model.kind](shared[:, first:last], X_cam, by_coefficient, by_tau)
         f, c = shared[:, None, :2, None], shared[:, None, 2:4, None]
         panel[:, :, 0, 0], panel[:, :, 1, 1] = distorted[:, :, 0], distorted[:, :, 1]
-        by_tau *= f.unsqueeze(2)
-        if model.count:
-            by_coefficient *= f.unsqueeze(2)
+        torch.sub(torch.addcmul(c, f, distorted), self._seen, out=panel[:, :, -1])
+        skew = shared[:, last, None, None] if self.skew else None
+        for part in (by_tau, by_coefficient) if model.count else (by_tau,):
+            sheared = None if skew is None else skew.unsqueeze(2) * part[:, :, :, 1]
+            part *= f.unsqueeze(2)
+            if sheared is not None:
+                part[:, :, :, 0] += sheared
+        if skew is not None:  # u = f_x x + skew y + c_x, with (x, y) distorted
+            panel[:, :, last, 0] = distorted[:, :, 1]
+            panel[:, :, -1, 0].addcmul_(skew, distorted[:, :, 1])
         if self.bow:
             normal = (R[..., 2, None, None] * by_tau).sum(2)
             for row in range(2):
-                torch.mul(normal, self._bow_shape[row], out=panel[:, :, last + row])
+                torch.mul(normal, self._bow_shape[row], out=panel[:, :, last + self.skew + row])
         for axis in range(3):
             a, b = (axis + 1) % 3, (axis + 2) % 3
             row = panel[:, :, axis - 7]
             torch.mul(q[:, :, a, None], by_tau[:, :, b], out=row)
             row.addcmul_(q[:, :, b, None], by_tau[:, :, a], value=-1)
-        torch.sub(torch.addcmul(c, f, distorted), self._seen, out=panel[:, :, -1])
         if self._unused is not None:
             panel.masked_fill_(self._unused[:, :, None, None], 0.0)
         return panel

@@ -13,7 +13,7 @@ from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
 from diffproj.calibration.bow import bowed
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.distinct import alike, described
-from diffproj.calibration.parametrisation import BOW, Parametrisation
+from diffproj.calibration.parametrisation import BOW, SKEW, Parametrisation
 from diffproj.calibration.region import covered_region
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
@@ -75,6 +75,7 @@ class Calibration:
         lens_region: for what `locate` found with a calibration, the `region` of that one.
         shares: how much each view counted for the camera `(*B, V)`: 1, or 1 over the number of views that show the
             board as it does, to within 2 px, which bring nothing new. `None` where all counted fully.
+        skew: whether the skew of K is among the parameters: it was fitted, or K had some that was held.
     """
 
     camera: Camera
@@ -90,6 +91,7 @@ class Calibration:
     causes: tuple[str, ...] = ()
     pixel_sigma: Float[Tensor, "*batch"] | None = None
     shares: Float[Tensor, "*batch v"] | None = None
+    skew: bool = False
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
     degrees_of_freedom: Float[Tensor, "*batch"] | None = None
@@ -105,7 +107,7 @@ class Calibration:
     @property
     def parameters(self) -> Parametrisation:
         """The names and the order of the shared parameters."""
-        return Parametrisation.of(self.camera, self.bow is not None)
+        return Parametrisation.of(self.camera, self.bow is not None, self.skew)
 
     @property
     def shared(self) -> Float[Tensor, "*batch s"]:
@@ -300,6 +302,8 @@ class Calibration:
             line("principal point", ("c_x", "c_y"), "10.3f", " px"),
             *(line(f"lens {name}", (name,), "10.5f", "") for name in self.parameters.coefficient_names),
         ]
+        if self.parameters.skew:
+            lines.append(line("skew", (SKEW,), "10.3f", " px"))
         if self.bow is not None:
             lines.append(line("bow along x, y", BOW, "10.4f", " world units"))
         lines.append(f"{'RMS':<16}{self.rms.item():10.4f} px over {int(self.used.sum())} corners")

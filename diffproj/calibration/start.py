@@ -1,50 +1,82 @@
 """The solver's starting point: from a camera that is known roughly, or from nothing but the size of the image."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from diffproj.calibration import closed_form
+from diffproj.calibration import closed_form, given
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import normal_tensors
 from diffproj.calibration.parametrisation import Parametrisation, Pose
 from diffproj.calibration.task import Task
 from diffproj.geometry.camera import Camera
-from diffproj.geometry.intrinsics import check_no_skew
-from diffproj.lens.models import MODELS, LensModel
+from diffproj.lens.models import MODELS, LensModel, model_of
 
 
-def from_camera(camera: Camera, data: Data, bow: bool) -> tuple[Tensor, tuple[Tensor, Tensor], LensModel]:
-    """Shared parameters and poses to start from."""
-    parameters = Parametrisation.of(camera, bow)
-    if None not in (camera.size, data.views.size) and camera.size != data.views.size:
-        raise ValueError(
-            f"camera: want the size of the photographs, {data.views.size}, got {camera.size}; see resized()"
-        )
+def from_camera(
+    camera: Camera, data: Data, bow: bool, skew: bool = False, with_poses: bool = True
+) -> tuple[Tensor, tuple[Tensor, Tensor], Parametrisation]:
+    """Shared parameters and poses to start from, and which parameters they are.
+
+    A camera whose image is turned is replaced by the one that is turned itself, and sees the same.
+
+    Args:
+        camera: where its batch shape broadcasts to the views' `*B`, it gives intrinsics alone; where it broadcasts to
+            `(*B, V)` instead, poses too, and the intrinsics are those of its first view.
+        data: the views.
+        bow: whether the board's bow is among the parameters.
+        skew: whether the skew is, even where K has none.
+        with_poses: whether the camera may bring poses.
+
+    Raises:
+        TypeError: the lens is of another package.
+        ValueError: sizes or shapes do not fit, the image is turned against a tilted sensor, or values that are needed
+            are not a camera's.
+    """
+    model_of(camera.distortion)
+    given.check_size(camera.size, data.views.size)
     camera = camera.detach().to(data.points.device, data.points.dtype)
-    check_no_skew(camera.K)
-    posed = len(camera.batch_shape) == len(data.batch) + 1
-    intrinsics = camera[..., 0] if posed else camera
-    try:
-        if posed:
-            camera = camera.at(camera.R.expand(*data.batch, len(data.views), 3, 3), camera.t)
-        shared = parameters.pack(intrinsics).expand(*data.batch, -1).reshape(-1, parameters.size)
-    except (RuntimeError, ValueError):
-        shape = tuple(camera.batch_shape)
+    batch, V = tuple(data.batch), len(data.views)
+    posed = not _broadcasts(camera.batch_shape, batch)
+    if posed and not (with_poses and _broadcasts(camera.batch_shape, (*batch, V))):
+        ways = f", or to {(*batch, V)} with the poses to start from" if with_poses else ""
+        remedy = "" if with_poses else "; index it, or take calibration.camera"
         raise ValueError(
-            f"camera: want a batch shape that broadcasts to {tuple(data.batch)} or is {(*data.batch, len(data.views))} "
-            f"with the poses to start from, got {shape}"
-        ) from None
+            f"camera: want a batch shape that broadcasts to {batch}{ways}, got {tuple(camera.batch_shape)}{remedy}"
+        )
+    intrinsics = camera[..., 0] if posed else camera
+    given.check_finite(intrinsics.K)
+    if bool((camera.K[..., 1, 0] != 0).any()) or bool((camera.K[..., [0, 1], [0, 1]] < 0).all(-1).any()):
+        camera = camera.upright()
+        intrinsics = camera[..., 0] if posed else camera
+    parameters = Parametrisation.of(intrinsics, bow, skew)
+    shared = parameters.pack(intrinsics).expand(*batch, -1).reshape(-1, parameters.size)
+    centers = intrinsics.K[..., :2, 2].expand(*batch, 2).reshape(-1, 2)
+    given.check_resolution(centers, data.pixels, data.used, camera.size, data.views.size)
     if posed:
-        R, t = camera.R.reshape(-1, len(data.views), 3, 3), camera.t.reshape(-1, len(data.views), 3)
-        return shared, (R, data.about_middle(R, t)), parameters.lens
+        R, t = camera.R.expand(*batch, V, 3, 3), camera.t.expand(*batch, V, 3)
+        # A view without enough corners takes no part: its pose may be anything.
+        idle = ~data.used.any(-1).reshape(*batch, V, 1)
+        R = torch.where(idle.unsqueeze(-1), torch.eye(3, dtype=R.dtype, device=R.device), R)
+        t = torch.where(idle, t.new_tensor([0.0, 0, 1]), t)
+        given.check_poses(R, t, data.views.names)
+        R, t = R.reshape(-1, V, 3, 3), t.reshape(-1, V, 3)
+        return shared, (R, data.about_middle(R, t)), parameters
     upright = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(*data.used.shape[:2], 3, 3)
     views = parameters.unpack(shared, (upright, torch.zeros_like(upright[..., 0])))
     direction, valid = views.directions(data.pixels)
     perspective = MODELS[parameters.lens].perspective
-    return shared, closed_form.poses_along(data.points, direction, data.used & valid, perspective), parameters.lens
+    return shared, closed_form.poses_along(data.points, direction, data.used & valid, perspective), parameters
+
+
+def _broadcasts(shape: Sequence[int], to: Sequence[int]) -> bool:
+    """Whether a tensor of that shape expands to the other."""
+    if len(shape) > len(to):
+        return False
+    return all(mine in (1, theirs) for mine, theirs in zip(reversed(shape), reversed(to), strict=False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,16 +159,16 @@ class Straightened:
 
 
 def from_nothing(
-    data: Data, model: LensModel, size: tuple[int, int], tied: bool, bow: bool
+    data: Data, size: tuple[int, int], tied: bool, parameters: Parametrisation
 ) -> tuple[Tensor, Pose, Straightened]:
     """Shared parameters and poses to start from, with nothing known but the size of the image."""
     with torch.inference_mode():
         middle = data.pixels.new_tensor([(size[0] - 1) / 2, (size[1] - 1) / 2]).expand(len(data.pixels), 2)
         zero = torch.zeros_like(middle[:, 0])
-        straight = Straightened(model, data.pixels, middle, zero, size, zero + 1)
-        count = Parametrisation(model, bow).size
+        straight = Straightened(parameters.lens, data.pixels, middle, zero, size, zero + 1)
+        count = parameters.size
         if straight.lens == "fisheye":
-            shared, pose = _fisheye(data, straight, count, bow)
+            shared, pose = _fisheye(data, straight, parameters)
         else:
             shared, pose, straight = _perspective(data, straight, count, tied)
     return (*normal_tensors((shared, pose)), straight)
@@ -156,15 +188,15 @@ def _perspective(data: Data, straight: Straightened, count: int, tied: bool) -> 
     return straight.shared(f, count), pose, straight
 
 
-def _fisheye(data: Data, straight: Straightened, count: int, bow: bool) -> tuple[Tensor, Pose]:
+def _fisheye(data: Data, straight: Straightened, parameters: Parametrisation) -> tuple[Tensor, Pose]:
     """Of equidistant lenses with several focal lengths, the one whose poses explain the corners best."""
-    problem = data.task("fisheye", bow=bow).problem
+    problem = data.task("fisheye", bow=parameters.bow, skew=parameters.skew).problem
     tries = []
     for scale in closed_form.FISHEYE_SCALE:
         f = straight.middle.new_full((len(straight.middle),), scale * straight.longer / torch.pi)
         xy, inside = straight.rays(f)
         pose = closed_form.poses(closed_form.homographies(data.points, xy, data.used & inside), data.points)
-        shared = straight.shared(f, count)
+        shared = straight.shared(f, parameters.size)
         cost = problem.linearise(shared, pose)[:, :, -1].square().sum((1, 2, 3))
         tries.append((torch.where(cost.isfinite(), cost, torch.inf), shared, *pose))
     costs, *starts = (torch.stack(parts) for parts in zip(*tries, strict=True))

@@ -30,7 +30,7 @@ class Task:
         points: the board's points `(N, 3)`.
         pixels: `(P, V, N, 2)`.
         used: which corners count `(P, V, N)`.
-        lens, bow: the model.
+        lens, bow, skew: the model.
         objective: residuals on the image or on the board.
         weights: of the corners `(P, V, N)`, or `None` for 1.
         shares: how much each view counts in what all views share `(P, V)`, or `None` for 1: see `distinct.py`. A pose
@@ -45,6 +45,7 @@ class Task:
     used: Tensor
     lens: LensModel
     bow: bool = False
+    skew: bool = False
     objective: Objective = "image"
     weights: Tensor | None = None
     shares: Tensor | None = None
@@ -55,7 +56,7 @@ class Task:
     @property
     def parameters(self) -> Parametrisation:
         """Which they are, and in which order."""
-        return Parametrisation(self.lens, self.bow)
+        return Parametrisation(self.lens, self.bow, self.skew)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -66,7 +67,7 @@ class Task:
     def problem(self) -> Reprojection:
         """Residuals and Jacobians."""
         kind = BoardError if self.objective == "plane" else Reprojection
-        return kind(self.points, self.pixels, self.used, self.lens, self.bow)
+        return kind(self.points, self.pixels, self.used, self.lens, self.bow, self.skew)
 
     def part(self, where: slice | Tensor) -> "Task":
         """The task of some of the cameras."""

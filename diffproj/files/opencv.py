@@ -25,7 +25,10 @@ def dumps(path: Path, item: Camera | Calibration) -> str:
         )
     K, dist, rvec, tvec = camera.to_opencv()
     if rvec.any() or tvec.any():
-        raise ValueError(f"{path}: OpenCV's formats hold no pose; use .json, or save camera.without_pose()")
+        remedy = "camera.without_pose()"
+        if not np.array_equal(K, camera.K.numpy(force=True)):  # of a turned image: OpenCV's camera is turned instead
+            remedy = "camera.upright().without_pose(), whose axes are those of the turned image"
+        raise ValueError(f"{path}: OpenCV's formats hold no pose; use .json, or save {remedy}")
     suffix = ".xml" if path.suffix.lower() == ".xml" else ".yml"
     storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     if camera.size is not None:

@@ -40,6 +40,7 @@ from diffproj._core.numerics import (
     rounding,
 )
 from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.geometry.intrinsics import pixel_to_normalized
 from diffproj.geometry.plane import Plane
 
@@ -282,9 +283,11 @@ def _plane_matrix(camera: Camera, plane: Plane) -> Tensor:
         F_inverse = pixel_to_normalized(in_float64(camera.K))
         M = torch.cat([(M[..., :2].unsqueeze(-1) * F_inverse.unsqueeze(-3)).sum(dim=-2), M[..., 2:]], dim=-1)
     with torch.no_grad():  # the factor changes no point, so no derivative has to pass through it
-        resting = rounding(camera.dtype) * (offset.abs() + vector_norm(b, dim=-1) * vector_norm(t, dim=-1))
+        reach, distance = offset.abs() + vector_norm(b, dim=-1) * vector_norm(t, dim=-1), height.abs()
         factor = M.abs().amax(dim=(-2, -1)).reciprocal().copysign(height)
-        factor = torch.where(height.abs() > resting, factor, 0.0)
+        factor = torch.where(distance > rounding(camera.dtype) * reach, factor, 0.0)
+        if looks_at_rounding(camera.t):
+            warn_of_rounding(reach, distance)
     return M * factor[..., None, None]
 
 

@@ -161,18 +161,38 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         identity = torch.eye(3, dtype=self.dtype, device=self.device)
         return self._with(R=identity, t=torch.zeros_like(identity[0]))
 
-    def resized(self, size: tuple[int, int]) -> "Camera":
+    def resized(self, size: tuple[int, int], stretched: bool = False) -> "Camera":
         """The camera of the same image resized to `size = (width, height)`: `c -> s c + (s - 1) / 2`.
 
+        Each axis has its own scale, so that sides rounded to whole pixels stay exact.
+
+        Args:
+            size: `(width, height)` of the resized image, its aspect that of the camera's to within a pixel.
+            stretched: whether the whole image was stretched to another aspect, as networks of a fixed input size do.
+
         Raises:
-            ValueError: the camera does not know its own size.
+            ValueError: the camera does not know its own size, or another aspect. A camera's video mode of another
+                aspect shows a part of the sensor: crop first.
+
+        Example:
+            >>> camera = Camera(torch.tensor([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]]), size=(640, 480))
+            >>> wide = camera.cropped(0, 60, 640, 360).resized((1280, 720))  # 16 : 9, cut from 4 : 3
+            >>> wide.K.tolist()
+            [[1000.0, 0.0, 639.5], [0.0, 1000.0, 359.5], [0.0, 0.0, 1.0]]
         """
         if self.size is None:
             raise ValueError(
                 "resized: want a camera with a size, got size=None; give Camera(..., size=(width, height))"
             )
-        width, height = checked_size(size) or (0, 0)
+        width, height = checked_size(size) or self.size
         scale = (width / self.size[0], height / self.size[1])
+        # Rounding moves each side by a pixel at most: is there one scale that both may have been rounded from?
+        if abs(scale[0] - scale[1]) > 1 / self.size[0] + 1 / self.size[1] and not stretched:
+            raise ValueError(
+                f"resized: want the aspect of {self.size[0]} x {self.size[1]} px, got {width} x {height}; where the "
+                "image shows a part of the camera's, use cropped(left, top, width, height) first; where all of it was "
+                "stretched, resized(size, stretched=True)"
+            )
         factors = self.K.new_tensor([[scale[0]], [scale[1]], [1.0]])
         shift = self.K.new_tensor([[0, 0, (scale[0] - 1) / 2], [0, 0, (scale[1] - 1) / 2], [0, 0, 0]])
         return self._with(K=self.K * factors + shift, size=(width, height))
@@ -358,11 +378,16 @@ def _pinhole(direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
     return [torch.where(valid, component, 0.0) * inverse_depth for component in (x, y)], valid
 
 
+def is_rotation(R: Float[Tensor, "*shape 3 3"]) -> Bool[Tensor, "*shape"]:
+    """Which matrices are rotations, to `ROTATION_TOLERANCE`."""
+    error = (R.mT @ R - torch.eye(3, dtype=R.dtype, device=R.device)).abs()
+    return (error <= ROTATION_TOLERANCE).all(-1).all(-1) & (torch.linalg.det(R) > 0)
+
+
 def _check_pose(R: Tensor, t: Tensor) -> None:
     if not bool(t.isfinite().all()):
         raise ValueError("t: want finite values, got NaN or infinity")
-    error = (R.mT @ R - torch.eye(3, dtype=R.dtype, device=R.device)).abs()
-    if not bool((error <= ROTATION_TOLERANCE).all() and (torch.linalg.det(R) > 0).all()):
+    if not bool(is_rotation(R).all()):
         raise ValueError(
             "R: want rotation matrices (orthonormal to 1e-5, determinant +1), got others; "
             "kornia's axis_angle_to_rotation_matrix makes them from rotation vectors"

@@ -1,13 +1,16 @@
 """What other libraries give and take of a camera: the part of `Camera` that is about OpenCV and Kornia."""
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from diffproj._core.numerics import dot, has_values
 from diffproj.geometry import interop
 from diffproj.geometry.interop import ArrayLike
+from diffproj.geometry.intrinsics import upright
 from diffproj.lens.brown_conrady import BrownConrady
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.kannala_brandt import KannalaBrandt
@@ -26,6 +29,9 @@ class Exchange:
     t: Tensor
     distortion: Lens | None
     size: tuple[int, int] | None
+
+    def _with(self: C, **changes: Any) -> C:
+        raise NotImplementedError
 
     @classmethod
     def from_opencv(
@@ -61,18 +67,56 @@ class Exchange:
         lens = KannalaBrandt if fisheye else BrownConrady
         return cls(K, R, t, None if coefficients is None else lens(coefficients), size)  # type: ignore[call-arg]
 
+    def upright(self: C) -> C:
+        """The camera that sees the same with K upper triangular: turned about its axis, instead of its image.
+
+        The focal lengths are positive unless the image is mirrored. Where the image is not turned, the same numbers.
+
+        Raises:
+            TypeError: a lens of another package.
+            ValueError: a tilted sensor's image that is turned by other than half turns, or
+                quarter turns where it is tilted about one axis only: no coefficients describe it.
+
+        Example:
+            >>> import torch, diffproj as dp
+            >>> camera = dp.Camera(torch.tensor([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]), size=(640, 480))
+            >>> quarter = torch.tensor([[0.0, -1, 479], [1, 0, 0], [0, 0, 1]])  # clockwise: (u, v) to (479 - v, u)
+            >>> turned = camera.warped(quarter, size=(480, 640))
+            >>> turned.K.tolist(), turned.upright().K.tolist()[:2]
+            ([[0.0, -510.0, 239.0], [500.0, 0.0, 320.0], [0.0, 0.0, 1.0]], [[510.0, 0.0, 239.0], [0.0, 500.0, 320.0]])
+        """
+        K, cosine, sine = upright(self.K)
+        lens = self.distortion
+        if lens is not None:
+            if not isinstance(lens, CoefficientLens):
+                raise TypeError(f"distortion: want a lens of diffproj to turn, got {type(lens).__name__}")
+            lens, exact = lens.turned(cosine, sine)
+            if has_values(exact) and not bool(exact.all()):
+                raise ValueError(
+                    "K: want an image that is not turned against the tilted sensor (tau_x, tau_y) of the lens, got a "
+                    "turned one, which no coefficients describe; turn it back with warped()"
+                )
+        zero, one = torch.zeros_like(sine), torch.ones_like(sine)
+        rows = [cosine, -sine, zero, sine, cosine, zero, zero, zero, one]
+        q = torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+        R, t = (q.unsqueeze(-1) * self.R.unsqueeze(-3)).sum(-2), dot(q, self.t.unsqueeze(-2))
+        return self._with(K=K, R=R, t=t, distortion=lens)
+
     def to_opencv(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """`(K, dist, rvec, tvec)` as float64 arrays for OpenCV's functions, batch axes in front.
 
         `dist` is empty for a pinhole. Whether the coefficients are the fisheye model's is for the caller to remember.
+        A camera whose image is turned is given as the one that is turned itself (`upright`), which sees the same.
 
         Raises:
-            ValueError: the camera has skew or a turned image, which OpenCV would ignore, or another library's lens.
+            ValueError: the camera has skew, which OpenCV would ignore, another library's lens, or a turned image that
+                no lens describes (see `upright`).
         """
         if self.distortion is not None and not isinstance(self.distortion, CoefficientLens):
             raise ValueError(f"distortion: want a lens that OpenCV has, got {type(self.distortion).__name__}")
-        coefficients = None if self.distortion is None else self.distortion.coefficients
-        return interop.arrays_for_opencv(self.K, coefficients, self.R, self.t)
+        camera = self.upright()
+        coefficients = None if camera.distortion is None else camera.distortion.coefficients  # type: ignore[union-attr]
+        return interop.arrays_for_opencv(camera.K, coefficients, camera.R, camera.t)
 
     @classmethod
     def from_kornia(cls: type[C], pinhole: PinholeCamera) -> C:
@@ -87,6 +131,8 @@ class Exchange:
     def to_kornia(self) -> PinholeCamera:
         """Kornia's `PinholeCamera` of batch size `B`; a single camera becomes a batch of one.
 
+        A camera whose image is turned is given as the one that is turned itself (`upright`), which sees the same.
+
         Raises:
             ValueError: what `PinholeCamera` cannot hold: a lens, no size, or more than one batch axis.
         """
@@ -94,4 +140,5 @@ class Exchange:
             raise ValueError("distortion: want None, for PinholeCamera holds no lens; undistort first")
         if self.size is None:
             raise ValueError("size: want (width, height), got None, and PinholeCamera needs it")
-        return interop.pinhole_from_tensors(self.K, self.R, self.t, self.size)
+        camera = self.upright()
+        return interop.pinhole_from_tensors(camera.K, camera.R, camera.t, self.size)

@@ -51,11 +51,14 @@ def arrays_for_opencv(
     """`(K, dist, rvec, tvec)` as float64 arrays with the batch axes in front.
 
     Raises:
-        ValueError: K has skew or a rotation of the image: OpenCV uses only focal lengths and principal point.
+        ValueError: K has skew: OpenCV uses only focal lengths and principal point.
     """
     K_array, R_array, t_array = _array(K), _array(R), _array(t)
-    if np.any(K_array[..., 0, 1]) or np.any(K_array[..., 1, 0]):
-        raise ValueError("K: want no skew, for OpenCV ignores it; got K[..., 0, 1] or K[..., 1, 0] other than 0")
+    skew = np.abs(K_array[..., 0, 1] / K_array[..., 0, 0]).max(initial=0.0)
+    if skew:
+        raise ValueError(
+            f"K: want no skew, for OpenCV ignores it; got axes of the image {skew:.3g} rad off the right angle"
+        )
     batch = K_array.shape[:-2]
     dist = np.zeros((*batch, 0)) if coefficients is None else _array(coefficients)
     vectors = [cv2.Rodrigues(matrix)[0].ravel() for matrix in R_array.reshape(-1, 3, 3)]

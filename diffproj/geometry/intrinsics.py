@@ -8,20 +8,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.numerics import in_float64
+from diffproj._core.numerics import in_float64, rounding
 
 
 def intrinsic_matrix(
-    focal: Float[Tensor, "*batch 2"], center: Float[Tensor, "*batch 2"]
+    focal: Float[Tensor, "*batch 2"], center: Float[Tensor, "*batch 2"], skew: Float[Tensor, "*batch"] | None = None
 ) -> Float[Tensor, "*batch 3 3"]:
-    """K from focal lengths and principal point, in px."""
+    """K from focal lengths, principal point and skew, in px."""
     (f_x, f_y), (c_x, c_y) = focal.unbind(-1), center.unbind(-1)
     zero, one = torch.zeros_like(f_x), torch.ones_like(f_x)
-    return torch.stack([f_x, zero, c_x, zero, f_y, c_y, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
+    row = [f_x, zero if skew is None else skew, c_x]
+    return torch.stack([*row, zero, f_y, c_y, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
 
 
 def focal_and_center(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """`f_x f_y c_x c_y` from a K without skew: the inverse of `intrinsic_matrix`."""
+    """`f_x f_y c_x c_y` from an upper triangular K: the inverse of `intrinsic_matrix`, but for the skew."""
     return torch.cat([K.diagonal(dim1=-2, dim2=-1)[..., :2], K[..., :2, 2]], dim=-1)
 
 
@@ -30,6 +31,26 @@ def pixel_to_normalized(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch
     a, b, c, d = K[..., :2, :2].flatten(-2).unbind(-1)
     determinant = torch.addcmul(a * d, b, c, value=-1)
     return (torch.stack([d, -b, -c, a], dim=-1) / determinant.unsqueeze(-1)).unflatten(-1, (2, 2))
+
+
+def upright(
+    K: Float[Tensor, "*batch 3 3"],
+) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """An upper triangular K and the turn of the image that it leaves out: `F = F_upper q`, q a rotation.
+
+    Returns:
+        `K_upper (*B, 3, 3)`, with positive focal lengths unless the image is mirrored, and cosine and sine of the angle
+        that q turns by, from x towards y `(*B,)`. A turn by a right angle that rounding has spoilt is one again.
+    """
+    a, b, c, d = K[..., :2, :2].flatten(-2).unbind(-1)
+    mirrored = a * d < b * c
+    f_y = torch.hypot(c, d) * torch.where(mirrored & (d < 0), -1.0, 1.0)
+    cosine, sine = d / f_y, c / f_y
+    f_x, skew = a * cosine - b * sine, a * sine + b * cosine
+    skew = torch.where(skew.abs() <= rounding(K.dtype) * (f_x.abs() + f_y.abs()), 0.0, skew)
+    zero = torch.zeros_like(f_x)
+    F = torch.stack([f_x, skew, zero, f_y], dim=-1).unflatten(-1, (2, 2))
+    return torch.cat([torch.cat([F, K[..., :2, 2:]], dim=-1), K[..., 2:, :]], dim=-2), cosine, sine
 
 
 def warped(
@@ -84,16 +105,6 @@ def check_intrinsics(K: Tensor) -> None:
     determinant = F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0]
     if bool((determinant.abs() <= 8 * torch.finfo(K.dtype).eps * F.square().sum(dim=(-2, -1))).any()):
         raise ValueError("K: want an invertible matrix, got a singular one; are both focal lengths set?")
-
-
-def check_no_skew(K: Tensor) -> None:
-    """Check that F is diagonal, so that f_x, f_y, c_x and c_y represent K completely.
-
-    Raises:
-        ValueError: F is not diagonal.
-    """
-    if bool((K[..., 0, 1] != 0).any() or (K[..., 1, 0] != 0).any()):
-        raise ValueError("camera: want no skew, got K[..., 0, 1] or K[..., 1, 0] other than 0")
 
 
 def check_warp(matrix: Tensor, K: Tensor, behind_lens: bool) -> None:

@@ -1,12 +1,15 @@
 """Metric top views of a plane, and the way back: `rectify` an image, `render` a texture.
 
-A top view is an image of a plane in world units. Its column j and row i are at the plane's own coordinates (s, t),
+A top view is an image of a plane in world units. It fills its extent: column j and row i are at the plane's own
+coordinates (s, t),
 
-    s = s_min + (j + 1/2) resolution        t = t_min + (i + 1/2) resolution        X = origin + s axis_s + t axis_t
+    s = s_min + (j + 1/2) (s_max - s_min) / columns     t = t_min + (i + 1/2) (t_max - t_min) / rows
+    X = origin + s axis_s + t axis_t
 
-A pixel covers a square, so that areas and edges keep their places at any resolution. Every pixel of the target image
-is mapped to the source image through the camera, lens included. Where its footprint there is larger than a pixel, it is
-supersampled, by at most 8 x 8 bilinear samples, against aliasing. Both are differentiable in image and camera.
+A pixel covers a rectangle, a square where the extent is a whole multiple of the resolution, so that areas and edges
+keep their places at any resolution. Every pixel of the target image is mapped to the source image through the camera,
+lens included. Where its footprint there is larger than a pixel, it is the mean of bilinear samples about a pixel apart,
+against aliasing. Both are differentiable in image and camera.
 """
 
 import math
@@ -18,15 +21,17 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from diffproj._core.numerics import check_tensor
+from diffproj._core.numerics import BLOCK_POINTS, broadcast_batches, check_tensor
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
-from diffproj.geometry.grid import inside, pixel_grid
+from diffproj.geometry.float32 import warn_if_rounded
+from diffproj.geometry.grid import checked_size, inside, pixel_grid
 from diffproj.geometry.plane import Plane
 
 LookUp = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Maps an offset within the target's pixels, from 0 to 1, to positions in the source `(*B, N, 2)` and `valid`."""
-MAX_SUPERSAMPLING = 8
+"""Maps places in the target `(N, 2)`, in pixels from its first corner, to positions in the source `(*B, N, 2)`, in
+pixels from the centre of its first pixel, and `valid (*B, N)`."""
+MAX_SUPERSAMPLING = 128
 """Maximum number of samples along each side of a pixel."""
 
 
@@ -71,7 +76,8 @@ def rectify(
         camera: with its pose, of batch shape `*B`; the image is taken to be its full image.
         plane: of batch shape `*B`.
         extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes.
-        resolution: world units per pixel of the top view.
+        resolution: world units per pixel of the top view. Where the extent is no whole multiple of it, the number of
+            pixels is rounded, and they fill the extent.
         axes: `(origin, axis_s, axis_t)`, each `(*B, 3)`; those of `plane_axes` if left out.
 
     Returns:
@@ -80,7 +86,7 @@ def rectify(
 
     Raises:
         TypeError: the image is no floating-point tensor.
-        ValueError: an empty extent, a resolution that is not positive, or shapes that do not fit.
+        ValueError: an empty or infinite extent, a resolution that is not positive, or shapes that do not fit.
 
     Example:
         >>> import diffproj as dp
@@ -90,15 +96,17 @@ def rectify(
         >>> top.shape, bool(valid.all())
         (torch.Size([3, 50, 100]), True)
     """
-    image, camera = _checked_image(image), as_camera(camera)
+    image, camera = check_tensor("image", image, "C", "H", "W"), as_camera(camera)
     rows, columns = _shape(extent, resolution)
     plane = plane.like(camera.K)
     origin, along_s, along_t = axes or plane_axes(plane)
+    broadcast_batches(image=image.shape[:-3], camera=camera.batch_shape, plane=plane.batch_shape)
+    warn_if_rounded(camera, plane)
     H, W = image.shape[-2:]
-    low = camera.K.new_tensor([extent[0], extent[1]])
+    low, unit = _corner_and_pixel(extent, (rows, columns), camera.K)
 
-    def look_up(offset: Tensor) -> tuple[Tensor, Tensor]:
-        s, t = ((pixel_grid(rows, columns, camera.K) + offset) * resolution + low).reshape(-1, 2).unbind(-1)
+    def look_up(places: Tensor) -> tuple[Tensor, Tensor]:
+        s, t = (places * unit + low).unbind(-1)
         points = (
             origin.unsqueeze(-2) + s.unsqueeze(-1) * along_s.unsqueeze(-2) + t.unsqueeze(-1) * along_t.unsqueeze(-2)
         )
@@ -131,7 +139,7 @@ def render(
 
     Raises:
         TypeError: the texture is no floating-point tensor.
-        ValueError: an empty extent, no size, or shapes that do not fit.
+        ValueError: an empty or infinite extent, no size, or shapes that do not fit.
 
     Example:
         >>> import diffproj as dp
@@ -141,21 +149,20 @@ def render(
         >>> image.shape, int(valid.sum())  # 200 x 100 world units at 2 per pixel
         (torch.Size([1, 480, 640]), 5000)
     """
-    texture, camera = _checked_image(texture), as_camera(camera)
-    size = size or camera.size
+    texture, camera = check_tensor("texture", texture, "C", "rows", "columns"), as_camera(camera)
+    size = checked_size(size) or camera.size
     if size is None:
         raise ValueError("size: want (width, height), got None, and the camera has none")
-    _shape(extent, 1.0)
+    _checked_extent(extent)
     plane = plane.like(camera.K)
     origin, along_s, along_t = axes or plane_axes(plane)
     width, height = size
     rows, columns = texture.shape[-2:]
-    low = camera.K.new_tensor([extent[0], extent[1]])
-    unit = camera.K.new_tensor([(extent[2] - extent[0]) / columns, (extent[3] - extent[1]) / rows])
+    broadcast_batches(texture=texture.shape[:-3], camera=camera.batch_shape, plane=plane.batch_shape)
+    low, unit = _corner_and_pixel(extent, (rows, columns), camera.K)
 
-    def look_up(offset: Tensor) -> tuple[Tensor, Tensor]:
-        pixels = (pixel_grid(height, width, camera.K) + offset - 0.5).reshape(-1, 2)
-        points, valid = back_project(pixels, camera, plane)
+    def look_up(places: Tensor) -> tuple[Tensor, Tensor]:
+        points, valid = back_project(places - 0.5, camera, plane)
         off = points - origin.unsqueeze(-2)
         st = torch.stack([(off * along_s.unsqueeze(-2)).sum(-1), (off * along_t.unsqueeze(-2)).sum(-1)], dim=-1)
         return (st - low) / unit - 0.5, valid
@@ -163,36 +170,65 @@ def render(
     return _resampled(texture, look_up, (height, width), (columns, rows), camera.K)
 
 
+def _corner_and_pixel(extent: Sequence[float], shape: tuple[int, int], like: Tensor) -> tuple[Tensor, Tensor]:
+    """`(s, t)` of an extent's first corner, and the size along s and t of the pixels that fill it."""
+    (s_min, t_min, s_max, t_max), (rows, columns) = extent, shape
+    return like.new_tensor([s_min, t_min]), like.new_tensor([(s_max - s_min) / columns, (t_max - t_min) / rows])
+
+
 def _resampled(
     source: Tensor, look_up: LookUp, shape: tuple[int, int], size: tuple[int, int], like: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Resample a source, of `(width, height)` `size`, to a target of `(rows, columns)` `shape`, with supersampling."""
-    n = _supersampling(look_up, shape, size, like)
-    steps = ((torch.arange(n, dtype=like.dtype, device=like.device) + 0.5) / n).tolist()
-    total, counts = torch.zeros((), dtype=source.dtype, device=source.device), torch.zeros((), device=source.device)
-    for down in steps:
-        for right in steps:
-            sampled, seen = _sampled(source, *look_up(like.new_tensor([right, down])), shape, size)
-            total, counts = total + sampled, counts + seen
-    covered = counts >= 0.5 * n * n
-    mean = total / counts.clamp(min=1).unsqueeze(-3).to(total)
-    return torch.where(covered.unsqueeze(-3), mean, 0.0), covered
-
-
-def _supersampling(look_up: LookUp, shape: tuple[int, int], size: tuple[int, int], like: Tensor) -> int:
-    """Samples per side: the side of the target pixels' footprint in the source, 90th percentile, at most 8."""
+    corners = pixel_grid(*shape, like)
     with torch.no_grad():
-        places, valid = look_up(like.new_tensor([0.5, 0.5]))
+        places, valid = look_up((corners + 0.5).reshape(-1, 2))
         shown = (valid & inside(places, size)).unflatten(-1, shape)
-        places = places.unflatten(-2, shape)
-        footprint = 1.0
-        for axis in (-1, -2):
-            step = places.diff(dim=axis - 1).norm(dim=-1)
-            count = shown.shape[axis] - 1
-            step = step[shown.narrow(axis, 0, count) & shown.narrow(axis, 1, count)]
-            if len(step):
-                footprint = max(footprint, float(step[:: 1 + len(step) // 100_000].quantile(0.9)))
-    return min(MAX_SUPERSAMPLING, math.ceil(footprint - 0.25))
+        right, down = (_samples(look_up, corners, places.unflatten(-2, shape), shown, axis) for axis in (-1, -2))
+    # A target may reach far beyond the source: only the part about what is shown is sampled.
+    (top, bottom), (left, end) = (_range_of(shown.transpose(-1, axis).flatten(0, -2).any(0)) for axis in (-2, -1))
+    corners = corners[top:bottom, left:end]
+    part = corners.shape[:2]
+    offsets = ((pixel_grid(down, right, like) + 0.5) / like.new_tensor([right, down])).reshape(-1, 2)
+    total, counts = torch.zeros((), dtype=source.dtype, device=source.device), torch.zeros((), device=source.device)
+    for some in offsets.split(max(1, BLOCK_POINTS // max(1, part.numel() * valid.shape[:-1].numel()))):
+        places, valid = look_up((corners + some[:, None, None]).reshape(-1, 2))
+        sampled, seen = _sampled(source, places, valid, (len(some) * part[0], part[1]), size)
+        total = total + sampled.unflatten(-2, (len(some), part[0])).sum(-3)
+        counts = counts + seen.unflatten(-2, (len(some), part[0])).sum(-3)
+    covered = counts >= 0.5 * len(offsets)
+    mean = torch.where(covered.unsqueeze(-3), total / counts.clamp(min=1).unsqueeze(-3).to(total), 0.0)
+    around = (left, shape[1] - end, top, shape[0] - bottom)
+    return torch.nn.functional.pad(mean, around), torch.nn.functional.pad(covered, around)
+
+
+def _range_of(lines: Tensor) -> tuple[int, int]:
+    """The range of lines `(n,)` that are shown, and one more on each side; all where none is."""
+    where = lines.nonzero().flatten()
+    return (max(0, int(where[0]) - 1), min(len(lines), int(where[-1]) + 2)) if len(where) else (0, len(lines))
+
+
+def _samples(look_up: LookUp, corners: Tensor, places: Tensor, shown: Tensor, axis: int) -> int:
+    """Samples along a pixel's side, as many as its footprint in the source has pixels, at most `MAX_SUPERSAMPLING`.
+
+    The footprint is the 90th percentile over the target's pixels that are shown, from neighbour to neighbour, or, where
+    there are none, from edge to edge. From a footprint of `n + 1/4` pixels on there are n + 1 samples.
+
+    Args:
+        look_up: where places of the target are in the source.
+        corners: of the target's pixels `(rows, columns, 2)`.
+        places: of their middles in the source `(*B, rows, columns, 2)`.
+        shown: which of these lie in the source `(*B, rows, columns)`.
+        axis: along which: -1 to the right, -2 down.
+    """
+    step, pairs = places.diff(dim=axis - 1).norm(dim=-1), shown.shape[axis] - 1
+    step = step[shown.narrow(axis, 0, pairs) & shown.narrow(axis, 1, pairs)]
+    if len(step) == 0:
+        half = corners.new_tensor([0.5, 0.0] if axis == -1 else [0.0, 0.5])
+        (first, seen), (last, too) = (look_up((corners + 0.5 + side * half).reshape(-1, 2)) for side in (-1, 1))
+        step = (last - first).norm(dim=-1)[seen & too & shown.flatten(-2)]
+    footprint = float(step[:: 1 + len(step) // 100_000].quantile(0.9)) if len(step) else 1.0
+    return min(MAX_SUPERSAMPLING, max(1, math.ceil(footprint - 0.25)))
 
 
 def _sampled(
@@ -211,14 +247,19 @@ def _sampled(
     return torch.where(seen.unsqueeze(-3), sampled, 0.0), seen
 
 
+def _checked_extent(extent: Sequence[float]) -> tuple[float, float]:
+    """The sides of an extent along s and t, in world units."""
+    numbers = tuple(extent)
+    if len(numbers) == 4 and all(map(math.isfinite, numbers)):
+        s_min, t_min, s_max, t_max = numbers
+        if s_max > s_min and t_max > t_min:
+            return s_max - s_min, t_max - t_min
+    raise ValueError(f"extent: want finite (s_min, t_min, s_max, t_max) with room between, got {numbers}")
+
+
 def _shape(extent: Sequence[float], resolution: float) -> tuple[int, int]:
-    s_min, t_min, s_max, t_max = extent
-    if not (s_max > s_min and t_max > t_min):
-        raise ValueError(f"extent: want (s_min, t_min, s_max, t_max) with room between, got {tuple(extent)}")
-    if not resolution > 0:
+    """`(rows, columns)` of the top view whose pixels fill the extent."""
+    width, height = _checked_extent(extent)
+    if not 0 < resolution < math.inf:
         raise ValueError(f"resolution: want world units per pixel, above 0, got {resolution}")
-    return max(1, round((t_max - t_min) / resolution)), max(1, round((s_max - s_min) / resolution))
-
-
-def _checked_image(image: Tensor) -> Tensor:
-    return check_tensor("image", image, "C", "H", "W")
+    return max(1, round(height / resolution)), max(1, round(width / resolution))

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj._core.numerics import in_blocks
+from diffproj._core.numerics import in_blocks, rounding
 from diffproj.lens import brown_domain
 from diffproj.lens.brown_equations import COUNTS, Terms, bend, radial
 from diffproj.lens.brown_inverse import newton, search, squared_domain, untilted
@@ -140,6 +140,31 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
         """Directions `(x, y, 1)` whose projections are the distorted points; (0, 0, 1) where not valid."""
         xy, valid = self.undistort(xy_distorted)
         return torch.nn.functional.pad(xy, (0, 1), value=1.0), valid
+
+    def turned(
+        self, cosine: Float[Tensor, "*lens"], sine: Float[Tensor, "*lens"]
+    ) -> tuple["BrownConrady", Bool[Tensor, "*lens"]]:
+        """The lens turned about its axis, and whether there is one `(*lens,)`: it maps `q xy` to `q xy_distorted`.
+
+        Tangential terms and prism turn like vectors, radial ones do not change. Behind a tilted sensor the image can
+        be turned by 180 degrees, and by 90 where it is tilted about one of its axes only; else no coefficients say it.
+
+        Args:
+            cosine: of the angle that the rotation q turns by, from x towards y `(*lens,)`.
+            sine: of the same angle.
+        """
+        columns = list(self.coefficients.unbind(-1))
+        exact = torch.ones_like(cosine, dtype=torch.bool)
+        if len(columns) == 14:
+            upright, across = ((columns[i].abs() <= rounding(self.dtype)) for i in (12, 13))
+            by_180, by_90 = (part.abs() <= rounding(self.dtype) for part in (sine, cosine))
+            exact = by_180 | (upright & across) | (by_90 & (upright | across))
+        # (x, y) of each vector: tangential (p2, p1), prism (s1, s3) and (s2, s4), tilt (tau_x, tau_y).
+        for i, j in ((3, 2), (8, 10), (9, 11), (12, 13)):
+            if max(i, j) < len(columns):
+                x, y = columns[i], columns[j]
+                columns[i], columns[j] = cosine * x - sine * y, sine * x + cosine * y
+        return type(self)(torch.stack(columns, dim=-1)), exact
 
     @staticmethod
     def _find_domain(coefficients: Tensor) -> Tensor:

@@ -82,6 +82,10 @@ class CoefficientLens(Batched, ABC):
     def unproject(self, xy_distorted: Tensor) -> tuple[Tensor, Tensor]:
         """Distorted points to directions; see `Lens`."""
 
+    @abstractmethod
+    def turned(self: L, cosine: Tensor, sine: Tensor) -> tuple[L, Tensor]:
+        """The lens turned about its axis by an angle `(*B,)`, and whether there is one `(*B,)`."""
+
     @staticmethod
     @abstractmethod
     def _find_domain(coefficients: Tensor) -> Tensor:

@@ -130,6 +130,14 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
 
         return in_blocks(backward, self._checked("xy_distorted", xy_distorted, 2), self.coefficients)  # type: ignore[return-value]
 
+    def turned(
+        self,
+        cosine: Float[Tensor, "*lens"],
+        sine: Float[Tensor, "*lens"],  # noqa: ARG002
+    ) -> tuple["KannalaBrandt", Bool[Tensor, "*lens"]]:
+        """The lens turned about its axis, which is the same, and that there is one `(*lens,)`."""
+        return self, torch.ones_like(cosine, dtype=torch.bool)
+
     @staticmethod
     def _find_domain(coefficients: Tensor) -> Tensor:
         columns = list(coefficients.unsqueeze(-2).unbind(-1))

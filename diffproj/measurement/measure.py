@@ -19,6 +19,7 @@ Where a view's pose may be the wrong one of two, the other is too far away for t
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -30,6 +31,7 @@ from diffproj.calibration.parametrisation import Parametrisation, moved
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.float32 import warn_if_rounded
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.doubt import of_the_pose
 from diffproj.measurement.measurement import Measurement
@@ -75,16 +77,19 @@ def measure(
     pixels = in_float64(check_tensor("pixels", pixels, "N", 2))
     if isinstance(calibration, Calibration):
         camera, known, level, middle = _at_view(calibration, view)
+        parameters = replace(calibration.parameters, bow=False)
     else:
-        camera, known, level, middle = as_camera(calibration), None, None, None
+        camera, known, level, middle = as_camera(calibration).upright(), None, None, None
+        parameters = Parametrisation.of(camera)
     if pixel_sigma is None and level is None:
         source = "this calibration" if isinstance(calibration, Calibration) else "a camera alone"
         raise ValueError(f"pixel_sigma: want the noise of the pixels, for {source} does not know it")
+    warn_if_rounded(camera, plane)
     camera, plane = camera.to(torch.float64), plane.to(torch.float64)
     points, valid = back_project(pixels, camera, plane)
     batch = points.shape[:-2]
     sigma = _expanded(level if pixel_sigma is None else pixel_sigma, like=points)
-    by_theta, by_point = _projection_derivatives(points, camera, known, middle)
+    by_theta, by_point = _projection_derivatives(points, camera, parameters, known, middle)
     tangents = plane.tangents()
     T = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)  # (*B, N, 3, 2)
     D = torch.where(valid[..., None, None], T @ _inverse2(by_point @ T), 0.0)
@@ -166,14 +171,13 @@ def _expanded(pixel_sigma: float | Tensor | None, like: Tensor) -> Tensor:
 
 
 def _projection_derivatives(
-    points: Tensor, camera: Camera, known: Tensor | None, middle: Tensor | None
+    points: Tensor, camera: Camera, parameters: Parametrisation, known: Tensor | None, middle: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Derivatives of the pixels by theta `(*B, N, 2, s + 6)` (bow excluded: 0) and by the point `(*B, N, 2, 3)`.
 
     The pose turns about `middle (3,)`: about a distant origin a turn and a shift would nearly cancel.
     """
     batch = points.shape[:-2]
-    parameters = Parametrisation.of(camera)
     s = parameters.size
     shared = parameters.pack(camera).expand(*batch, s).reshape(-1, s)
     R, t = camera.R.expand(*batch, 3, 3).reshape(-1, 1, 3, 3), camera.t.expand(*batch, 3).reshape(-1, 1, 3)

@@ -1,5 +1,7 @@
 """`CalibrationPrior`: how far a camera may move from its calibration, given the calibration's covariance."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
@@ -7,7 +9,7 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
 from diffproj._core.numerics import in_float64
-from diffproj.calibration.parametrisation import POSE, Parametrisation
+from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.lens.models import model_of
@@ -60,13 +62,13 @@ class CalibrationPrior(GeometryModule):
         if calibration.views.batch_shape or not calibration.has_covariance:
             raise ValueError("calibration: want one camera with its covariance, as calibrate gives it")
         camera = (calibration.camera if view is None else calibration.cameras[view]).detach()
-        known, parameters = calibration.covariance.about_middle, Parametrisation.of(camera)
+        known, parameters = calibration.covariance.about_middle, replace(calibration.parameters, bow=False)
         middle = calibration.covariance.middle
         C = (known.shared if view is None else known.view(view)).detach()
         # The rows of C are the camera's parameters, the bow of the board, which is none of the camera's, and the pose.
         of_pose = range(len(known.names), len(known.names) + (0 if view is None else POSE))
         rows = torch.tensor([*range(parameters.size), *of_pose], device=C.device)
-        self.lens, self.with_pose = parameters.lens, view is not None
+        self.parametrisation, self.with_pose = parameters, view is not None
         self.register_buffer("R_0", in_float64(camera.R).clone())
         self.register_buffer("middle", torch.zeros_like(self.R_0[0]) if middle is None else middle.clone())
         self.register_buffer("center", self._vector(camera).clone())
@@ -76,23 +78,23 @@ class CalibrationPrior(GeometryModule):
         """`1/2 d^T C^-1 d` of a camera of batch shape `*B`, such as `projector.camera`; `(*B,)` in float64.
 
         Args:
-            camera: with the calibration's lens model and without skew.
+            camera: with the calibration's lens model and an upper triangular K, whose skew counts where the calibration
+                has it.
 
         Raises:
             TypeError: not a camera, or one whose lens is of another package.
             ValueError: another lens model.
         """
         camera = as_camera(camera)
-        if model_of(camera.distortion).name != self.lens:
-            raise ValueError(
-                f"camera: want the calibration's lens model {self.lens!r}, got {model_of(camera.distortion).name!r}"
-            )
+        lens, wanted = model_of(camera.distortion).name, self.parametrisation.lens
+        if lens != wanted:
+            raise ValueError(f"camera: want the calibration's lens model {wanted!r}, got {lens!r}")
         off = self._vector(camera) - self.center
         return (off * (self.precision * off.unsqueeze(-2)).sum(-1)).sum(-1) / 2
 
     def _vector(self, camera: Camera) -> Tensor:
         """The parameters of a camera `(*B, p)`: intrinsics and lens, with a pose its turn from R_0 and its place."""
-        parts = [in_float64(Parametrisation.of(camera).pack(camera))]
+        parts = [in_float64(self.parametrisation.pack(camera))]
         if self.with_pose:
             turn = (in_float64(camera.R).unsqueeze(-3) * self.R_0.unsqueeze(-2)).sum(-1).mT  # R R_0^T
             omega = rotation_matrix_to_axis_angle(turn.reshape(-1, 3, 3)).reshape(*turn.shape[:-2], 3)

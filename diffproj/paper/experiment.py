@@ -48,7 +48,7 @@ class Experiment:
 
     Attributes:
         fit: the calibration of the fitting views.
-        test: the test views with their poses, intrinsics held.
+        test: the test views with their poses, intrinsics held; its covariance holds what the fit leaves open of them.
         board: the board.
         approximated: corners of the test views put back on the board `(V, N, 3)`, in world units.
         measured: which corners count `(V, N)`: seen, back-projected, and under `strict` not used for the pose.
@@ -121,7 +121,7 @@ def run_experiment(
     held_out = torch.zeros(test.pixels.shape[-2], dtype=torch.bool)
     if strict:
         held_out[1::2] = True
-    located = locate(test.hiding(held_out), board, calibration.camera)
+    located = locate(test.hiding(held_out), board, calibration)
     measured = test.hiding(~held_out) if strict else test
     points, valid = back_project(measured.pixels.to(torch.float64), located.cameras, Plane.z(0.0))
     return Experiment(calibration, located, board, points, valid & measured.visible)

@@ -794,7 +794,8 @@ def test_bad_input_is_refused_by_name() -> None:
     other = type(
         "Other", (), {"unproject": None, "dtype": D, "device": torch.device("cpu"), "batch_shape": torch.Size(())}
     )
-    skewed = dp.Camera(truth.K[0] + torch.tensor([[0.0, 1, 0], [0, 0, 0], [0, 0, 0]], dtype=D))
+    tilted = dp.BrownConrady(torch.tensor([0.0] * 12 + [0.02, 0.03], dtype=D))
+    turned = dp.Camera(truth.K[0][[1, 0, 2]], distortion=tilted)
     batch = dp.Views(views.pixels[None], size=views.size)
     cases = [
         (TypeError, "views: want dp.Views, got Tensor", lambda: dp.calibrate(views.pixels, board)),
@@ -856,7 +857,7 @@ def test_bad_input_is_refused_by_name() -> None:
         (TypeError, "loss: want one such as", lambda: dp.calibrate(views, board, loss="huber")),
         (ValueError, "camera: want a batch shape that broadcasts", lambda: dp.locate(views, board, truth)),
         (ValueError, "camera: want a batch shape that broadcasts", lambda: dp.refine(views, board, truth[:3])),
-        (ValueError, "camera: want no skew", lambda: dp.refine(views, board, skewed)),
+        (ValueError, "K: want an image that is not turned against", lambda: dp.refine(views, board, turned)),
         (TypeError, "camera: want a pinhole", lambda: dp.refine(views, board, dp.Camera(K, distortion=other()))),
         (
             ValueError,

@@ -15,12 +15,15 @@ D = torch.float64
 P, V = 2, 3
 
 
-def situation(lens: LensModel, bow: bool) -> tuple[dp.Chessboard, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+def situation(
+    lens: LensModel, bow: bool, skew: bool = False
+) -> tuple[dp.Chessboard, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
     """Shared parameters, board and poses at random; every coefficient differs from 0."""
     board = dp.Chessboard(columns=5, rows=4, square=40.0)
     intrinsics = torch.tensor([500.0, 510, 320, 240], dtype=D) + torch.randn(P, 4, dtype=D)
     coefficients = 0.02 * torch.randn(P, MODELS[lens].count, dtype=D) + 0.01
-    shared = torch.cat([intrinsics, coefficients, 3 * torch.randn(P, 2 * bow, dtype=D)], dim=-1)
+    extra = [5 * torch.randn(P, int(skew), dtype=D), 3 * torch.randn(P, 2 * bow, dtype=D)]
+    shared = torch.cat([intrinsics, coefficients, *extra], dim=-1)
     R = axis_angle_to_rotation_matrix(0.3 * torch.randn(P * V, 3, dtype=D)).reshape(P, V, 3, 3)
     t = 20 * torch.randn(P, V, 3, dtype=D) + torch.tensor([-80.0, -60, 500], dtype=D)
     return board, shared, (R, t)
@@ -32,11 +35,12 @@ def residual(
     pixels: torch.Tensor,
     lens: LensModel,
     bow: bool,
+    skew: bool,
     shared: torch.Tensor,
     local: tuple[torch.Tensor, ...],
 ) -> torch.Tensor:
     """`(P, V, 2, N)` through the public camera and the public back-projection."""
-    cameras = Parametrisation(lens, bow).unpack(shared, local)
+    cameras = Parametrisation(lens, bow, skew).unpack(shared, local)
     points = board.points.expand(P, 1, -1, 3)
     if bow:
         z = (shared[:, None, -2:, None] * bow_shape(board.points)).sum(2)
@@ -54,17 +58,18 @@ LONG = [pytest.param(name, marks=pytest.mark.slow) if name in ("brown8", "brown1
 
 
 @pytest.mark.parametrize("lens", LONG)
+@pytest.mark.parametrize("skew", [False, True])
 @pytest.mark.parametrize(("kind", "bow"), [(Reprojection, False), (Reprojection, True), (BoardError, False)])
-def test_jacobians_are_autograds(kind: type[Reprojection], lens: LensModel, bow: bool) -> None:
-    board, shared, local = situation(lens, bow)
-    cameras = Parametrisation(lens, bow).unpack(shared, local)
+def test_jacobians_are_autograds(kind: type[Reprojection], lens: LensModel, bow: bool, skew: bool) -> None:
+    board, shared, local = situation(lens, bow, skew)
+    cameras = Parametrisation(lens, bow, skew).unpack(shared, local)
     pixels = cameras.project(board.points)[0] + torch.randn(P, V, len(board), 2, dtype=D)
-    problem = kind(board.points, pixels, torch.ones(pixels.shape[:-1], dtype=torch.bool), lens, bow)
+    problem = kind(board.points, pixels, torch.ones(pixels.shape[:-1], dtype=torch.bool), lens, bow, skew)
     panel = problem.linearise(shared, local).clone()
     torch.testing.assert_close(
-        panel[:, :, -1], residual(kind, board, pixels, lens, bow, shared, local), rtol=0, atol=1e-10
+        panel[:, :, -1], residual(kind, board, pixels, lens, bow, skew, shared, local), rtol=0, atol=1e-10
     )
-    s = Parametrisation(lens, bow).size
+    s = Parametrisation(lens, bow, skew).size
     # Each direction at once, for every camera and view: a step along it moves all of them.
     zero = torch.zeros(P, V, 6, dtype=D)
     for row in range(s + 6):
@@ -72,7 +77,7 @@ def test_jacobians_are_autograds(kind: type[Reprojection], lens: LensModel, bow:
 
         def along(step: torch.Tensor, direction: torch.Tensor = direction) -> torch.Tensor:
             pose = moved(local, zero + step * direction[s:])
-            return residual(kind, board, pixels, lens, bow, shared + step * direction[:s], pose)
+            return residual(kind, board, pixels, lens, bow, skew, shared + step * direction[:s], pose)
 
         _, want = torch.func.jvp(along, (torch.zeros((), dtype=D),), (torch.ones((), dtype=D),))
         scale = float(want.abs().amax()) + 1e-12

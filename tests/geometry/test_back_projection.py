@@ -57,6 +57,7 @@ def test_equals_the_papers_route(seed: int) -> None:
     assert (error <= 1e-10 * size)[valid & steep].all()
 
 
+@pytest.mark.filterwarnings("ignore:float32:UserWarning")  # a few of the cameras are very close to their plane
 @given(seed=st.integers(0, 2**31))
 def test_float32_is_right_to_a_millionth_of_the_scene(seed: int) -> None:
     camera, plane, pixels, _, _ = draw_scene(seed)

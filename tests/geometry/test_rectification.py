@@ -66,6 +66,85 @@ def test_coarse_views_do_not_alias() -> None:
     assert (top - 0.5).abs().max() < 0.15
 
 
+def facing(width: int, height: int) -> dp.Camera:
+    """A camera straight above the plane's origin, in the middle of whose image a pixel covers a world unit."""
+    K = torch.tensor([[500.0, 0, (width - 1) / 2], [0, 500, (height - 1) / 2], [0, 0, 1]], dtype=D)
+    return dp.Camera(K, t=torch.tensor([0.0, 0, 500], dtype=D), size=(width, height))
+
+
+@pytest.mark.parametrize("side", [2, 3, 5, 8, 10, 13, 20, 33, 40, 64, 80, 100])
+def test_a_pixel_of_a_coarse_view_is_the_mean_of_what_it_covers(side: int) -> None:
+    """Whole pixels of noise and of stripes of every period from 2 to 10: their mean, exactly."""
+    columns = 600 // side
+    period = torch.arange(2, 11)[:, None]
+    stripes = (torch.arange(side * columns) % period < period / 2).to(D)[:, None].expand(-1, 2 * side, -1)
+    image = torch.cat([stripes, torch.rand(1, 2 * side, side * columns, dtype=D)])
+    half = side * columns / 2
+    camera = facing(side * columns, 2 * side)
+    top, valid = dp.rectify(image, camera, dp.Plane.z(0.0), (-half, -side, half, side), side)
+    assert valid.all()
+    want = torch.nn.functional.avg_pool2d(image, side)
+    assert top.shape == want.shape
+    assert (top - want).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize(("side", "share"), [(1.5, 0.18), (2.5, 0.1), (7.9, 0.02), (20.5, 0.005), (70.6, 0.005)])
+def test_a_pixel_of_a_coarse_view_that_cuts_pixels(side: float, share: float) -> None:
+    """Off the mean of white noise under each pixel by at most that share of its spread; as measured, and a bit more."""
+    count = int(700 // side)
+    image, half = torch.rand(1, 800, 800, dtype=D), side * count / 2
+    top, _ = dp.rectify(image, facing(800, 800), dp.Plane.z(0.0), (-half, -half, half, half), side)
+    edges = 400 - half + side * torch.arange(count + 1, dtype=D)
+    pixel = torch.arange(800)
+    cover = torch.minimum(edges[1:, None], pixel + 1.0) - torch.maximum(edges[:-1, None], pixel + 0.0)
+    cover = cover.clamp(min=0) / side
+    want = cover @ image[0] @ cover.T
+    assert (top[0] - want).square().mean().sqrt() < share * want.std()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 1)])
+def test_views_of_a_single_row_or_column_do_not_alias(shape: tuple[int, int]) -> None:
+    rows, columns = shape
+    image = torch.rand(1, 40 * rows, 40 * columns, dtype=D)
+    extent = (-20 * columns, -20 * rows, 20 * columns, 20 * rows)
+    top, valid = dp.rectify(image, facing(40 * columns, 40 * rows), dp.Plane.z(0.0), extent, 40.0)
+    assert valid.all()
+    assert (top - torch.nn.functional.avg_pool2d(image, 40)).abs().max() < 1e-9
+
+
+def test_footprints_are_measured_along_each_side() -> None:
+    """Pixels 40 px wide and 1 px high take the mean over their width only."""
+    image = torch.rand(1, 60, 400, dtype=D)
+    flat = torch.tensor([[500.0, 0, 199.5], [0, 500 / 40, 29.5], [0, 0, 1]], dtype=D)
+    camera = dp.Camera(flat, t=torch.tensor([0.0, 0, 500], dtype=D), size=(400, 60))
+    top, _ = dp.rectify(image, camera, dp.Plane.z(0.0), (-200, -1200, 200, 1200), 40.0)
+    want = torch.nn.functional.avg_pool2d(image, (1, 40))
+    assert (top - want).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("resolution", [20.0, 7.0, 3.3, 300.0])
+def test_the_way_back_at_an_extent_that_is_no_multiple_of_the_resolution(resolution: float) -> None:
+    """Both fill the extent: where the top view says that a place is, `render` puts it."""
+    extent = (-101.0, -58.0, 108.0, 63.0)
+    column = torch.arange(640, dtype=D).expand(1, 480, 640)
+    row = torch.arange(480, dtype=D)[:, None].expand(1, 480, 640)
+    camera = facing(640, 480)
+    s, t = column - 319.5, row - 239.5  # the image shows where it is
+    top, valid = dp.rectify(torch.cat([s, t]), camera, dp.Plane.z(0.0), extent, resolution)
+    assert valid.all()
+    rows, columns = top.shape[-2:]
+    assert (rows, columns) == (max(1, round(121 / resolution)), max(1, round(209 / resolution)))
+    want_s = -101 + (torch.arange(columns, dtype=D) + 0.5) * 209 / columns
+    want_t = -58 + (torch.arange(rows, dtype=D) + 0.5) * 121 / rows
+    assert (top[0] - want_s).abs().max() < 0.03 * resolution
+    assert (top[1] - want_t[:, None]).abs().max() < 0.03 * resolution
+    if rows > 1:
+        back, shown = dp.render(top, camera, dp.Plane.z(0.0), extent)
+        inner = (s[0] > want_s[0]) & (s[0] < want_s[-1]) & (t[0] > want_t[0]) & (t[0] < want_t[-1])
+        assert shown[inner].all()
+        assert (back - torch.cat([s, t]))[:, inner].abs().max() < 0.06 * resolution
+
+
 def test_outside_of_the_image_is_not_valid() -> None:
     image = torch.ones(1, 480, 640, dtype=D)
     top, valid = dp.rectify(image, above(), dp.Plane.z(0.0), (-3000, -3000, 3000, 3000), 20.0)
@@ -216,7 +295,18 @@ def test_bad_input_is_refused_by_name() -> None:
     bare = dp.Camera(above().K, above().R, above().t)
     cases = [
         (TypeError, "image: want a floating-point tensor", lambda: dp.rectify(image.int(), above(), z, EXTENT, 1.0)),
-        (ValueError, "extent: want", lambda: dp.rectify(image, above(), z, (0, 0, 0, 1), 1.0)),
+        *(
+            (ValueError, "extent: want finite", lambda extent=extent: dp.rectify(image, above(), z, extent, 1.0))
+            for extent in ((0, 0, 0, 1), (0, 0, 1), (0, 0, 1, float("inf")), (0, 0, float("nan"), 1))
+        ),
+        (ValueError, "extent: want finite", lambda: dp.render(image, above(), z, (0, 0, 1))),
+        (ValueError, "resolution: want", lambda: dp.rectify(image, above(), z, EXTENT, float("nan"))),
+        (ValueError, "texture: want shape", lambda: dp.render(image[0], above(), z, EXTENT)),
+        (
+            ValueError,
+            r"batch shapes do not broadcast: image \(3,\), camera \(2,\), plane \(\)",
+            lambda: dp.rectify(image.expand(3, 1, 48, 64), above().expand(2), z, EXTENT, 1.0),
+        ),
         (ValueError, "resolution: want", lambda: dp.rectify(image, above(), z, EXTENT, 0.0)),
         (ValueError, "size: want", lambda: dp.render(image, bare, z, EXTENT)),
         (TypeError, "camera: want dp.Camera", lambda: dp.render(image, None, z, EXTENT)),

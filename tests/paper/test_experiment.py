@@ -47,6 +47,17 @@ def test_the_lens_costs_about_half_a_millimetre(views: dp.Views) -> None:
     assert 0.35 < max(total.mean[:2]) < 1.0
 
 
+def test_error_bars_in_test_views_hold_what_the_fit_leaves_open(views: dp.Views) -> None:
+    outcome = run(views)
+    assert torch.equal(outcome.test.covariance.shared, outcome.fit.covariance.shared)
+    held = dp.locate(views[8:], outcome.board, outcome.fit.camera)
+    assert torch.equal(outcome.test.cameras.t, held.cameras.t)
+    corners = views.pixels[8, [0, 53]]
+    full, noise_alone = (dp.measure(corners, found, dp.Plane.z(0.0)) for found in (outcome.test, held))
+    assert full.includes_intrinsics
+    assert (full.lengths().deviation > noise_alone.lengths().deviation).all()
+
+
 def test_errors_are_what_equations_15_to_17_say(views: dp.Views) -> None:
     outcome = run(views)
     row = outcome.rows[2]

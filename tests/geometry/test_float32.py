@@ -1,0 +1,79 @@
+"""Scenes far from the world's origin: where float32 rounds them visibly, somebody says so."""
+
+import warnings
+
+import pytest
+import torch
+
+import diffproj as dp
+
+D, S = torch.float64, torch.float32
+GROUND = dp.Plane.z(0.0)
+PIXELS = torch.tensor([[100.0, 400], [320, 300], [600, 450]], dtype=D)
+
+
+def camera_at(x: float, height: float = 10.0) -> dp.Camera:
+    """A camera above the ground, far from the world's origin, looking down at a slant."""
+    K = torch.tensor([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]], dtype=D)
+    R = dp.rotation_from_euler(*torch.tensor([2.6, 0.2, 0.3], dtype=D))
+    center = torch.tensor([x, 0.5 * x, height], dtype=D)
+    return dp.Camera(K, R, -(R @ center), size=(640, 480))
+
+
+def warned(text: str):
+    return pytest.warns(UserWarning, match=rf"float32: .* rounding moves places on the plane by {text} of the camera's")
+
+
+@pytest.mark.parametrize(("x", "share"), [(1e4, "0.0001"), (1e5, "0.001"), (1e6, "0.01"), (5e6, "0.01")])
+def test_what_is_warned_of_is_how_far_points_are_off(x: float, share: str) -> None:
+    exact = camera_at(x)
+    wanted, _ = dp.back_project(PIXELS, exact, GROUND)
+    with warned(share):
+        points, valid = dp.back_project(PIXELS.float(), exact.to(S), GROUND)
+    assert valid.all()
+    off = float((points - wanted).norm(dim=-1).mean())
+    assert 0.1 * float(share) < off / 10.0 < 10 * float(share)
+
+
+def test_uses_of_a_plane_warn() -> None:
+    far = camera_at(1e6).to(S)
+    image = torch.rand(1, 48, 64)
+    extent = (1e6, 5e5, 1e6 + 8, 5e5 + 8)
+    uses = [
+        lambda: dp.PlaneMap(far, GROUND),
+        lambda: dp.PlaneProjector(far, GROUND),
+        lambda: dp.explain(PIXELS.float(), far, GROUND),
+        lambda: dp.ground_resolution(PIXELS.float(), far, GROUND),
+        lambda: dp.rectify(image, far.resized((64, 48)), GROUND, extent, 0.5),
+        lambda: dp.measure(PIXELS.float(), far, GROUND, pixel_sigma=0.5),
+        lambda: dp.back_project(PIXELS.float()[None], dp.Camera.stack([camera_at(0.0).to(S), far])[:, None], GROUND),
+    ]
+    for use in uses:
+        with warned("0.01"):
+            use()
+    with warned("0.01"):  # not the distance from the origin counts, but that in units of the distance from the plane
+        dp.back_project(PIXELS.float(), camera_at(1e3, 0.01).to(S), GROUND)
+
+
+def test_scenes_near_the_origin_and_float64_do_not_warn() -> None:
+    for camera in (camera_at(0.0), camera_at(3e3), camera_at(0.0, 1e7), camera_at(1e9, 1e8), camera_at(0.0, 1e-7)):
+        dp.back_project(PIXELS.float(), camera.to(S), GROUND)
+        dp.back_project(PIXELS, camera, GROUND)
+    dp.back_project(PIXELS, camera_at(1e7), GROUND)
+    on_plane = dp.Camera(camera_at(0.0).K, t=torch.zeros(3, dtype=D)).to(S)
+    assert not dp.back_project(PIXELS.float(), on_plane, GROUND)[1].any()
+
+
+def test_transforms_do_not_look() -> None:
+    far = camera_at(1e6).to(S)
+    torch.func.vmap(lambda t: dp.back_project(PIXELS.float(), far.at(far.R, t), GROUND)[0])(far.t[None])
+
+
+@pytest.mark.plain
+def test_the_warning_points_at_the_caller_and_comes_once() -> None:
+    far = camera_at(1e6).to(S)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("default")
+        for _ in range(5):
+            dp.back_project(PIXELS.float(), far, GROUND)
+    assert [warning.filename for warning in seen] == [__file__]
