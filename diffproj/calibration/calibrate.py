@@ -12,6 +12,7 @@ from diffproj.calibration import start
 from diffproj.calibration.data import Data
 from diffproj.calibration.options import CalibrationOptions, calibration_options
 from diffproj.calibration.outcome import minimised, outcome
+from diffproj.calibration.restraint import restrained
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.second_look import second_look
 from diffproj.lens.models import LensModel, model_named
@@ -56,6 +57,7 @@ def calibrate(
     # The start is a guess from the corners; what is held, or known, is not.
     reference = shared.clone()
     reference[:, :2], reference[:, 4:] = torch.nan, 0.0
+    near = None
     if model.count > 5:
         # The rational terms nearly cancel each other: from far off they lead into side valleys.
         early = chosen.but(
@@ -64,9 +66,11 @@ def calibrate(
             reject_outliers=False,
             loss=None if chosen.objective == "plane" else chosen.loss,  # its scale is in world units
         )
-        near, _ = minimised(data, early, distortion, shared, local, reference)
-        shared, local = near.solution.shared, near.solution.local
+        poorer, _ = minimised(data, early, distortion, shared, local, reference)
+        shared, local = near = poorer.solution.shared, poorer.solution.local
     found, _ = minimised(data, chosen, distortion, shared, local, reference)
     limits = {"max_iterations": chosen.max_iterations, "tolerance": chosen.tolerance}
     found = second_look(found, straight, reject=chosen.outlier_limit, **limits)
+    if near is not None:
+        found = restrained(found, *near, views.size, reject=chosen.outlier_limit, **limits)
     return outcome("calibrate", data, found, views.size, chosen.throw)

@@ -65,13 +65,12 @@ class Fit:
 
     def plain_covariance(self) -> Covariance:
         """The covariance for least squares with equal weights."""
-        prior = self.task.prior
         return covariances.covariance(
             self.solution.equations,
             self.task.names,
             self.residual_variance(),
             basis=self.task.basis,
-            precision=None if prior is None else prior.precision,
+            precision=self._measured_precision(),
         )
 
     def covariance(self) -> Covariance:
@@ -94,6 +93,10 @@ class Fit:
         s = len(task.names)
         U = H[..., :s, :s].sum(1)
         precision = None if task.prior is None else task.prior.precision
+        spread = self._measured_precision()
+        if precision is not None and spread is not None and spread is not precision:
+            # What only restrains is as uncertain as the residuals say.
+            spread = spread + self.residual_variance().nan_to_num(0.0)[:, None, None] * (precision - spread)
         return covariances.covariance(
             Equations(
                 U if precision is None else U + precision,
@@ -104,9 +107,13 @@ class Fit:
             task.names,
             torch.ones_like(U[:, 0, 0]),
             basis=task.basis,
-            precision=precision,
+            precision=spread,
             scores=Scores(M[..., :s, :s], M[..., :s, s:], M[..., s:, s:]),
         )
+
+    def _measured_precision(self) -> Tensor | None:
+        prior = self.task.prior
+        return None if prior is None else prior.precision if prior.known is None else prior.known
 
     def _finite_sample_factor(self, weight: Tensor, slope: Tensor, bend: Tensor, squared: Tensor) -> Tensor:
         """Finite-sample correction of the sandwich covariance: how much fitting shrinks squared scores, `(P,)`.

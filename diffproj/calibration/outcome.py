@@ -6,6 +6,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from diffproj.calibration.adequacy import remarks
 from diffproj.calibration.constraints import free_basis, held_at, make_prior
 from diffproj.calibration.covariance import Covariance, reshaped
 from diffproj.calibration.data import Data
@@ -92,6 +93,7 @@ def outcome(
         causes,
         shaped(found.pixel_sigma()),
         partial(_covariance, found, tuple(batch), known),
+        partial(remarks, found, status, size),
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -77,6 +78,7 @@ class Calibration:
     causes: tuple[str, ...] = ()
     pixel_sigma: Float[Tensor, "*batch"] | None = None
     _covariance: Callable[[], Covariance] | None = None
+    _remarks: Callable[[], tuple[str, ...]] | None = None
 
     @property
     def board_points(self) -> Float[Tensor, "*batch n 3"]:
@@ -97,26 +99,24 @@ class Calibration:
 
     @property
     def residuals(self) -> Float[Tensor, "*batch v n 2"]:
-        """Projected minus seen corners `(*B, V, N, 2)` in pixels; zero where a corner was not used."""
-        return self._residuals()[0]
+        """Projected minus seen corners `(*B, V, N, 2)` in pixels; zero where a corner was not used.
+
+        Infinite where one was used that the camera does not project, for it lies beyond the fold of the lens. (A
+        calibration that has converged has none.)
+        """
+        points = self.board_points.unsqueeze(-3)
+        residuals, projected = projected_minus_seen(self.cameras, points, self.views.pixels, self.used)
+        return torch.where((self.used & ~projected).unsqueeze(-1), torch.inf, residuals)
 
     @property
     def view_rms(self) -> Float[Tensor, "*batch v"]:
-        """RMS reprojection error of each view `(*B, V)` in pixels; NaN where no corner was used."""
-        residuals, count = self._residuals()
-        return (residuals.square().sum(dim=(-2, -1)) / count).sqrt()
+        """RMS reprojection error of each view `(*B, V)` in pixels; NaN where no corner was used; see `residuals`."""
+        return (self.residuals.square().sum(dim=(-2, -1)) / self.used.sum(-1)).sqrt()
 
     @property
     def rms(self) -> Float[Tensor, "*batch"]:
         """RMS reprojection error `(*B,)` in pixels as OpenCV defines it: `sqrt(sum |e|^2 / number of points)`."""
-        residuals, count = self._residuals()
-        return (residuals.square().sum(dim=(-3, -2, -1)) / count.sum(-1)).sqrt()
-
-    def _residuals(self) -> tuple[Tensor, Tensor]:
-        """The residuals, and how many corners of each view there are; one beyond the lens's fold does not count."""
-        points = self.board_points.unsqueeze(-3)
-        residuals, counts = projected_minus_seen(self.cameras, points, self.views.pixels, self.used)
-        return residuals, counts.sum(-1)
+        return (self.residuals.square().sum(dim=(-3, -2, -1)) / self.used.sum((-2, -1))).sqrt()
 
     @property
     def converged(self) -> Bool[Tensor, "*batch"]:
@@ -125,19 +125,22 @@ class Calibration:
 
     @property
     def message(self) -> str:
-        """How it ended, in a sentence; for many cameras, how many converged and what became of the others."""
+        """How it ended, in a sentence, and the remarks; for many cameras, how many converged and why others did not."""
         codes = [Status(code) for code in self.status.flatten().tolist()]
         causes = [cause or SENTENCES[code] for code, cause in zip(codes, self._causes(), strict=True)]
-        beyond = (self.used.sum(-1) - self._residuals()[1]).sum(-1).flatten().tolist()
-        causes = [
-            f"{cause}; {_counted(count)} beyond the fold of the lens: fit one with fewer coefficients" * bool(count)
-            or cause
-            for cause, count in zip(causes, beyond, strict=True)
-        ]
         if not self.views.batch_shape:
-            return causes[0]
+            return "; ".join([causes[0], *filter(None, self.remarks)])
         failed = [f"camera {i}: {c}" for i, (s, c) in enumerate(zip(codes, causes, strict=True)) if s]
         return "; ".join([f"{len(codes) - len(failed)} of {len(codes)} cameras converged", *failed])
+
+    @cached_property
+    def remarks(self) -> tuple[str, ...]:
+        """What is to be known of each camera that converged, `*B` flattened; empty where nothing is.
+
+        That its lens had to be kept from folding, or ends inside the image. Computed at the first call; empty for a
+        calibration from a file.
+        """
+        return self._remarks() if self._remarks is not None else ("",) * max(1, self.status.numel())
 
     @property
     def has_covariance(self) -> bool:
@@ -197,10 +200,6 @@ class Calibration:
 
     def _causes(self) -> tuple[str, ...]:
         return self.causes or ("",) * max(1, self.status.numel())
-
-
-def _counted(corners: int) -> str:
-    return "1 corner lies" if corners == 1 else f"{corners} corners lie"
 
 
 def _spread(deviation: Tensor | None, form: str) -> str:

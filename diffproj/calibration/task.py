@@ -69,7 +69,7 @@ class Task:
         """The task of some of the cameras."""
         cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}
         cut |= {name: None if (whole := getattr(self, name)) is None else whole[where] for name in ("weights", "basis")}
-        prior = None if self.prior is None else Prior(*(part[where] for part in self.prior))
+        prior = None if self.prior is None else self.prior.part(where)
         return replace(self, **cut, prior=prior)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Unpack
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from diffproj.calibration.calibrate import calibrate
@@ -32,6 +32,8 @@ class CrossValidation:
         held_out_px: the same for the held-out corners, `(k,)`.
         in_sample_world: RMS error of the fitted corners, back-projected onto the board, in world units `(k,)`.
         held_out_world: the same for the held-out corners, `(k,)`.
+        lost: how many held-out corners lie beyond the fold of the lens that was fitted without them, `(k,)`. Where
+            there are any, the fold's errors are infinite.
     """
 
     fits: Calibration
@@ -39,6 +41,7 @@ class CrossValidation:
     held_out_px: Float[Tensor, " k"]
     in_sample_world: Float[Tensor, " k"]
     held_out_world: Float[Tensor, " k"]
+    lost: Int[Tensor, " k"]
 
     def summary(self) -> str:
         """A table of text: each fold, and the root mean square over the folds."""
@@ -49,6 +52,12 @@ class CrossValidation:
         lines += [
             f"{n:<4} {a:11.4f} {b:13.4f} {c:14.4f} {d:16.4f}" for n, (a, b, c, d) in zip(names, rows, strict=True)
         ]
+        if bool(self.lost.any()):
+            which = ", ".join(str(i + 1) for i in self.lost.nonzero().flatten().tolist())
+            lines.append(
+                f"{int(self.lost.sum())} held-out corners lie beyond the fold of the lens that was fitted without them "
+                f"(fold {which}): take one with fewer coefficients"
+            )
         return "\n".join(lines)
 
 
@@ -63,6 +72,7 @@ def cross_validate(
 
     The pose of a held-out view is estimated from every second corner and evaluated on the others, then with the roles
     exchanged, so that no corner is evaluated with a pose that it contributed to.
+    (A view of which less than 4 of these are visible is not evaluated.)
 
     Args:
         views: corners `(V, N, 2)` of one camera; view i is left out of fit i mod k.
@@ -96,11 +106,14 @@ def cross_validate(
     second = torch.arange(views.pixels.shape[-2], device=views.device) % 2 == 1
     errors = []
     for posing in (second, ~second):
-        located = locate(held_out.hiding(posing), target, fits.camera)
-        errors.append(_squared_errors(located, held_out.hiding(~posing)))
-    px, world = (_rms([error[i] for error in errors], [error[2] for error in errors]) for i in range(2))
-    in_sample = _squared_errors(fits, Views.unchecked(every.pixels, fits.used, every.names, every.size))
-    return CrossValidation(fits, _rms([in_sample[0]], [in_sample[2]]), px, _rms([in_sample[1]], [in_sample[2]]), world)
+        located = locate(held_out.hiding(posing), target, fits.camera, throw=False)
+        if bool((located.covariance.undetermined_views & located.used.any(-1)).any()):
+            raise CalibrationError(f"cross_validate: a held-out view has no pose: {located.message}", located)
+        posed = located.used.any(-1, keepdim=True)
+        errors.append(_squared_errors(located, every.pixels, held_out.hiding(~posing).visible & posed))
+    held_out_px, held_out_world, lost = _rms(errors)
+    in_sample_px, in_sample_world, _ = _rms([_squared_errors(fits, every.pixels, fits.used)])
+    return CrossValidation(fits, in_sample_px, held_out_px, in_sample_world, held_out_world, lost)
 
 
 def bootstrap(
@@ -162,16 +175,22 @@ def _repeated(views: Views, count: int) -> Views:
     return Views.unchecked(pixels, views.visible.expand(count, *views.visible.shape), views.names, views.size)
 
 
-def _squared_errors(calibration: Calibration, evaluated: Views) -> tuple[Tensor, Tensor, Tensor]:
-    """Sums of squared errors `(k,)` in pixels and in world units over the evaluated corners, and their number."""
-    cameras, pixels = calibration.cameras, evaluated.pixels.to(calibration.points)
-    px, seen = projected_minus_seen(cameras, calibration.board_points.unsqueeze(-3), pixels, evaluated.visible)
-    world, on_plane = put_back_minus_known(cameras, calibration.points, pixels, evaluated.visible)
-    counts = seen & on_plane
-    px, world = px.square().sum(-1), world[..., :2].square().sum(-1)
-    total = [torch.where(counts, part, 0.0).sum((-2, -1)) for part in (px, world)]
-    return total[0], total[1], counts.sum((-2, -1))
+def _squared_errors(
+    calibration: Calibration, pixels: Tensor, evaluated: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Sums of squared errors `(k,)` in pixels and in world units over the corners evaluated `(k, V, N)`.
+
+    With them the number of these corners, and of those that the camera does not see. The latter's error is infinite.
+    """
+    cameras, pixels = calibration.cameras, pixels.to(calibration.points)
+    px, seen = projected_minus_seen(cameras, calibration.board_points.unsqueeze(-3), pixels, evaluated)
+    world, landed = put_back_minus_known(cameras, calibration.points, pixels, evaluated)
+    in_px = torch.where(evaluated & ~seen, torch.inf, px.square().sum(-1)).sum((-2, -1))
+    in_world = torch.where(evaluated & ~landed, torch.inf, world[..., :2].square().sum(-1)).sum((-2, -1))
+    return in_px, in_world, evaluated.sum((-2, -1)), (evaluated & ~(seen & landed)).sum((-2, -1))
 
 
-def _rms(sums: list[Tensor], counts: list[Tensor]) -> Tensor:
-    return (torch.stack(sums).sum(0) / torch.stack(counts).sum(0)).sqrt()
+def _rms(parts: list[tuple[Tensor, ...]]) -> tuple[Tensor, Tensor, Tensor]:
+    """RMS errors `(k,)` in pixels and in world units, and the number of corners that the cameras do not see."""
+    px, world, count, lost = (torch.stack(columns).sum(0) for columns in zip(*parts, strict=True))
+    return (px / count).sqrt(), (world / count).sqrt(), lost

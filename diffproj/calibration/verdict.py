@@ -7,6 +7,7 @@ from torch import Tensor
 
 from diffproj.calibration.closed_form import homographies
 from diffproj.calibration.fit import Fit
+from diffproj.calibration.reach import folds_at_corners, lost_corners
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import mean_squares
@@ -45,11 +46,13 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     unknown[:, :4] |= ~(std <= MAX_RELATIVE_STD * solution.shared[:, :1].abs())
     none = ~used.any(-1)
     finite = solution.cost.isfinite()
+    folded = finite & ~no_pose.any(-1) & folds_at_corners(task, solution.shared, solution.local)
     redundant = (found.degrees_of_freedom() > 0) | (task.prior is not None)
-    if task.basis is not None and task.basis.shape[-1] == 0:  # poses only: four corners leave two degrees of freedom
+    poses_only = task.basis is not None and task.basis.shape[-1] == 0
+    if poses_only:  # four corners leave two degrees of freedom
         unknown[:] = False
     status = solution.status
-    degenerate = none | mirrored.any(-1) | misfits.any(-1) | unknown.any(-1) | no_pose.any(-1) | ~redundant
+    degenerate = none | mirrored.any(-1) | misfits.any(-1) | unknown.any(-1) | no_pose.any(-1) | ~redundant | folded
     status = torch.where(degenerate & finite & (status != Status.DIVERGED), Status.DEGENERATE, status)
     causes = [""] * len(status)
     if not bool(status.any()):
@@ -70,6 +73,8 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
             causes[p] = (
                 f"the corners of {_joined_names(names, no_pose[p])} do not determine a pose: do they lie on a line?"
             )
+        elif bool(folded[p]) and (poses_only or not bool(misfits[p].any())):
+            causes[p] = _folded(task, int(lost_corners(task, solution.shared, solution.local)[p].sum()))
         elif bool(misfits[p].any()):
             causes[p] = (
                 f"the corners of {_joined_names(names, misfits[p])} do not match the board: "
@@ -118,6 +123,14 @@ def _mirrored(R: Tensor, t: Tensor, points: Tensor, used: Tensor, board: object)
     else:
         expected = 2 * (away & used).sum(-1, keepdim=True) >= used.sum(-1, keepdim=True)
     return used & (away != expected)
+
+
+def _folded(task: Task, count: int) -> str:
+    what = f"{'1 corner lies' if count == 1 else f'{count} corners lie'} beyond the fold of the lens"
+    if task.basis is not None and task.basis.shape[-1] == 0:
+        return f"{what}: hide {'it' if count == 1 else 'them'}, or take a camera whose lens reaches as far"
+    other = "'brown5'" if task.lens == "fisheye" else "'brown5' or 'fisheye'" if len(task.names) > 9 else "'fisheye'"
+    return f"{what}: fit distortion={other}, which may reach as far"
 
 
 def _undetermined(lacking: list[str], R: Tensor, foreshortening: Tensor, free_principal_point: bool) -> str:
