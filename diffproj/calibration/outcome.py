@@ -93,7 +93,7 @@ def outcome(
         causes,
         shaped(found.pixel_sigma()),
         partial(_covariance, found, tuple(batch), known),
-        partial(remarks, found, status, size),
+        partial(remarks, found, status),
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)

@@ -8,13 +8,11 @@ that it was fitted to is no calibration.
 import torch
 from torch import Tensor
 
+from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.parametrisation import Pose
 from diffproj.calibration.task import Task
 from diffproj.lens.brown_domain import clearly_one_to_one
 from diffproj.lens.models import MODELS
-
-BORDER = 16
-"""Pixels along each side of the image that are looked at."""
 
 
 def folds_at_corners(task: Task, shared: Tensor, poses: Pose) -> Tensor:
@@ -43,13 +41,6 @@ def lost_corners(task: Task, shared: Tensor, poses: Pose) -> Tensor:
 def reaches_image(task: Task, shared: Tensor, size: tuple[int, int]) -> Tensor:
     """Which part of the image's border has rays `(P,)`, from 0 to 1."""
     with torch.no_grad():
-        width, height = size
-        along = torch.linspace(0, 1, BORDER + 1, dtype=shared.dtype, device=shared.device)[:-1]
-        zero, one = torch.zeros_like(along), torch.ones_like(along)
-        unit = torch.cat(
-            [torch.stack(side, -1) for side in ((along, zero), (one, along), (1 - along, one), (zero, 1 - along))]
-        )
-        border = unit * unit.new_tensor([width - 1.0, height - 1.0])
         upright = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(len(shared), 3, 3)
-        camera = task.parameters.unpack(shared.detach().clone(), (upright, torch.zeros_like(upright[..., 0])))
-        return camera.directions(border)[1].to(shared).mean(-1)
+        pose = upright, torch.zeros_like(upright[..., 0])
+        return border_with_rays(task.parameters.unpack(shared.detach().clone(), pose), size)

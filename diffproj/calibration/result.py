@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.bow import bowed
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.parametrisation import BOW, Parametrisation
@@ -137,8 +138,9 @@ class Calibration:
     def remarks(self) -> tuple[str, ...]:
         """What is to be known of each camera that converged, `*B` flattened; empty where nothing is.
 
-        That its lens had to be kept from folding, or ends inside the image. Computed at the first call; empty for a
-        calibration from a file.
+        That its lens had to be kept from folding; that the residuals are no noise, but change smoothly over the image,
+        repeat on the board, or are large; and what to try. Computed at the first call; empty for a calibration from a
+        file.
         """
         return self._remarks() if self._remarks is not None else ("",) * max(1, self.status.numel())
 
@@ -196,7 +198,11 @@ class Calibration:
             remark = f"  without corners {', '.join(map(str, out))}" if out and used[view] else ""
             text = f"{rms:.4f} px{remark}" if used[view] else f"left out: {seen[view] - len(out)} corners, 4 are needed"
             lines.append(f"  {name:<{width}}  {text}")
-        return "\n".join([*lines, self.message])
+        if self.camera.size is not None and (share := float(border_with_rays(self.camera, self.camera.size))) < 1:
+            lines.append(
+                f"{'image':<16}{100 * (1 - share):.0f} % of its border lies beyond the fold of the lens: no rays"
+            )
+        return "\n".join([*lines, *self.message.split("; ")])
 
     def _causes(self) -> tuple[str, ...]:
         return self.causes or ("",) * max(1, self.status.numel())

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from diffproj.calibration.adequacy import gravely_inadequate, other_lens, poses_only
 from diffproj.calibration.closed_form import homographies
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.reach import folds_at_corners, lost_corners
@@ -48,11 +49,14 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     finite = solution.cost.isfinite()
     folded = finite & ~no_pose.any(-1) & folds_at_corners(task, solution.shared, solution.local)
     redundant = (found.degrees_of_freedom() > 0) | (task.prior is not None)
-    poses_only = task.basis is not None and task.basis.shape[-1] == 0
-    if poses_only:  # four corners leave two degrees of freedom
+    held = poses_only(task)
+    if held:  # four corners leave two degrees of freedom
         unknown[:] = False
     status = solution.status
-    degenerate = none | mirrored.any(-1) | misfits.any(-1) | unknown.any(-1) | no_pose.any(-1) | ~redundant | folded
+    wrong_lens = finite & ~folded & gravely_inadequate(found)
+    degenerate = (
+        none | mirrored.any(-1) | misfits.any(-1) | unknown.any(-1) | no_pose.any(-1) | ~redundant | folded | wrong_lens
+    )
     status = torch.where(degenerate & finite & (status != Status.DIVERGED), Status.DEGENERATE, status)
     causes = [""] * len(status)
     if not bool(status.any()):
@@ -73,8 +77,12 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
             causes[p] = (
                 f"the corners of {_joined_names(names, no_pose[p])} do not determine a pose: do they lie on a line?"
             )
-        elif bool(folded[p]) and (poses_only or not bool(misfits[p].any())):
+        elif bool(folded[p]) and (held or not bool(misfits[p].any())):
             causes[p] = _folded(task, int(lost_corners(task, solution.shared, solution.local)[p].sum()))
+        elif bool(wrong_lens[p]):
+            sigma = f"{float(found.pixel_sigma()[p]):.1f} px in each coordinate"
+            remedy = other_lens(task, p, radial=True)
+            causes[p] = f"the residuals, {sigma}, change smoothly over the image, as through another lens: {remedy}"
         elif bool(misfits[p].any()):
             causes[p] = (
                 f"the corners of {_joined_names(names, misfits[p])} do not match the board: "
