@@ -45,6 +45,7 @@ from importlib import import_module
 from typing import Any
 
 from diffproj.calibration.calibrate import calibrate
+from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.locate import locate
 from diffproj.calibration.losses import Cauchy, Huber, Loss, SoftL1
@@ -103,6 +104,7 @@ __all__ = [
     "LearnableCamera",
     "LearnablePlane",
     "Lens",
+    "LensComparison",
     "LocateOptions",
     "Loss",
     "Measurement",

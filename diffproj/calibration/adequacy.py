@@ -26,6 +26,8 @@ GRAVE_PX = 2.0
 GRAVE_SHARE = 0.5
 """Standard deviation of a coordinate, and part of the sum of squares that a better lens would explain, above which a
 fit is no calibration: its error bars, which take the model for right, would say nothing."""
+LENS_WORDS = "change smoothly"
+"""What is said of residuals that another lens would explain."""
 
 
 def remarks(found: Fit, status: Tensor) -> tuple[str, ...]:
@@ -89,7 +91,7 @@ def _left_over(task: Task, left: Leftover, i: int, p: int, sigma: float) -> str:
             where = "with the distance from the principal point" if radial else "over the image"
             part = f"{100 * float(effect.share[i]):.0f} % of their sum of squares"
             remedy = other_lens(task, p, radial)
-            return f"the residuals change smoothly {where}, as through another lens ({part}): {remedy}"
+            return f"the residuals {LENS_WORDS} {where}, as through another lens ({part}): {remedy}"
     if int(task.used[p].any(-1).sum()) >= SHAPE_VIEWS and counts(left.shape, SHAPE_SHARE):
         if counts(left.bow, BOW_PART * float(left.shape.share[i])):
             return "the residuals repeat on the board, as if it were bent: take bow=True"

@@ -114,13 +114,13 @@ class _Scores:
         explained, points, moves = self._moved_points()
         shape = _effect(explained, points, _total(self.residual), self.count)
         rest = self.residual - torch.einsum("pvikn,pni->pvkn", self.by_point, moves)
-        radial = self._radial()
+        rings = self._radial()
         known = shape.deviations > shape_deviations
         radial, smooth = (
             self._added(columns, self.residual, self.count).besides(
                 self._added(columns, rest, self.count - points), known
             )
-            for columns in (radial, torch.cat([radial, self._fields()], dim=2))
+            for columns in (rings, torch.cat([rings, self._fields()], dim=2))
         )
         bow = self._added(self._bow(), self.residual, self.count)
         return Leftover(radial, smooth, shape, bow, self._spread(moves))

@@ -1,7 +1,7 @@
 """`Calibration`: a camera with the poses of its views, what is left over, how it ended, and how sure it is."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.bow import bowed
+from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.parametrisation import BOW, Parametrisation
 from diffproj.calibration.solver import Status
@@ -64,6 +65,7 @@ class Calibration:
         causes: for each camera that did not converge, the cause in words; `*B` flattened.
         pixel_sigma: the standard deviation of a corner's coordinate in pixels, as the residuals tell it `(*B,)`: their
             root mean square over the degrees of freedom; under a robust loss, 1.4826 times their median.
+        comparison: how the lenses fared, where `distortion="auto"` compared them.
     """
 
     camera: Camera
@@ -78,6 +80,7 @@ class Calibration:
     objective: Objective = "image"
     causes: tuple[str, ...] = ()
     pixel_sigma: Float[Tensor, "*batch"] | None = None
+    comparison: LensComparison | None = field(default=None, kw_only=True)
     _covariance: Callable[[], Covariance] | None = None
     _remarks: Callable[[], tuple[str, ...]] | None = None
 
@@ -127,12 +130,11 @@ class Calibration:
     @property
     def message(self) -> str:
         """How it ended, in a sentence, and the remarks; for many cameras, how many converged and why others did not."""
-        codes = [Status(code) for code in self.status.flatten().tolist()]
-        causes = [cause or SENTENCES[code] for code, cause in zip(codes, self._causes(), strict=True)]
+        ends = self._ends()
         if not self.views.batch_shape:
-            return "; ".join([causes[0], *filter(None, self.remarks)])
-        failed = [f"camera {i}: {c}" for i, (s, c) in enumerate(zip(codes, causes, strict=True)) if s]
-        return "; ".join([f"{len(codes) - len(failed)} of {len(codes)} cameras converged", *failed])
+            return "; ".join([ends[0], *filter(None, self.remarks)])
+        failed = [f"camera {i}: {ends[i]}" for i in self.status.flatten().nonzero().flatten().tolist()]
+        return "; ".join([f"{len(ends) - len(failed)} of {len(ends)} cameras converged", *failed])
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
@@ -202,10 +204,12 @@ class Calibration:
             lines.append(
                 f"{'image':<16}{100 * (1 - share):.0f} % of its border lies beyond the fold of the lens: no rays"
             )
-        return "\n".join([*lines, *self.message.split("; ")])
+        return "\n".join([*lines, self._ends()[0], *filter(None, self.remarks[0].split("; "))])
 
-    def _causes(self) -> tuple[str, ...]:
-        return self.causes or ("",) * max(1, self.status.numel())
+    def _ends(self) -> list[str]:
+        """How each camera ended, in a sentence."""
+        codes = [Status(code) for code in self.status.flatten().tolist()]
+        return [cause or SENTENCES[code] for code, cause in zip(codes, self.causes or ("",) * len(codes), strict=True)]
 
 
 def _spread(deviation: Tensor | None, form: str) -> str:

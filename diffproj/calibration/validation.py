@@ -13,11 +13,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from diffproj.calibration.calibrate import calibrate
-from diffproj.calibration.locate import locate
-from diffproj.calibration.options import CalibrationOptions
+from diffproj.calibration.held_out import errors_of, folds_of, repeated, without_views
+from diffproj.calibration.options import CalibrationOptions, calibration_options
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.lens.models import LensModel
-from diffproj.targets.residuals import projected_minus_seen, put_back_minus_known
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
@@ -71,8 +70,8 @@ def cross_validate(
     """Refit without each of k folds of the views, and evaluate on the held-out fold.
 
     The pose of a held-out view is estimated from every second corner and evaluated on the others, then with the roles
-    exchanged, so that no corner is evaluated with a pose that it contributed to.
-    (A view of which less than 4 of these are visible is not evaluated.)
+    exchanged, so that no corner is evaluated with a pose that it contributed to. (A view with fewer than 4 such corners
+    is not evaluated.)
 
     Args:
         views: corners `(V, N, 2)` of one camera; view i is left out of fit i mod k.
@@ -97,22 +96,10 @@ def cross_validate(
         raise ValueError("bow: want False, for held-out views are located on a flat board")
     if not 2 <= folds <= len(views):
         raise ValueError(f"folds: want from 2 to the number of views, {len(views)}, got {folds}")
-    out = torch.arange(len(views), device=views.device) % folds == torch.arange(folds, device=views.device).unsqueeze(
-        -1
-    )
-    every = _repeated(views, folds)
-    fits = calibrate(every.hiding(out.unsqueeze(-1).expand(every.visible.shape)), target, distortion, **options)
-    held_out = every.hiding(~out.unsqueeze(-1).expand(every.visible.shape))
-    second = torch.arange(views.pixels.shape[-2], device=views.device) % 2 == 1
-    errors = []
-    for posing in (second, ~second):
-        located = locate(held_out.hiding(posing), target, fits.camera, throw=False)
-        if bool((located.covariance.undetermined_views & located.used.any(-1)).any()):
-            raise CalibrationError(f"cross_validate: a held-out view has no pose: {located.message}", located)
-        posed = located.used.any(-1, keepdim=True)
-        errors.append(_squared_errors(located, every.pixels, held_out.hiding(~posing).visible & posed))
-    held_out_px, held_out_world, lost = _rms(errors)
-    in_sample_px, in_sample_world, _ = _rms([_squared_errors(fits, every.pixels, fits.used)])
+    chosen = calibration_options("cross_validate", options)
+    fits, errors = without_views(views, target, distortion, folds_of(views, folds), chosen)
+    held_out_px, held_out_world, lost = errors.over_views()
+    in_sample_px, in_sample_world, _ = errors_of(fits, fits.views.pixels, fits.used).over_views()
     return CrossValidation(fits, in_sample_px, held_out_px, in_sample_world, held_out_world, lost)
 
 
@@ -159,7 +146,7 @@ def bootstrap(
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randint(len(views), (draws, len(views)), generator=generator).to(views.device)
     counts = torch.nn.functional.one_hot(drawn, len(views)).sum(1).to(torch.float64)
-    every = _repeated(views, draws)
+    every = repeated(views, draws)
     hidden = (counts == 0).unsqueeze(-1).expand(every.visible.shape)
     options |= {"weights": counts.unsqueeze(-1), "throw": False}
     found = calibrate(every.hiding(hidden), target, distortion, **options)
@@ -167,30 +154,3 @@ def bootstrap(
     if int(kept.sum()) < max(2, draws // 2):
         raise CalibrationError(f"bootstrap: {int(kept.sum())} of {draws} draws determine the camera; add views", found)
     return dict(zip(found.parameters.names, found.shared[kept].std(0).unbind(), strict=True))
-
-
-def _repeated(views: Views, count: int) -> Views:
-    """The same views for a batch of cameras."""
-    pixels = views.pixels.expand(count, *views.pixels.shape)
-    return Views.unchecked(pixels, views.visible.expand(count, *views.visible.shape), views.names, views.size)
-
-
-def _squared_errors(
-    calibration: Calibration, pixels: Tensor, evaluated: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Sums of squared errors `(k,)` in pixels and in world units over the corners evaluated `(k, V, N)`.
-
-    With them the number of these corners, and of those that the camera does not see. The latter's error is infinite.
-    """
-    cameras, pixels = calibration.cameras, pixels.to(calibration.points)
-    px, seen = projected_minus_seen(cameras, calibration.board_points.unsqueeze(-3), pixels, evaluated)
-    world, landed = put_back_minus_known(cameras, calibration.points, pixels, evaluated)
-    in_px = torch.where(evaluated & ~seen, torch.inf, px.square().sum(-1)).sum((-2, -1))
-    in_world = torch.where(evaluated & ~landed, torch.inf, world[..., :2].square().sum(-1)).sum((-2, -1))
-    return in_px, in_world, evaluated.sum((-2, -1)), (evaluated & ~(seen & landed)).sum((-2, -1))
-
-
-def _rms(parts: list[tuple[Tensor, ...]]) -> tuple[Tensor, Tensor, Tensor]:
-    """RMS errors `(k,)` in pixels and in world units, and the number of corners that the cameras do not see."""
-    px, world, count, lost = (torch.stack(columns).sum(0) for columns in zip(*parts, strict=True))
-    return (px / count).sqrt(), (world / count).sqrt(), lost
