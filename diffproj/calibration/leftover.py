@@ -174,7 +174,7 @@ class _Scores:
         if first:
             follow = _inverse(S[:, :first, :first], 1e-13) @ S[:, :first, first:]
             X, y = X - S[:, first:, :first] @ follow, y - follow.mT @ g[:, :first]
-        size, turn = torch.linalg.eigh(X.nan_to_num(0.0))
+        size, turn = torch.linalg.eigh(X.nan_to_num(0.0, 0.0, 0.0))
         free = size > FREE
         explained = torch.where(free, (turn.mT @ y).squeeze(-1).square() / torch.where(free, size, 1.0), 0.0).sum(-1)
         return _effect(explained, free.sum(-1), _total(residual), count)
@@ -215,7 +215,7 @@ def _total(residual: Tensor) -> Tensor:
 
 def _inverse(matrix: Tensor, least: float) -> Tensor:
     """The inverse of symmetric matrices without directions below a part of their largest eigenvalue."""
-    size, turn = torch.linalg.eigh(matrix.nan_to_num(0.0))
+    size, turn = torch.linalg.eigh(matrix.nan_to_num(0.0, 0.0, 0.0))
     kept = size > least * size[..., -1:].clamp(min=1e-300)
     return turn @ (torch.where(kept, 1 / torch.where(kept, size, 1.0), 0.0).unsqueeze(-1) * turn.mT)
 

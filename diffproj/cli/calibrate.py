@@ -12,7 +12,7 @@ from rich.table import Table
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.result import Calibration
 from diffproj.cli.inputs import board_size, camera_file, find_corners, photographs, square_side
-from diffproj.cli.terminal import RESULTS, aligned, progress_bars, result, rounded
+from diffproj.cli.terminal import RESULTS, aligned, in_options, progress_bars, result, rounded
 from diffproj.files.save import save_camera
 from diffproj.lens.models import LensModel
 from diffproj.targets.chessboard import Chessboard
@@ -194,9 +194,4 @@ def _say_how_it_ended(calibration: Calibration, reject_outliers: bool) -> None:
     how, *remarks = calibration.message.split("; ")
     result(f"Solver {how}")
     for remark in remarks:
-        result(textwrap.fill(_in_options(remark[0].upper() + remark[1:]), 79))
-
-
-def _in_options(text: str) -> str:
-    """A remark with the command's options in place of Python's."""
-    return text.replace("distortion=", "--distortion ").replace("bow=True", "--bow").replace("'", "")
+        result(textwrap.fill(in_options(remark[0].upper() + remark[1:]), 79))

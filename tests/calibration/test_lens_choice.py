@@ -30,26 +30,25 @@ SCENES: dict[str, tuple[float, object, tuple[int, int], tuple[float, float]]] = 
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("truth", SCENES)
 def test_the_truth_is_found(truth: str) -> None:
     f, lens, size, distance = SCENES[truth]
-    found = dp.calibrate(seen(f, lens, 10, size, distance=distance), BOARD, "auto")
-    assert found.comparison is not None
-    assert found.comparison.chosen == truth
-    assert found.comparison.held_out == "views"
-    assert found.rms < 0.3
-    again = dp.calibrate(found.views, BOARD, truth)  # type: ignore[arg-type]
-    assert torch.equal(found.camera.K, again.camera.K)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("truth", SCENES)
-def test_the_truth_is_found_again_and_again(truth: str) -> None:
-    f, lens, size, distance = SCENES[truth]
-    for seed in range(1, 7):
+    for seed in range(4):
         found = dp.calibrate(seen(f, lens, 13, size, seed, distance=distance), BOARD, "auto")
         assert found.comparison is not None
         assert found.comparison.chosen == truth
+        assert found.comparison.held_out == "views"
+        again = dp.calibrate(found.views, BOARD, truth)  # type: ignore[arg-type]
+        assert torch.equal(found.camera.K, again.camera.K)
+
+
+def test_a_lens_of_180_degrees() -> None:
+    f, lens, size, distance = SCENES["fisheye"]
+    found = dp.calibrate(seen(f, lens, 5, size, distance=distance), BOARD, "auto")
+    assert found.comparison is not None
+    assert found.comparison.chosen == "fisheye"
+    assert found.rms < 0.3
 
 
 @pytest.mark.parametrize("views", [2, 3])
@@ -80,8 +79,8 @@ def test_the_table_tells_what_was_compared() -> None:
 
 
 def test_options_go_to_the_lenses_that_have_them() -> None:
-    views = dp.example_views("left")[:6]
-    found = dp.calibrate(views, BOARD, "auto", fixed=("k3",), priors={"principal_point": 5.0})
+    views = dp.example_views("left")[:4]
+    found = dp.calibrate(views, BOARD, "auto", fixed=("k3",), priors={"p1": 0.01})
     assert found.comparison is not None
     assert found.comparison.chosen == "brown5"
     assert float(found.shared[8]) == 0
