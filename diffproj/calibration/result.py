@@ -141,8 +141,7 @@ class Calibration:
         """What is to be known of each camera that converged, `*B` flattened; empty where nothing is.
 
         That its lens had to be kept from folding; that the residuals are no noise, but change smoothly over the image,
-        repeat on the board, or are large; and what to try. Computed at the first call; empty for a calibration from a
-        file.
+        repeat on the board, or are large; and what to try. Computed at the first call.
         """
         return self._remarks() if self._remarks is not None else ("",) * max(1, self.status.numel())
 

@@ -13,7 +13,7 @@ import math
 import re
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -24,6 +24,7 @@ from diffproj.geometry.camera import Camera
 from diffproj.lens.models import KINDS, coefficients_of
 from diffproj.targets.views import Views
 
+T = TypeVar("T")
 SUFFIXES: tuple[str, ...] = (".json",)
 KIND, VERSION = "diffproj camera", 1
 """What every file says of itself."""
@@ -87,6 +88,7 @@ def read_calibration(path: Path) -> Calibration | None:
             tuple(found["causes"]),
             None if found["pixel_sigma"] is None else _tensor(_with_nan(found["pixel_sigma"]), torch.float64),
             None if covariance is None else partial(_same, covariance),
+            partial(_same, tuple(found["remarks"])) if "remarks" in found else None,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
@@ -125,14 +127,15 @@ def _calibration_fields(item: Calibration) -> dict[str, Any]:
         "used": item.used.tolist(),
         "rejected": item.rejected.tolist(),
         "causes": item.causes,
+        "remarks": item.remarks,
         "pixel_sigma": None if item.pixel_sigma is None else item.pixel_sigma.tolist(),
         "covariance": item.covariance.to_fields() if item.has_covariance else None,
     }
 
 
-def _same(covariance: Covariance) -> Covariance:
-    """What a calibration calls for its covariance; a function of the module, so that it can be pickled."""
-    return covariance
+def _same(known: T) -> T:
+    """What a calibration calls for what it computes late; a function of the module, so that it can be pickled."""
+    return known
 
 
 def _without_nan(value: Any) -> Any:
