@@ -46,6 +46,7 @@ from typing import Any
 
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.calibrate import calibrate
+from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.locate import locate
 from diffproj.calibration.losses import Cauchy, Huber, Loss, SoftL1
@@ -107,6 +108,7 @@ __all__ = [
     "LearnableCamera",
     "LearnablePlane",
     "Lens",
+    "LensComparison",
     "LocateOptions",
     "Loss",
     "Measurement",

@@ -4,24 +4,22 @@ A start in closed form is refined by the solver. It works for one camera, views 
 `(*B, V, N, 2)`, each with its own damping and its own end, and computes in float64.
 """
 
-from typing import Unpack
+from typing import Literal, Unpack
 
-import torch
-
-from diffproj.calibration import start
-from diffproj.calibration.data import Data
+from diffproj.calibration.lens_choice import chosen_lens
+from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.options import CalibrationOptions, calibration_options
-from diffproj.calibration.outcome import minimised, outcome
-from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import Calibration
-from diffproj.calibration.second_look import second_look
-from diffproj.lens.models import LensModel, model_named
+from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
 
 def calibrate(
-    views: Views, target: Target, distortion: LensModel = "brown5", **options: Unpack[CalibrationOptions]
+    views: Views,
+    target: Target,
+    distortion: LensModel | Literal["auto"] = "brown5",
+    **options: Unpack[CalibrationOptions],
 ) -> Calibration:
     """Find intrinsics, lens and one pose per view that minimise the error of the corners.
 
@@ -30,7 +28,9 @@ def calibrate(
             than 4 takes no part.
         target: anything with `.points (N, 3)` on z = 0, such as `Chessboard`; its unit is the world's.
         distortion: which lens to fit: `"none"`, `"brown4"`, `"brown5"`, `"brown8"`, `"brown12"`, `"brown14"` or
-            `"fisheye"`.
+            `"fisheye"`. Or `"auto"`, for one camera: all of them but the longest are fitted side by side and compared
+            by their errors on corners held out; the simplest that is no worse than the best, as far as the views can
+            tell, is returned, and `Calibration.comparison` says how they fared.
         options: `objective`, `bow`, `skew`, `fixed`, `tied_focal`, `priors`, `weights`, `loss`, `reject_outliers`,
             `max_iterations`, `tolerance`, `progress` and `throw`: see `CalibrationOptions`.
 
@@ -39,7 +39,7 @@ def calibrate(
 
     Raises:
         TypeError: views are no `dp.Views`, or an option is unknown or of another type.
-        ValueError: views, target and options do not fit together.
+        ValueError: views, target and options do not fit together; or `"auto"` for many cameras, or with a held lens.
         CalibrationError: a camera did not converge, or its views do not determine it.
 
     Example:
@@ -48,27 +48,7 @@ def calibrate(
         >>> print(f"{calibration.rms:.3f}", [round(f) for f in calibration.camera.K.diagonal()[:2].tolist()])
         0.177 [533, 533]
     """
-    model = model_named(distortion)
     chosen = calibration_options("calibrate", options)
-    data = Data(views, target, chosen.weights)
-    if views.size is None:
-        raise ValueError("views: want the photographs' size, got None; give Views(..., size=(width, height))")
-    parameters = Parametrisation(distortion, chosen.bow, chosen.skew)
-    shared, local, straight = start.from_nothing(data, views.size, chosen.tied_focal, parameters)
-    # The start is a guess from the corners; what is held, or known, is not.
-    reference = shared.clone()
-    reference[:, :2], reference[:, 4:] = torch.nan, 0.0
-    if model.count > 5:
-        # The rational terms nearly cancel each other: from far off they lead into side valleys.
-        early = chosen.but(
-            fixed=(*chosen.fixed, *model.coefficient_names[5:]),
-            objective="image",
-            reject_outliers=False,
-            loss=None if chosen.objective == "plane" else chosen.loss,  # its scale is in world units
-        )
-        near, _ = minimised(data, early, parameters, shared, local, reference)
-        shared, local = near.solution.shared, near.solution.local
-    found, _ = minimised(data, chosen, parameters, shared, local, reference)
-    limits = {"max_iterations": chosen.max_iterations, "tolerance": chosen.tolerance}
-    found = second_look(found, straight, reject=chosen.outlier_limit, **limits)
-    return outcome("calibrate", data, found, views.size, chosen.throw)
+    if distortion == "auto":
+        return chosen_lens(views, target, chosen)
+    return calibrated(views, target, distortion, chosen)

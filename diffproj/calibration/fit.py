@@ -67,15 +67,19 @@ class Fit:
 
     def plain_covariance(self) -> Covariance:
         """The covariance for least squares, whatever the loss and the objective: what verdicts go by."""
-        prior = self.task.prior
         return covariances.covariance(
             self.solution.equations,
             self.task.names,
             self.residual_variance(),
             basis=self.task.basis,
-            precision=None if prior is None else prior.precision,
+            precision=self.measured_precision(),
             shares=self.task.shares,
         )
+
+    def measured_precision(self) -> Tensor | None:
+        """That part of the prior's precision which stands for a measurement `(P, s, s)`; the rest only restrains."""
+        prior = self.task.prior
+        return None if prior is None else prior.precision if prior.known is None else prior.known
 
 
 def fit(

@@ -6,6 +6,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from diffproj.calibration.adequacy import remarks
 from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.constraints import free_basis, held_at, make_prior
 from diffproj.calibration.covariance import Covariance, reshaped
@@ -104,12 +105,13 @@ def outcome(
         task.objective,
         causes,
         shaped(noise.variance.sqrt()),
-        None if task.shares is None else shaped(task.shares),
-        task.skew,
-        partial(_covariance, found, data, before, known),
-        partial(_others, found, data, before),
-        shaped(noise.freedom),
-        None if known is None else known.region,
+        shares=None if task.shares is None else shaped(task.shares),
+        skew=task.skew,
+        degrees_of_freedom=shaped(noise.freedom),
+        lens_region=None if known is None else known.region,
+        _covariance=partial(_covariance, found, data, before, known),
+        _others=partial(_others, found, data, before),
+        _remarks=partial(remarks, found, status),
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)

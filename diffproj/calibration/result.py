@@ -10,7 +10,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
+from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.bow import bowed
+from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.distinct import alike, described
 from diffproj.calibration.parametrisation import BOW, SKEW, Parametrisation
@@ -76,6 +78,7 @@ class Calibration:
         shares: how much each view counted for the camera `(*B, V)`: 1, or 1 over the number of views that show the
             board as it does, to within 2 px, which bring nothing new. `None` where all counted fully.
         skew: whether the skew of K is among the parameters: it was fitted, or K had some that was held.
+        comparison: how the lenses fared, where `distortion="auto"` compared them.
     """
 
     camera: Camera
@@ -92,10 +95,12 @@ class Calibration:
     pixel_sigma: Float[Tensor, "*batch"] | None = None
     shares: Float[Tensor, "*batch v"] | None = None
     skew: bool = False
-    _covariance: Callable[[], Covariance] | None = None
-    _others: Callable[[], OtherPoses] | None = None
     degrees_of_freedom: Float[Tensor, "*batch"] | None = None
     lens_region: Float[Tensor, "*#batch directions"] | None = None
+    comparison: LensComparison | None = None
+    _covariance: Callable[[], Covariance] | None = None
+    _others: Callable[[], OtherPoses] | None = None
+    _remarks: Callable[[], tuple[str, ...]] | None = None
 
     @property
     def board_points(self) -> Float[Tensor, "*batch n 3"]:
@@ -116,26 +121,24 @@ class Calibration:
 
     @property
     def residuals(self) -> Float[Tensor, "*batch v n 2"]:
-        """Projected minus seen corners `(*B, V, N, 2)` in pixels; zero where a corner was not used."""
-        return self._residuals()[0]
+        """Projected minus seen corners `(*B, V, N, 2)` in pixels; zero where a corner was not used.
+
+        Infinite where one was used that the camera does not project, for it lies beyond the fold of the lens. (A
+        calibration that has converged has none.)
+        """
+        points = self.board_points.unsqueeze(-3)
+        residuals, projected = projected_minus_seen(self.cameras, points, self.views.pixels, self.used)
+        return torch.where((self.used & ~projected).unsqueeze(-1), torch.inf, residuals)
 
     @property
     def view_rms(self) -> Float[Tensor, "*batch v"]:
-        """RMS reprojection error of each view `(*B, V)` in pixels; NaN where no corner was used."""
-        residuals, count = self._residuals()
-        return (residuals.square().sum(dim=(-2, -1)) / count).sqrt()
+        """RMS reprojection error of each view `(*B, V)` in pixels; NaN where no corner was used; see `residuals`."""
+        return (self.residuals.square().sum(dim=(-2, -1)) / self.used.sum(-1)).sqrt()
 
     @property
     def rms(self) -> Float[Tensor, "*batch"]:
         """RMS reprojection error `(*B,)` in pixels as OpenCV defines it: `sqrt(sum |e|^2 / number of points)`."""
-        residuals, count = self._residuals()
-        return (residuals.square().sum(dim=(-3, -2, -1)) / count.sum(-1)).sqrt()
-
-    def _residuals(self) -> tuple[Tensor, Tensor]:
-        """The residuals, and how many corners of each view there are; one beyond the lens's fold does not count."""
-        points = self.board_points.unsqueeze(-3)
-        residuals, counts = projected_minus_seen(self.cameras, points, self.views.pixels, self.used)
-        return residuals, counts.sum(-1)
+        return (self.residuals.square().sum(dim=(-3, -2, -1)) / self.used.sum((-2, -1))).sqrt()
 
     @property
     def converged(self) -> Bool[Tensor, "*batch"]:
@@ -144,25 +147,13 @@ class Calibration:
 
     @property
     def message(self) -> str:
-        """How it ended, in a sentence; for many cameras, how many converged and what became of the others."""
-        codes = [Status(code) for code in self.status.flatten().tolist()]
-        causes = [cause or SENTENCES[code] for code, cause in zip(codes, self._causes(), strict=True)]
-        beyond = (self.used.sum(-1) - self._residuals()[1]).sum(-1).flatten().tolist()
-        causes = [
-            f"{cause}; {_counted(count)} beyond the fold of the lens: fit one with fewer coefficients" * bool(count)
-            or cause
-            for cause, count in zip(causes, beyond, strict=True)
-        ]
+        """How it ended, in a sentence, and the remarks; for many cameras, how many converged and why others did not."""
+        ends = self._ends()
         if not self.views.batch_shape:
-            return causes[0] if codes[0] or not self.doubts else f"{causes[0]}; {self.doubts}"
-        failed = [f"camera {i}: {c}" for i, (s, c) in enumerate(zip(codes, causes, strict=True)) if s]
-        return "; ".join(
-            [
-                f"{len(codes) - len(failed)} of {len(codes)} cameras converged",
-                *failed,
-                *([self.doubts] if self.doubts else []),
-            ]
-        )
+            return "; ".join([ends[0], *filter(None, [*self.remarks, "" if self.status else self.doubts])])
+        failed = [f"camera {i}: {ends[i]}" for i in self.status.flatten().nonzero().flatten().tolist()]
+        count = f"{len(ends) - len(failed)} of {len(ends)} cameras converged"
+        return "; ".join([count, *failed, *filter(None, [self.doubts])])
 
     @property
     def doubts(self) -> str:
@@ -177,6 +168,15 @@ class Calibration:
             return ""
         more = f" and {len(doubtful) - MAX_NAMES} more views" if len(doubtful) > MAX_NAMES else ""
         return f"two poses fit {', '.join(doubtful[:MAX_NAMES])}{more}, and the one that was kept may be the wrong one"
+
+    @cached_property
+    def remarks(self) -> tuple[str, ...]:
+        """What is to be known of each camera that converged, `*B` flattened; empty where nothing is.
+
+        That its lens had to be kept from folding; that the residuals are no noise, but change smoothly over the image,
+        repeat on the board, or are large; and what to try. Computed at the first call.
+        """
+        return self._remarks() if self._remarks is not None else ("",) * max(1, self.status.numel())
 
     @property
     def has_covariance(self) -> bool:
@@ -320,14 +320,17 @@ class Calibration:
         if self.shares is not None:
             same = alike(self.points, self.views.pixels.unsqueeze(0), self.used.unsqueeze(0))[0]
             lines.append(described(same, self.views.names))
-        return "\n".join([*lines, self.message])
+        if self.camera.size is not None and (share := float(border_with_rays(self.camera, self.camera.size))) < 1:
+            lines.append(
+                f"{'image':<16}{100 * (1 - share):.0f} % of its border lies beyond the fold of the lens: no rays"
+            )
+        remarks = [*self.remarks[0].split("; "), "" if self.status else self.doubts]
+        return "\n".join([*lines, self._ends()[0], *filter(None, remarks)])
 
-    def _causes(self) -> tuple[str, ...]:
-        return self.causes or ("",) * max(1, self.status.numel())
-
-
-def _counted(corners: int) -> str:
-    return "1 corner lies" if corners == 1 else f"{corners} corners lie"
+    def _ends(self) -> list[str]:
+        """How each camera ended, in a sentence."""
+        codes = [Status(code) for code in self.status.flatten().tolist()]
+        return [cause or SENTENCES[code] for code, cause in zip(codes, self.causes or ("",) * len(codes), strict=True)]
 
 
 def _spread(deviation: Tensor | None, form: str) -> str:

@@ -94,10 +94,20 @@ class Problem(Protocol):
 
 
 class Prior(NamedTuple):
-    """`1/2 (x - mean)^T precision (x - mean)`: mean `(P, s)`, precision `(P, s, s)`."""
+    """`1/2 (x - mean)^T precision (x - mean)`: mean `(P, s)`, precision `(P, s, s)`.
+
+    `known (P, s, s)` is the part of the precision that stands for a measurement; all of it if left out. The rest only
+    keeps the minimum where it makes sense: the solver makes no difference, the covariance does.
+    """
 
     mean: Tensor
     precision: Tensor
+    known: Tensor | None = None
+
+    def part(self, where: slice | Tensor) -> "Prior":
+        """That of some of the problems."""
+        known = None if self.known is None else self.known[where]
+        return Prior(self.mean[where], self.precision[where], known)
 
 
 class Equations(NamedTuple):

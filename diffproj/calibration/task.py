@@ -74,7 +74,7 @@ class Task:
         cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}
         optional = ("weights", "shares", "basis")
         cut |= {name: None if (whole := getattr(self, name)) is None else whole[where] for name in optional}
-        prior = None if self.prior is None else Prior(*(part[where] for part in self.prior))
+        prior = None if self.prior is None else self.prior.part(where)
         return replace(self, **cut, prior=prior)
 
 

@@ -47,6 +47,10 @@ def covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = N
     }
     if task.objective == "plane":
         equations, scores = _on_the_plane(found)
+        if task.prior is not None and precision is not None and precision is not task.prior.precision:
+            # What only restrains is as uncertain as the residuals say.
+            scale = found.residual_variance().nan_to_num(0.0)[:, None, None]
+            common["precision"] = precision + scale * (task.prior.precision - precision)
         return covariances.covariance(equations, variance=torch.ones_like(phi), scores=scores, **common)
     if task.loss is None:
         equations, factor, variance = found.solution.equations, 1.0, found.residual_variance()

@@ -9,15 +9,14 @@ from dataclasses import dataclass
 from typing import Unpack
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from diffproj.calibration.calibrate import calibrate
-from diffproj.calibration.locate import located
-from diffproj.calibration.options import CalibrationOptions
+from diffproj.calibration.held_out import errors_of, folds_of, repeated, without_views
+from diffproj.calibration.options import CalibrationOptions, calibration_options
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.lens.models import LensModel
-from diffproj.targets.residuals import projected_minus_seen, put_back_minus_known
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
@@ -32,6 +31,8 @@ class CrossValidation:
         held_out_px: the same for the held-out corners, `(k,)`.
         in_sample_world: RMS error of the fitted corners, back-projected onto the board, in world units `(k,)`.
         held_out_world: the same for the held-out corners, `(k,)`.
+        lost: how many held-out corners lie beyond the fold of the lens that was fitted without them, `(k,)`. Where
+            there are any, the fold's errors are infinite.
     """
 
     fits: Calibration
@@ -39,6 +40,7 @@ class CrossValidation:
     held_out_px: Float[Tensor, " k"]
     in_sample_world: Float[Tensor, " k"]
     held_out_world: Float[Tensor, " k"]
+    lost: Int[Tensor, " k"]
 
     def summary(self) -> str:
         """A table of text: each fold, and the root mean square over the folds."""
@@ -49,6 +51,12 @@ class CrossValidation:
         lines += [
             f"{n:<4} {a:11.4f} {b:13.4f} {c:14.4f} {d:16.4f}" for n, (a, b, c, d) in zip(names, rows, strict=True)
         ]
+        if bool(self.lost.any()):
+            which = ", ".join(str(i + 1) for i in self.lost.nonzero().flatten().tolist())
+            lines.append(
+                f"{int(self.lost.sum())} held-out corners lie beyond the fold of the lens that was fitted without them "
+                f"(fold {which}): take one with fewer coefficients"
+            )
         return "\n".join(lines)
 
 
@@ -62,7 +70,8 @@ def cross_validate(
     """Refit without each of k folds of the views, and evaluate on the held-out fold.
 
     The pose of a held-out view is estimated from every second corner and evaluated on the others, then with the roles
-    exchanged, so that no corner is evaluated with a pose that it contributed to.
+    exchanged, so that no corner is evaluated with a pose that it contributed to. (A view with fewer than 4 such corners
+    is not evaluated.)
 
     Args:
         views: corners `(V, N, 2)` of one camera; view i is left out of fit i mod k.
@@ -87,20 +96,11 @@ def cross_validate(
         raise ValueError("bow: want False, for held-out views are located on a flat board")
     if not 2 <= folds <= len(views):
         raise ValueError(f"folds: want from 2 to the number of views, {len(views)}, got {folds}")
-    out = torch.arange(len(views), device=views.device) % folds == torch.arange(folds, device=views.device).unsqueeze(
-        -1
-    )
-    every = _repeated(views, folds)
-    fits = calibrate(every.hiding(out.unsqueeze(-1).expand(every.visible.shape)), target, distortion, **options)
-    held_out = every.hiding(~out.unsqueeze(-1).expand(every.visible.shape))
-    second = torch.arange(views.pixels.shape[-2], device=views.device) % 2 == 1
-    errors = []
-    for posing in (second, ~second):
-        posed = located(held_out.hiding(posing), target, fits.camera)
-        errors.append(_squared_errors(posed, held_out.hiding(~posing)))
-    px, world = (_rms([error[i] for error in errors], [error[2] for error in errors]) for i in range(2))
-    in_sample = _squared_errors(fits, Views.unchecked(every.pixels, fits.used, every.names, every.size))
-    return CrossValidation(fits, _rms([in_sample[0]], [in_sample[2]]), px, _rms([in_sample[1]], [in_sample[2]]), world)
+    chosen = calibration_options("cross_validate", options)
+    fits, errors = without_views(views, target, distortion, folds_of(views, folds), chosen)
+    held_out_px, held_out_world, lost = errors.over_views()
+    in_sample_px, in_sample_world, _ = errors_of(fits, fits.views.pixels, fits.used).over_views()
+    return CrossValidation(fits, in_sample_px, held_out_px, in_sample_world, held_out_world, lost)
 
 
 def bootstrap(
@@ -146,7 +146,7 @@ def bootstrap(
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randint(len(views), (draws, len(views)), generator=generator).to(views.device)
     counts = torch.nn.functional.one_hot(drawn, len(views)).sum(1).to(torch.float64)
-    every = _repeated(views, draws)
+    every = repeated(views, draws)
     hidden = (counts == 0).unsqueeze(-1).expand(every.visible.shape)
     options |= {"weights": counts.unsqueeze(-1), "throw": False}
     found = calibrate(every.hiding(hidden), target, distortion, **options)
@@ -154,24 +154,3 @@ def bootstrap(
     if int(kept.sum()) < max(2, draws // 2):
         raise CalibrationError(f"bootstrap: {int(kept.sum())} of {draws} draws determine the camera; add views", found)
     return dict(zip(found.parameters.names, found.shared[kept].std(0).unbind(), strict=True))
-
-
-def _repeated(views: Views, count: int) -> Views:
-    """The same views for a batch of cameras."""
-    pixels = views.pixels.expand(count, *views.pixels.shape)
-    return Views.unchecked(pixels, views.visible.expand(count, *views.visible.shape), views.names, views.size)
-
-
-def _squared_errors(calibration: Calibration, evaluated: Views) -> tuple[Tensor, Tensor, Tensor]:
-    """Sums of squared errors `(k,)` in pixels and in world units over the evaluated corners, and their number."""
-    cameras, pixels = calibration.cameras, evaluated.pixels.to(calibration.points)
-    px, seen = projected_minus_seen(cameras, calibration.board_points.unsqueeze(-3), pixels, evaluated.visible)
-    world, on_plane = put_back_minus_known(cameras, calibration.points, pixels, evaluated.visible)
-    counts = seen & on_plane
-    px, world = px.square().sum(-1), world[..., :2].square().sum(-1)
-    total = [torch.where(counts, part, 0.0).sum((-2, -1)) for part in (px, world)]
-    return total[0], total[1], counts.sum((-2, -1))
-
-
-def _rms(sums: list[Tensor], counts: list[Tensor]) -> Tensor:
-    return (torch.stack(sums).sum(0) / torch.stack(counts).sum(0)).sqrt()

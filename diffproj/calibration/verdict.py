@@ -5,9 +5,11 @@ import math
 import torch
 from torch import Tensor
 
+from diffproj.calibration.adequacy import gravely_inadequate, other_lens, poses_only
 from diffproj.calibration.closed_form import homographies
 from diffproj.calibration.distinct import one_view
 from diffproj.calibration.fit import Fit
+from diffproj.calibration.reach import folds_at_corners, lost_corners
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import mean_squares
@@ -52,12 +54,16 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     unknown[:, :4] |= ~(std <= MAX_RELATIVE_STD * solution.shared[:, :1].abs())
     none = ~used.any(-1)
     finite = solution.cost.isfinite()
+    folded = finite & ~no_pose.any(-1) & folds_at_corners(task, solution.shared, solution.local)
     redundant = (found.degrees_of_freedom() > 0) | (task.prior is not None)
-    if task.basis is not None and task.basis.shape[-1] == 0:  # poses only: four corners leave two degrees of freedom
+    held = poses_only(task)
+    if held:  # four corners leave two degrees of freedom
         unknown[:] = False
     alone = _leans_on_one_view(task)
     status = solution.status
-    degenerate = none | mirrored.any(-1) | misfits.any(-1) | unknown.any(-1) | no_pose.any(-1) | ~redundant | alone
+    wrong_lens = finite & ~folded & gravely_inadequate(found)
+    at_fault = (mirrored | misfits | no_pose).any(-1)
+    degenerate = none | at_fault | unknown.any(-1) | ~redundant | alone | folded | wrong_lens
     status = torch.where(degenerate & finite & (status != Status.DIVERGED), Status.DEGENERATE, status)
     causes = [""] * len(status)
     if not bool(status.any()):
@@ -78,6 +84,12 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
             causes[p] = (
                 f"the corners of {_joined_names(names, no_pose[p])} do not determine a pose: do they lie on a line?"
             )
+        elif bool(folded[p]) and (held or not bool(misfits[p].any())):
+            causes[p] = _folded(task, int(lost_corners(task, solution.shared, solution.local)[p].sum()))
+        elif bool(wrong_lens[p]):
+            sigma = f"{float(found.pixel_sigma()[p]):.1f} px in each coordinate"
+            remedy = other_lens(task, p, radial=True)
+            causes[p] = f"the residuals, {sigma}, change smoothly over the image, as through another lens: {remedy}"
         elif bool(misfits[p].any()):
             causes[p] = (
                 f"the corners of {_joined_names(names, misfits[p])} do not match the board: "
@@ -139,6 +151,14 @@ def _mirrored(R: Tensor, t: Tensor, points: Tensor, used: Tensor, board: object)
     else:
         expected = 2 * (away & used).sum(-1, keepdim=True) >= used.sum(-1, keepdim=True)
     return used & (away != expected)
+
+
+def _folded(task: Task, count: int) -> str:
+    what = f"{'1 corner lies' if count == 1 else f'{count} corners lie'} beyond the fold of the lens"
+    if task.basis is not None and task.basis.shape[-1] == 0:
+        return f"{what}: hide {'it' if count == 1 else 'them'}, or take a camera whose lens reaches as far"
+    other = "'brown5'" if task.lens == "fisheye" else "'brown5' or 'fisheye'" if len(task.names) > 9 else "'fisheye'"
+    return f"{what}: fit distortion={other}, which may reach as far"
 
 
 def _undetermined(lacking: list[str], R: Tensor, foreshortening: Tensor, free_principal_point: bool) -> str:

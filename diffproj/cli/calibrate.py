@@ -2,6 +2,7 @@
 
 import argparse
 import tempfile
+import textwrap
 from pathlib import Path
 from typing import get_args
 
@@ -11,7 +12,7 @@ from rich.table import Table
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.result import Calibration
 from diffproj.cli.inputs import board_size, camera_file, find_corners, photographs, square_side
-from diffproj.cli.terminal import RESULTS, aligned, progress_bars, result, rounded
+from diffproj.cli.terminal import RESULTS, aligned, in_options, progress_bars, result, rounded
 from diffproj.files.save import save_camera
 from diffproj.lens.models import LensModel
 from diffproj.targets.chessboard import Chessboard
@@ -31,7 +32,7 @@ EPILOG = """\
 examples:
   diffproj calibrate photos/ --board 9x6 --square 25
   diffproj calibrate left*.jpg --board 9x6 --square 25 -o camera.yaml
-  diffproj calibrate wide/ --board 11x8 --square 0.03 --distortion fisheye
+  diffproj calibrate wide/ --board 11x8 --square 0.03 --distortion auto
 
 The file is for diffproj.load_camera("camera.json") in Python; OpenCV reads the
 YAML and XML by cv2.FileStorage: camera_matrix, distortion_coefficients.
@@ -72,11 +73,12 @@ def add_options(command: argparse.ArgumentParser) -> None:
     lens = command.add_argument_group("the camera")
     lens.add_argument(
         "--distortion",
-        choices=get_args(LensModel),
+        choices=(*get_args(LensModel), "auto"),
         default="brown5",
         metavar="LENS",
         help="the lens that is fitted: none; brown4, brown5, brown8, brown12 or brown14, which are OpenCV's model with "
-        "that many coefficients; or fisheye, OpenCV's for wide angles (default: brown5)",
+        "that many coefficients; fisheye, OpenCV's for wide angles; or auto, which compares lenses by their errors on "
+        "corners held out and takes the simplest that is no worse than the best (default: brown5)",
     )
     lens.add_argument(
         "--reject-outliers",
@@ -112,6 +114,8 @@ def run(options: argparse.Namespace) -> int:
             reject_outliers=options.reject_outliers,
             progress=lambda done, total: bars.update(task, completed=done, total=total),
         )
+    if calibration.comparison is not None:
+        result(f"Lenses compared\n{calibration.comparison.summary()}\n")
     RESULTS.print(_views_table(calibration))
     result("")
     RESULTS.print(_parameters_table(calibration))
@@ -187,4 +191,7 @@ def _say_how_it_ended(calibration: Calibration, reject_outliers: bool) -> None:
     if reject_outliers:
         count = int(calibration.rejected.sum())
         result(f"{count or 'no'} corner{'s' * (count > 1)} rejected as outlier{'s' * (count > 1)}".capitalize())
-    result(f"Solver {calibration.message}")
+    how, *remarks = calibration.message.split("; ")
+    result(f"Solver {how}")
+    for remark in remarks:
+        result(textwrap.fill(in_options(remark[0].upper() + remark[1:]), 79))

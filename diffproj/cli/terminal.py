@@ -26,6 +26,11 @@ def result(text: str) -> None:
     RESULTS.print(text, markup=False, soft_wrap=True)
 
 
+def in_options(text: str) -> str:
+    """What a calibration advises, with the command's options in place of Python's."""
+    return text.replace("distortion=", "--distortion ").replace("bow=True", "--bow").replace("'auto'", "auto")
+
+
 def failure(error: Exception) -> str:
     """An error as one line that fits the command line."""
     if isinstance(error, CalibrationError) and error.calibration is not None:
@@ -35,6 +40,7 @@ def failure(error: Exception) -> str:
                 f"--distortion: the error was still falling after {int(found.iterations.max())} steps; choose a lens "
                 "with fewer coefficients, add photographs, or look for mixed-up corners"
             )
+        return in_options(" ".join(str(error).split()))
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
     return " ".join(str(error).split())

@@ -25,12 +25,12 @@ from diffproj.geometry.camera import Camera
 from diffproj.lens.models import KINDS, coefficients_of
 from diffproj.targets.views import Views
 
+T = TypeVar("T")
 SUFFIXES: tuple[str, ...] = (".json",)
-Known = TypeVar("Known", Covariance, OtherPoses)
 KIND, VERSION = "diffproj camera", 1
 """What every file says of itself."""
 
-LATER = "degrees_of_freedom", "lens_region"
+LATER = "shares", "degrees_of_freedom", "lens_region"
 """Fields of a calibration that files of earlier releases lack."""
 
 
@@ -92,11 +92,11 @@ def read_calibration(path: Path) -> Calibration | None:
             found["objective"],
             tuple(found["causes"]),
             None if found["pixel_sigma"] is None else _tensor(_with_nan(found["pixel_sigma"]), torch.float64),
-            None if found.get("shares") is None else _tensor(found["shares"], torch.float64),
-            found.get("skew", False),
-            None if covariance is None else partial(_same, covariance),
-            None if others is None else partial(_same, others),
-            *(None if found.get(key) is None else _tensor(found[key], torch.float64) for key in LATER),
+            skew=found.get("skew", False),
+            **{key: None if found.get(key) is None else _tensor(found[key], torch.float64) for key in LATER},
+            _covariance=None if covariance is None else partial(_same, covariance),
+            _others=None if others is None else partial(_same, others),
+            _remarks=partial(_same, tuple(found["remarks"])) if "remarks" in found else None,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
@@ -136,6 +136,7 @@ def _calibration_fields(item: Calibration) -> dict[str, Any]:
         "used": item.used.tolist(),
         "rejected": item.rejected.tolist(),
         "causes": item.causes,
+        "remarks": item.remarks,
         "pixel_sigma": None if item.pixel_sigma is None else item.pixel_sigma.tolist(),
         "shares": None if item.shares is None else item.shares.tolist(),
         "covariance": item.covariance_of_kept_poses.to_fields() if item.has_covariance else None,
@@ -157,8 +158,8 @@ def _other_poses(fields: dict[str, Any] | None) -> OtherPoses | None:
     return OtherPoses(R, t, torch.where(ratio.isnan(), torch.inf, ratio))
 
 
-def _same(known: Known) -> Known:
-    """What a calibration calls for what it knows; a function of the module, so that it can be pickled."""
+def _same(known: T) -> T:
+    """What a calibration calls for what it computes late; a function of the module, so that it can be pickled."""
     return known
 
 

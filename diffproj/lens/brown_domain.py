@@ -42,6 +42,8 @@ SAMPLES, COARSE_GRID, FINE_GRID = 20, 64, 256
 """Directions in which it is evaluated, and to which it is interpolated: in the first round and in later ones."""
 NEWTON_STEPS = 3
 """Newton steps that refine its minimum on the fine grid."""
+CLEAR_NODES, CLEAR_MARGIN = 32, 0.1
+"""Radii of the quick look, and the least eigenvalue of the symmetric part there: between them it stays positive."""
 BLOCK_LENSES = 8
 """Lenses with prism or tilt per block: intermediate results stay in the processor's cache."""
 RADIUS_POWERS = (2, 4, 1, 1, 6, 2, 4, 6, 1, 3, 1, 3)
@@ -84,6 +86,21 @@ def _domain_radius(coefficients: Tensor) -> Tensor:
         radius, failed = first_failure(_Circles(coefficients), grid, nodes=32, rounds=8)
     radius = torch.where(failed, radius, math.inf)
     return torch.where(radius > 1e-9 * scale, radius, 0)  # 0 for NaN and where it fails at the centre
+
+
+def clearly_one_to_one(coefficients: Tensor, radius: Tensor) -> Tensor:
+    """Whether a lens of 4 or 5 coefficients `(*B, k)` is one-to-one up to a radius `(*B,)`, with a margin.
+
+    A quick look at a few radii. False says nothing: then `domain_radius` tells.
+    """
+    terms = Terms.of(coefficients)
+    fraction = torch.linspace(1 / CLEAR_NODES, 1, CLEAR_NODES, dtype=radius.dtype, device=radius.device)
+    r = radius.unsqueeze(-1) * fraction
+    s = r * r
+    factor = radial(terms, s)
+    along = factor + s * radial_slope(terms, s, factor)
+    least = torch.minimum(along, factor) - 4 * r * torch.hypot(terms.two_p1, terms.two_p2)
+    return (least > CLEAR_MARGIN).all(-1)
 
 
 class _ClosedForm:

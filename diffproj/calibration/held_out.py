@@ -1,0 +1,101 @@
+"""Refits without some of the data, and their errors on it: what cross-validation and the choice of a lens rest on."""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.locate import located as located_without_warning
+from diffproj.calibration.losses import Loss
+from diffproj.calibration.one_lens import calibrated
+from diffproj.calibration.options import Options
+from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.lens.models import LensModel
+from diffproj.targets.residuals import projected_minus_seen, put_back_minus_known
+from diffproj.targets.target import Target
+from diffproj.targets.views import Views
+
+
+class Errors(NamedTuple):
+    """Errors of k refits in each of V views `(k, V)`: sums of squares in pixels and in world units, and numbers.
+
+    A corner that a refit's camera does not see is lost: its error is infinite.
+    """
+
+    px: Tensor
+    world: Tensor
+    number: Tensor
+    lost: Tensor
+
+    def plus(self, other: "Errors") -> "Errors":
+        """Those of other corners of the same views added."""
+        return Errors(*(a + b for a, b in zip(self, other, strict=True)))
+
+    def over_views(self) -> tuple[Tensor, Tensor, Tensor]:
+        """RMS errors `(k,)` in pixels and in world units, and the number of corners lost."""
+        px, world, number, lost = (part.sum(-1) for part in self)
+        return (px / number).sqrt(), (world / number).sqrt(), lost
+
+
+def repeated(views: Views, count: int) -> Views:
+    """The same views for a batch of cameras."""
+    pixels = views.pixels.expand(count, *views.pixels.shape)
+    return Views.unchecked(pixels, views.visible.expand(count, *views.visible.shape), views.names, views.size)
+
+
+def folds_of(views: Views, folds: int) -> Tensor:
+    """Which views are left out of which fit `(k, V)`: view i of fit i mod k."""
+    return torch.arange(len(views), device=views.device) % folds == torch.arange(folds, device=views.device)[:, None]
+
+
+def without_views(
+    views: Views, target: Target, distortion: LensModel, out: Tensor, chosen: Options, measure: Loss | None = None
+) -> tuple[Calibration, Errors]:
+    """Refits without the views of each fold `(k, V)`, and their errors there.
+
+    The pose of a view held out is estimated from every second corner and evaluated on the others, then with the roles
+    exchanged. With a robust `measure` the squares in pixels are its values.
+    """
+    every = repeated(views, len(out))
+    fits = calibrated(every.hiding(_corners(out, every)), target, distortion, chosen)
+    held_out = every.hiding(_corners(~out, every))
+    second = _second(views)
+    errors = []
+    posing: dict[str, Any] = {"loss": chosen.loss if chosen.objective == "image" else None, "throw": False}
+    for hidden in (second, ~second):
+        located = located_without_warning(held_out.hiding(hidden), target, fits.camera, **posing)
+        if bool((located.covariance.undetermined_views & located.used.any(-1)).any()):
+            raise CalibrationError(f"a view that was held out has no pose: {located.message}", located)
+        posed = located.used.any(-1, keepdim=True)
+        errors.append(errors_of(located, every.pixels, held_out.hiding(~hidden).visible & posed, measure))
+    return fits, errors[0].plus(errors[1])
+
+
+def without_corners(
+    views: Views, target: Target, distortion: LensModel, chosen: Options, measure: Loss | None = None
+) -> tuple[Calibration, Errors]:
+    """Two refits, each to every second corner of the views, and their errors on the others; see `without_views`."""
+    every = repeated(views, 2)
+    second = _second(views)
+    out = torch.stack([second, ~second])[:, None].expand(every.visible.shape)
+    fits = calibrated(every.hiding(out), target, distortion, chosen)
+    return fits, errors_of(fits, every.pixels, every.visible & out & fits.used.any(-1, keepdim=True), measure)
+
+
+def errors_of(calibration: Calibration, pixels: Tensor, evaluated: Tensor, measure: Loss | None = None) -> Errors:
+    """The errors of a calibration on corners `(k, V, N)` of its views, where `pixels` were seen."""
+    cameras, pixels = calibration.cameras, pixels.to(calibration.points)
+    px, seen = projected_minus_seen(cameras, calibration.board_points.unsqueeze(-3), pixels, evaluated)
+    world, landed = put_back_minus_known(cameras, calibration.points, pixels, evaluated)
+    squared = px.square().sum(-1)
+    in_px = torch.where(evaluated & ~seen, torch.inf, squared if measure is None else measure.value(squared)).sum(-1)
+    in_world = torch.where(evaluated & ~landed, torch.inf, world[..., :2].square().sum(-1)).sum(-1)
+    return Errors(in_px, in_world, evaluated.sum(-1), (evaluated & ~(seen & landed)).sum(-1))
+
+
+def _second(views: Views) -> Tensor:
+    return torch.arange(views.pixels.shape[-2], device=views.device) % 2 == 1
+
+
+def _corners(which: Tensor, views: Views) -> Tensor:
+    return which.unsqueeze(-1).expand(views.visible.shape)

@@ -1,0 +1,155 @@
+"""A lens that folds, or has a pole, inside its own corners is no calibration; and inside the image it is kept from it."""
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffproj as dp
+from diffproj import synthetic
+from diffproj.lens.brown_domain import clearly_one_to_one
+
+D = torch.float64
+BOARD = dp.Chessboard()
+SIZE = (640, 480)
+K = torch.tensor([[600.0, 0, 330], [0, 600, 230], [0, 0, 1]], dtype=D)
+
+
+def lens_of(*coefficients: float) -> dp.BrownConrady:
+    return dp.BrownConrady(torch.tensor(coefficients, dtype=D))
+
+
+TRUTH = dp.Camera(K, distortion=lens_of(-0.25, 0.09, 0.0, 0.0, -0.01), size=SIZE)
+
+
+def seen(camera: dp.Camera, seed: int, noise: float = 0.2) -> dp.Views:
+    return synthetic.corner_views(synthetic.random_cameras(camera, BOARD, 13, seed=seed), BOARD, noise_px=noise)
+
+
+def together(views: list[dp.Views]) -> dp.Views:
+    return dp.Views(torch.stack([v.pixels for v in views]), torch.stack([v.visible for v in views]), size=SIZE)
+
+
+def border() -> Tensor:
+    edge = torch.cartesian_prod(torch.linspace(0, 639, 33, dtype=D), torch.linspace(0, 479, 25, dtype=D))
+    return edge[((edge[:, 0] % 639) == 0) | ((edge[:, 1] % 479) == 0)]
+
+
+def test_eight_coefficients_reach_their_corners_and_the_image() -> None:
+    """Without restraint 11 of 24 such lenses fold inside their own corners; here 325 of 702 would be lost."""
+    views = seen(TRUTH, 8)
+    five, eight = dp.calibrate(views, BOARD), dp.calibrate(views, BOARD, "brown8")
+    projected, valid = eight.cameras.project(BOARD.points)
+    assert bool(valid.all())
+    assert bool(eight.camera.directions(border())[1].all())
+    assert five.rms * 0.99 < eight.rms <= five.rms
+    assert eight.rms == pytest.approx(float((projected - views.pixels).square().sum(-1).mean().sqrt()))
+    assert "k4, k5 and k6 are drawn towards 0" in eight.message
+    assert "drawn towards" not in five.message
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        pytest.param({"loss": dp.Huber(0.5)}, marks=pytest.mark.slow),
+        {"reject_outliers": True},
+        pytest.param({"objective": "plane"}, marks=pytest.mark.slow),
+    ],
+)
+def test_a_richer_lens_never_ends_above_a_poorer_one(options: dict) -> None:
+    views = together([seen(TRUTH, seed) for seed in (2, 8)])
+    five = dp.calibrate(views, BOARD, "brown5", **options)
+    eight = dp.calibrate(views, BOARD, "brown8", **options)
+    assert bool(eight.cameras.project(BOARD.points)[1].all())
+    if not options:
+        assert bool((eight.rms <= five.rms).all())
+    assert (eight.rms / five.rms).max() < 1.002
+    deviations = eight.covariance.deviations
+    assert all(bool((d.isfinite() & (d > 0)).all()) for d in deviations.values())
+    off = (eight.camera.K[:, 0, 0] - 600) / deviations["f_x"]  # over 24 sets: 1.03 root mean square
+    assert off.abs().max() < 3
+
+
+def test_what_restrains_counts_alike_in_both_covariances() -> None:
+    views = seen(TRUTH, 8)
+    plain = dp.calibrate(views, BOARD, "brown8").covariance.deviations
+    weighted = dp.calibrate(views, BOARD, "brown8", weights=torch.ones((), dtype=D)).covariance.deviations
+    for name, deviation in plain.items():
+        assert float(weighted[name] / deviation) == pytest.approx(1, abs=0.25)  # the sandwich, from 1404 residuals
+
+
+def test_terms_that_are_held_are_left_alone() -> None:
+    found = dp.calibrate(seen(TRUTH, 8), BOARD, "brown8", fixed=("k4", "k5", "k6"))
+    assert found.camera.distortion.coefficients[5:].tolist() == [0.0, 0.0, 0.0]  # type: ignore[union-attr]
+    assert "drawn" not in found.message
+
+
+def test_a_lens_that_folds_inside_its_corners_has_not_converged() -> None:
+    """A lens of 170 degrees is no polynomial of the tangent."""
+    wide = dp.KannalaBrandt(torch.tensor([0.02, -0.01, 0.003, -0.001], dtype=D))
+    camera = dp.Camera(K.new_tensor([[200.0, 0, 330], [0, 200, 230], [0, 0, 1]]), distortion=wide, size=SIZE)
+    poses = synthetic.random_cameras(camera, BOARD, 40, seed=3, distance=(0.6, 1.5))
+    faces = (poses.R[..., 2] * (poses.R @ BOARD.points.mean(0) + poses.t)).sum(-1) > 0
+    views = synthetic.corner_views(poses[faces][:13], BOARD)
+    found = dp.calibrate(views, BOARD, "brown5", throw=False)
+    lost = found.used & ~found.cameras.project(BOARD.points)[1]
+    assert bool(lost.any())
+    assert not bool(found.converged)
+    assert f"{int(lost.sum())} corners lie beyond the fold of the lens" in found.message
+    assert "fit distortion='fisheye'" in found.message
+    assert torch.equal(found.view_rms.isinf(), lost.any(-1))
+    assert bool(found.rms.isinf())
+    assert dp.calibrate(views, BOARD, "fisheye").rms < 0.3
+
+
+def test_refine_and_locate_say_it_too() -> None:
+    views = seen(TRUTH, 8)
+    beyond = dp.Camera(K, distortion=lens_of(-0.9, 0.0, 0.0, 0.0, 0.0), size=SIZE)  # it folds at 0.61
+    with pytest.raises(dp.CalibrationError, match=r"locate: .* beyond the fold of the lens: hide"):
+        dp.locate(views, BOARD, beyond)
+    rational = (-35.135, 306.48, -0.0004, 0.0, 38.38, -34.887, 297.69, 115.99)  # the lowest minimum, with a pole
+    with pytest.raises(dp.CalibrationError, match=r"refine: .* beyond the fold of the lens: fit .*'brown5'") as raised:
+        dp.refine(views, BOARD, dp.Camera(K, distortion=lens_of(*rational), size=SIZE))
+    assert bool(raised.value.calibration.rms.isinf())  # type: ignore[union-attr]
+
+
+def test_the_rest_of_the_image_is_a_remark() -> None:
+    found = dp.calibrate(dp.example_views("left"), BOARD, "fisheye")
+    valid = found.camera.directions(border())[1]
+    share = [int(word) for word in found.message.split() if word.isdigit()]
+    assert len(share) == 1
+    assert abs(share[0] - 100 * float((~valid).double().mean())) < 5
+    for side in ("left", "right"):
+        assert "fold" not in dp.calibrate(dp.example_views(side), BOARD).message
+
+
+def test_cross_validation_counts_what_a_lens_loses() -> None:
+    outcome = dp.cross_validate(dp.example_views("right"), BOARD, "brown12")
+    assert outcome.held_out_px.max() < 0.3
+    assert not bool(outcome.lost.any())
+
+
+def test_a_fold_whose_lens_loses_corners_is_infinitely_bad() -> None:
+    """The middle of the image tells five coefficients nothing about its corners."""
+    strong = dp.Camera(K, distortion=lens_of(-0.3, 0.12, 0.0, 0.0, -0.02), size=SIZE)
+    poses = synthetic.random_cameras(strong, BOARD, 400, seed=1, distance=(2.0, 5.0))
+    pixels = poses.project(BOARD.points)[0]
+    far = (pixels - K[:2, 2]).norm(dim=-1).amax(-1)
+    order = far.argsort()
+    chosen = torch.cat([order[:6], order[-1:]])
+    outcome = dp.cross_validate(synthetic.corner_views(poses[chosen], BOARD, noise_px=0.3), BOARD, folds=7)
+    assert int((outcome.lost > 0).sum()) == 1
+    assert torch.equal(outcome.held_out_px.isinf(), outcome.lost > 0)
+    assert f"{int(outcome.lost.sum())} held-out corners lie beyond the fold" in outcome.summary()
+
+
+@pytest.mark.parametrize("count", [4, 5])
+def test_the_quick_look_is_never_wrong(count: int) -> None:
+    draw = torch.Generator().manual_seed(0)
+    size = torch.tensor([0.5, 0.5, 0.02, 0.02, 0.5][:count], dtype=D)
+    coefficients = torch.randn(3000, count, generator=draw, dtype=D) * size
+    radius = 2 * torch.rand(3000, generator=draw, dtype=D)
+    clear = clearly_one_to_one(coefficients, radius)
+    domain = dp.BrownConrady(coefficients).domain
+    assert bool((radius <= domain)[clear].all())
+    assert int(clear.sum()) > 0.5 * int((radius <= domain).sum())
