@@ -12,8 +12,8 @@ so that the covariance of all points together is
 with `D = dX / d uv`, G the derivative by theta and by the plane, and Sigma their joint covariance: the calibration's,
 with its correlations between intrinsics and pose, and the plane's where one is given. A quantity of some of the points
 has the variance `g^T C g`, g its gradient. This is first order: sampling agrees as long as standard deviations are
-small beside the distance; `interval` goes on to where they are not. The covariance of all pairs of points is computed
-only where it is asked for (`joint`).
+small beside the distance. Beyond, `interval` follows the curve, and `lens_reach` tells how much less is known where the
+lens is extrapolated. The covariance of all pairs of points is computed only where it is asked for (`joint`).
 """
 
 from collections.abc import Sequence
@@ -25,10 +25,12 @@ from torch import Tensor
 
 from diffproj._core.numerics import check_tensor, in_float64
 from diffproj.calibration.parametrisation import Parametrisation, moved
+from diffproj.calibration.region import in_region
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
+from diffproj.measurement import lens_reach
 from diffproj.measurement.measurement import Measurement
 from diffproj.measurement.propagation import Noise
 from diffproj.measurement.sight import Sight
@@ -85,7 +87,15 @@ def measure(
     tangents = plane.tangents()
     T = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)  # (*B, N, 3, 2)
     D = torch.where(valid[..., None, None], T @ _inverse2(by_point @ T), 0.0)
+    region = calibration.region if isinstance(calibration, Calibration) else None
     blocks, covariances = [-D @ by_theta], [torch.zeros(*batch, 0, 0).to(D) if known is None else known]
+    beyond = torch.zeros_like(valid)
+    if region is not None and known is not None:
+        extrapolated = valid & ~in_region(pixels, region)
+        factor = lens_reach.stretch(extrapolated, pixels, points, camera, plane, known, blocks[0])
+        beyond = factor.isinf()
+        factor = torch.where(beyond, 1.0, factor)[..., None, None]
+        blocks, by_theta = [factor * blocks[0]], factor * by_theta
     if plane_covariance is not None:
         plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
         if plane.is_per_point:
@@ -96,8 +106,13 @@ def measure(
         with_offset = torch.cat([-points, torch.ones_like(points[..., :1])], dim=-1)
         blocks.append(lift.unsqueeze(-1) * with_offset.unsqueeze(-2))
         covariances.append(in_float64(plane_covariance))
+    if bool(beyond.any()):  # a parameter of which nothing is known, and no two points follow it alike
+        unlike = torch.linspace(1, 2, points.shape[-2]).to(points).unsqueeze(-1)
+        blocks.append(torch.where(beyond.unsqueeze(-1), unlike * T.abs().sum(-1), 0.0).unsqueeze(-1))
+        covariances.append(torch.full((1, 1), torch.inf).to(D))
     common = torch.where(valid[..., None, None], torch.cat(blocks, dim=-1), 0.0)
-    sight = Sight(pixels.expand(*batch, *pixels.shape[-2:]), sigma, camera, plane, by_theta)
+    shown = pixels.expand(*batch, *pixels.shape[-2:])
+    sight = Sight(shown, sigma, camera, plane, by_theta, plane_too=plane_covariance is not None)
     noise = Noise(
         sight,
         common,
@@ -107,7 +122,6 @@ def measure(
         pixels_too=pixel_sigma is None,
     )
     includes_intrinsics = isinstance(calibration, Calibration) and known is not None and calibration.knows_intrinsics
-    region = calibration.region if isinstance(calibration, Calibration) else None
     return Measurement(points, valid, includes_intrinsics, noise, region)
 
 

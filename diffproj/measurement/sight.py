@@ -24,6 +24,7 @@ class Sight:
         camera: at its pose.
         plane: what they lie on.
         by_theta: the derivative of the points' pixels by camera and pose `(*B, N, 2, q)`.
+        plane_too: whether the plane is uncertain.
     """
 
     pixels: Tensor
@@ -31,13 +32,14 @@ class Sight:
     camera: Camera
     plane: Plane
     by_theta: Tensor
+    plane_too: bool
 
     def points(self, index: Tensor, theta: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """The points after a step of camera, pose and plane, and of the pixels.
 
         Args:
             index: numbers of the k pixels of each of M quantities `(M, k)`.
-            theta: the step of camera, pose and, where it is uncertain, plane, `(*B, M, Q)`.
+            theta: the step of camera, pose and, where it is uncertain, plane, `(*B, M, Q)`; the rest does not count.
             noise: the pixels' step in standard deviations `(*B, M, k, 2)`.
 
         Returns:
@@ -55,7 +57,7 @@ class Sight:
             shape, chosen = self.plane.batch_shape, index.flatten()
             normal, offset = self.plane.normal.expand(*shape, 3), self.plane.offset.expand(shape)
             return Plane.unchecked(normal[..., chosen, :], offset[..., chosen], is_per_point=True)
-        if step.shape[-1] == 0:
+        if not self.plane_too:
             return self.plane
         normal, offset = self.plane.normal.unsqueeze(-2) + step[..., :3], self.plane.offset.unsqueeze(-1) + step[..., 3]
         k = index.shape[-1]
