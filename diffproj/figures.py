@@ -70,8 +70,8 @@ def fig7(experiment: Experiment, magnification: float = 50.0) -> Figure:
 def accuracy(found: AccuracyMap, unit: str = "world units") -> Figure:
     """Ground resolution and predicted standard deviation over the image.
 
-    A line surrounds the calibration's corners. What lies outside of them is hatched: the lens is extrapolated there,
-    and the standard deviation may be far too small.
+    A line surrounds the calibration's corners. What lies outside of them is hatched: the lens is extrapolated there.
+    Grey is where a pixel has no point, or a point no finite deviation.
 
     Args:
         found: the map, from `AccuracyMap.over_image`.

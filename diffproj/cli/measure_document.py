@@ -106,8 +106,9 @@ def _points(
             )
     if outside:
         remarks.append(
-            f"{listed('Point', outside)} outside of the region that the calibration's corners covered. Nothing tells "
-            "the lens there, and the truth may lie many deviations off: calibrate with the board there too."
+            f"{listed('Point', outside)} outside of the region that the calibration's corners covered. Only the "
+            "lens model tells the lens there, and where it does not fit, the truth lies further off: calibrate with "
+            "the board there too."
         )
     return rows, remarks
 

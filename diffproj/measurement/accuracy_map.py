@@ -3,8 +3,8 @@
 Two figures for each place: the ground resolution, world units that one pixel covers along its worst direction, which is
 geometry; and the predicted standard deviation of a point measured there, along its worst direction, which adds what the
 calibration does not know. Places beyond the horizon or the lens's reach are not valid. `covered` tells the part of the
-image that the calibration's corners surround: outside of it, `extrapolated`, nothing tells the lens. The standard
-deviation grows there, but only as far as the lens model holds.
+image that the calibration's corners surround: outside of it, `extrapolated`, only the lens model tells the lens. The
+standard deviation grows there with what a lens of that model may do, and is infinite where it may end before the pixel.
 """
 
 import math
@@ -35,7 +35,7 @@ class AccuracyMap:
             everywhere where they are not known, as for a pose that was located with a camera alone.
         resolution: world units a pixel along the worst direction `(H, W)`; NaN where not valid.
         deviation: standard deviation of a measured point along its worst direction in world units `(H, W)`; NaN where
-            not valid, infinite where the calibration does not determine it.
+            not valid, infinite where the calibration does not determine it, be it that the lens may end there.
     """
 
     pixels: Float[Tensor, "h w 2"]
@@ -47,7 +47,7 @@ class AccuracyMap:
 
     @property
     def extrapolated(self) -> Bool[Tensor, "h w"]:
-        """Where a point is measured outside of the corners `(H, W)`: nothing tells the lens there."""
+        """Where a point is measured outside of the corners `(H, W)`: only its model tells the lens there."""
         return self.valid & ~self.covered
 
     @classmethod

@@ -12,8 +12,8 @@ so that the covariance of all points together is
 with `D = dX / d uv`, G the derivative by theta and by the plane, and Sigma their joint covariance: the calibration's,
 with its correlations between intrinsics and pose, and the plane's where one is given. A quantity of some of the points
 has the variance `g^T C g`, g its gradient. This is first order: sampling agrees as long as standard deviations are
-small beside the distance; `interval` goes on to where they are not. The covariance of all pairs of points is computed
-only where it is asked for (`joint`).
+small beside the distance. Beyond, `interval` follows the curve, and `lens_reach` tells how much less is known where the
+lens is extrapolated. The covariance of all pairs of points is computed only where it is asked for (`joint`).
 
 Where a view's pose may be the wrong one of two, the other is too far away for that: see `doubt.py`.
 """
@@ -28,11 +28,13 @@ from torch import Tensor
 
 from diffproj._core.numerics import check_tensor, in_float64
 from diffproj.calibration.parametrisation import Parametrisation, moved
+from diffproj.calibration.region import in_region
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.float32 import warn_if_rounded
 from diffproj.geometry.plane import Plane
+from diffproj.measurement import lens_reach
 from diffproj.measurement.doubt import of_the_pose
 from diffproj.measurement.measurement import Measurement
 from diffproj.measurement.propagation import Noise
@@ -93,7 +95,15 @@ def measure(
     tangents = plane.tangents()
     T = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)  # (*B, N, 3, 2)
     D = torch.where(valid[..., None, None], T @ _inverse2(by_point @ T), 0.0)
+    region = calibration.region if isinstance(calibration, Calibration) else None
     blocks, covariances = [-D @ by_theta], [torch.zeros(*batch, 0, 0).to(D) if known is None else known]
+    beyond = torch.zeros_like(valid)
+    if region is not None and known is not None:
+        extrapolated = valid & ~in_region(pixels, region)
+        factor = lens_reach.stretch(extrapolated, pixels, points, camera, parameters, plane, known, middle, blocks[0])
+        beyond = factor.isinf()
+        factor = torch.where(beyond, 1.0, factor)[..., None, None]
+        blocks, by_theta = [factor * blocks[0]], factor * by_theta
     if plane_covariance is not None:
         plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
         if plane.is_per_point:
@@ -104,12 +114,17 @@ def measure(
         with_offset = torch.cat([-points, torch.ones_like(points[..., :1])], dim=-1)
         blocks.append(lift.unsqueeze(-1) * with_offset.unsqueeze(-2))
         covariances.append(in_float64(plane_covariance))
-    away = points.new_zeros(*points.shape, 0)
+    away = [points.new_zeros(*points.shape, 0)]
     if isinstance(calibration, Calibration) and calibration.has_alternatives:
-        away, doubt = of_the_pose(pixels, calibration, view_number(calibration, view), plane, points, valid)
-        blocks, covariances = [*blocks, away], [*covariances, doubt]
-    common = torch.where(valid[..., None, None], torch.cat(blocks, dim=-1), 0.0)
-    sight = Sight(pixels.expand(*batch, *pixels.shape[-2:]), sigma, camera, plane, by_theta, away)
+        doubt = of_the_pose(pixels, calibration, view_number(calibration, view), plane, points, valid)
+        away, covariances = [doubt.columns], [*covariances, doubt.covariance]
+    if bool(beyond.any()):  # a parameter of which nothing is known, and no two points follow it alike
+        unlike = torch.linspace(1, 2, points.shape[-2]).to(points).unsqueeze(-1)
+        away.append(torch.where(beyond.unsqueeze(-1), unlike * T.abs().sum(-1), 0.0).unsqueeze(-1))
+        covariances.append(torch.full((1, 1), torch.inf).to(D))
+    beside = torch.cat(away, dim=-1)
+    common = torch.where(valid[..., None, None], torch.cat([*blocks, beside], dim=-1), 0.0)
+    sight = Sight(pixels.expand(*batch, *pixels.shape[-2:]), sigma, camera, plane, by_theta, beside)
     noise = Noise(
         sight,
         common,
@@ -119,7 +134,6 @@ def measure(
         pixels_too=pixel_sigma is None,
     )
     includes_intrinsics = isinstance(calibration, Calibration) and known is not None and calibration.knows_intrinsics
-    region = calibration.region if isinstance(calibration, Calibration) else None
     return Measurement(points, valid, includes_intrinsics, noise, region)
 
 

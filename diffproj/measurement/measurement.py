@@ -18,8 +18,8 @@ from diffproj.measurement.quantity import Bounds, Quantity
 from diffproj.measurement.shapes import area_vector, difference, length, turn
 
 EXTRAPOLATED = (
-    "Extrapolated: outside of the region that the calibration's corners covered. Nothing tells the lens there, and the "
-    "truth may lie many deviations off: calibrate with the board there too."
+    "Extrapolated: outside of the region that the calibration's corners covered. Only the lens model tells the lens "
+    "there, and where it does not fit, the truth lies further off: calibrate with the board there too."
 )
 NONLINEAR = "Nonlinear: close to the horizon or to zero, where the deviation misleads; take the interval."
 """What the summary says of points and lengths that it marks so."""
@@ -111,10 +111,11 @@ class Measurement:
     def extrapolated(self) -> Bool[Tensor, "*batch n"] | None:
         """Which pixels lie outside the region that the corners of the calibration covered `(*B, N)`.
 
-        Nothing tells the lens there: the deviations assume that its model goes on to hold, with the coefficients that
-        the corners inside determine, and errors of ten times as much have been seen. The region is the convex hull of
-        all corners that were used, grown by half a square; for a calibration from `locate` that of the calibration it
-        was given. `None` where the corners are not known: for a camera alone, and a pose that was located with one.
+        Nothing tells the lens there but its model. The deviations hold what a lens of that model may do within the
+        uncertainty of its coefficients, and are infinite where such a lens may end before the pixel; of another lens
+        they know nothing. The region is the convex hull of all corners that were used, grown by half a square; for a
+        calibration from `locate` that of the calibration it was given. `None` where the corners are not known: for a
+        camera alone, and a pose that was located with one.
         """
         return None if self._region is None else ~in_region(self._noise.sight.pixels, self._region)
 

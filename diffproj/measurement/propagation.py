@@ -42,14 +42,9 @@ class Noise:
             lost = lost.unsqueeze(-2)
         return (rows.abs() * lost.unsqueeze(-2)).sum(-1, keepdim=True) > 0
 
-    @torch.no_grad()
     def root(self) -> Tensor:
         """A matrix L `(*B, Q, Q)` with `L L^T = sigma`, as if what is not determined were known."""
-        sigma = zero_where_infinite(self.sigma.detach())
-        scale = sigma.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-        unit = torch.where(scale > 0, scale, 1.0)
-        values, vectors = torch.linalg.eigh(sigma / unit.unsqueeze(-1) / unit.unsqueeze(-2))
-        return scale.unsqueeze(-1) * vectors * values.clamp(min=0).sqrt().unsqueeze(-2)
+        return root(self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,3 +172,13 @@ def _firsts(index: Tensor) -> Tensor:
     """1 where a point is named the first time in its row of `(M, k)`, else 0."""
     same = (index.unsqueeze(-1) == index.unsqueeze(-2)).tril(-1)
     return (~same.any(-1)).to(torch.float64)
+
+
+@torch.no_grad()
+def root(sigma: Tensor) -> Tensor:
+    """A matrix L `(*B, Q, Q)` with `L L^T = sigma`; infinite variances count as 0."""
+    sigma = zero_where_infinite(sigma.detach())
+    scale = sigma.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+    unit = torch.where(scale > 0, scale, 1.0)
+    values, vectors = torch.linalg.eigh(sigma / unit.unsqueeze(-1) / unit.unsqueeze(-2))
+    return scale.unsqueeze(-1) * vectors * values.clamp(min=0).sqrt().unsqueeze(-2)
