@@ -2,8 +2,9 @@
 
 A view of the plane z = 0 through a camera without distortion is a homography `H ~ K [r1 r2 t]` (Zhang 2000). That r1
 and r2 are orthogonal and of equal length gives two equations per view, linear in `1 / f_x^2` and `1 / f_y^2` once the
-principal point is fixed, here at the centre of the image; Zhang's full system, with the principal point as unknown, is
-more sensitive to lens distortion than it is useful, but for images that are a part cut out of a larger one. With K known, the columns of `K^-1 H` are the pose.
+principal point is fixed, here at the centre of the image. Zhang's full system, with the principal point as unknown, is
+more sensitive to lens distortion than it is useful, but for images cut out of larger ones. With K known, the columns of
+`K^-1 H` are the pose.
 
 Where these equations have no plausible solution (parallel views, strong distortion), the focal length is chosen from a
 coarse grid: the one under which the columns of `K^-1 H` are closest to orthonormal.
