@@ -29,7 +29,7 @@ FEW_VIEWS = 4
 DIVISION_VIEWS = 4
 """Views of a camera with more of them that lambda is estimated from: those that reach furthest out."""
 MAX_ANGLE = math.radians(75)
-"""Fisheye: corners further from the axis than this are left out of homographies."""
+"""Corners further from the axis than this are left out of homographies: the axis of a fisheye, or of turned rays."""
 
 
 def homographies(points: Tensor, xy: Tensor, used: Tensor) -> Tensor:
@@ -209,6 +209,44 @@ def poses(H: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     return R, t + torch.nn.functional.pad((near - lowest).clamp(min=0).unsqueeze(-1), (2, 0))
 
 
+def poses_along(points: Tensor, rays: Tensor, used: Tensor, perspective: bool) -> tuple[Tensor, Tensor]:
+    """Poses `(R, t)`, `(P, V, 3, 3)` and `(P, V, 3)`, from the corners' rays `(P, V, N, 3)`, however far off the axis.
+
+    With `perspective` all used corners are in front of the camera, where alone it sees them.
+    """
+    turn, xy, ahead = turned_rays(rays, used)
+    R, t = poses(homographies(points, xy, ahead), points)
+    R, t = turn @ R, (turn @ t.unsqueeze(-1)).squeeze(-1)
+    if perspective:
+        depth = (R[..., 2, :2] @ points[:, :2].mT) + t[..., 2:]
+        lowest = torch.where(used, depth, torch.inf).amin(-1)
+        near = 0.01 * (points - points.mean(0)).abs().amax()
+        sight = turn[..., 2]
+        behind = torch.where(lowest <= 0, near - lowest, 0.0)  # far out a corner may well be near the camera's plane
+        t = t + sight / sight[..., 2:].clamp(min=1e-3) * behind.unsqueeze(-1)
+    return R, t
+
+
+def turned_rays(rays: Tensor, used: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Each view's rays `(P, V, N, 3)` turned so that their mean is the axis, in the normalised plane.
+
+    Beside a wide lens a view is as good as in its middle, but its rays have no place, or a far one, on the plane z = 1.
+
+    Returns:
+        The rotation `(P, V, 3, 3)`, by half a turn, so that it leads back too; the rays' points `(P, V, N, 2)` after
+        it; and which of the used ones are within `MAX_ANGLE` of the mean `(P, V, N)`.
+    """
+    rays = torch.where(used.unsqueeze(-1), rays, 0.0)
+    rays = rays / _length(rays, keep=True).clamp(min=1e-300)
+    mean = rays.sum(-2)
+    between = mean / _length(mean, keep=True).clamp(min=1e-300) + mean.new_tensor([0.0, 0, 1])
+    turn = _half_turn(between / _length(between, keep=True).clamp(min=1e-300))
+    straight = rays @ turn
+    ahead = used & (straight[..., 2] > math.cos(MAX_ANGLE))
+    xy = straight[..., :2] / torch.where(ahead, straight[..., 2], 1.0).unsqueeze(-1)
+    return turn, torch.where(ahead.unsqueeze(-1), xy, 0.0), ahead
+
+
 def upright_poses(points: Tensor, xy: Tensor, used: Tensor) -> tuple[Tensor, Tensor]:
     """Poses `(R, t)` of boards that face the camera, turned, scaled and placed as `xy (P, V, N, 2)` says.
 
@@ -245,15 +283,9 @@ def other_pose(R: Tensor, t: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     center = points.mean(0)
     middle = R @ center + t
     sight = middle / _length(middle, keep=True)
-    normal = R[..., 2]
-    mirrored = 2 * (sight * normal).sum(-1, keepdim=True) * sight - normal
-    # The smallest rotation from one normal to the other: I + [v]x + [v]x^2 / (1 + cos).
-    cross = torch.linalg.cross(normal, mirrored)
-    cosine = (normal * mirrored).sum(-1)[..., None, None]
-    V = torch.zeros_like(R)
-    V[..., 0, 1], V[..., 0, 2], V[..., 1, 2] = -cross[..., 2], cross[..., 1], -cross[..., 0]
-    V = V - V.mT
-    turn = torch.eye(3, dtype=R.dtype, device=R.device) + V + V @ V / (1 + cosine).clamp(min=1e-3)
+    # Two half-turns, about the normal and then about the line of sight, are the smallest rotation from one normal
+    # to the other, and a rotation for every pose, seen edge-on too.
+    turn = _half_turn(sight) @ _half_turn(R[..., 2])
     other = turn @ R
     return other, middle - other @ center
 
@@ -284,6 +316,11 @@ def _skewness(h1: Tensor, h2: Tensor, f: Tensor, sound: Tensor) -> Tensor:
     aa, bb, ab = (a * a).sum(-1), (b * b).sum(-1), (a * b).sum(-1)
     off = (4 * ab.square() + (aa - bb).square()) / (aa + bb).square()
     return torch.where(sound, off, 0.0).sum(-1) / sound.sum(-1).clamp(min=1)
+
+
+def _half_turn(axis: Tensor) -> Tensor:
+    """The rotations `(*, 3, 3)` by half a turn about unit vectors `(*, 3)`."""
+    return 2 * axis.unsqueeze(-1) * axis.unsqueeze(-2) - torch.eye(3, dtype=axis.dtype, device=axis.device)
 
 
 def _length(vector: Tensor, keep: bool = False) -> Tensor:
