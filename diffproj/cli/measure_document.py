@@ -121,7 +121,7 @@ def listed(word: str, numbers: Sequence[int]) -> str:
 
 def between(low: float, high: float, scale: float) -> str:
     """An interval for people, whose bounds may be infinite, to the second digit of the standard deviation `scale`."""
-    decimals = max(0, 1 - math.floor(math.log10(scale))) if scale > 0 else 3
+    decimals = max(0, 1 - math.floor(math.log10(scale))) if 0 < scale < math.inf else 3
     start, end = (f"{end:.{decimals}f}" if math.isfinite(end) else "" for end in (low, high))
     if start and end:
         return f"{start} to {end}"

@@ -1,6 +1,7 @@
 """`diffproj measure` as a stranger meets it: what it prints, its JSON, its exit codes and its one-line errors."""
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import torch
 import diffproj as dp
 from diffproj import cli, synthetic
 from diffproj.cli import shielded
-from diffproj.cli.measure_document import REASONS, crosses
+from diffproj.cli.measure_document import REASONS, between, crosses, listed
 from diffproj.cli.measure_tables import coordinate, equation, shown
 
 D = torch.float64
@@ -330,3 +331,14 @@ def test_equations_and_quantities_for_people() -> None:
     assert coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 1) == ("0.00", " ± 0.20")
     assert coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 2) == ("0", "")
     assert shown({"value": 2.5, "deviation": None, "interval_95": None}) == ("2.5", "unknown", "unknown")
+    assert shown({"value": 900.0, "deviation": 300.0, "interval_95": [500.0, None]}) == ("900", "300", "from 500")
+
+
+def test_intervals_and_lists_for_people() -> None:
+    assert between(1.234, 2.345, 0.25) == "1.23 to 2.35"
+    assert between(1.234, math.inf, 0.25) == "from 1.23"
+    assert between(-math.inf, 12.6, 3.0) == "up to 12.6"
+    assert between(-math.inf, math.inf, math.inf) == "unknown"
+    assert between(5.0, 5.0, 0.0) == "5.000 to 5.000"
+    assert listed("Point", [2]) == "Point 2 lies"
+    assert listed("Point", [2, 3, 5]) == "Points 2, 3 and 5 lie"
