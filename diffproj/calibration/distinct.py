@@ -114,6 +114,11 @@ def one_view(
     points: Float[Tensor, "n 3"], pixels: Float[Tensor, "p v n 2"], used: Bool[Tensor, "p v n"]
 ) -> Bool[Tensor, " p"]:
     """Of which cameras no two views differ by more than a few pixels, or there is but one."""
+    if bool(used.all()):  # mostly the middles tell: that spares the rest
+        middle = pixels.mean(-2)
+        far = (middle - middle[:, :1]).abs().amax((-2, -1)) > 3 * ONE_VIEW_PX
+        if bool(far.all()):
+            return ~far
     products = _Products(points, pixels, used, FEWEST, NEIGHBOURS)
     most = used.sum(-1).argmax(-1)
     left, mask = (whole[torch.arange(len(used)), most].unsqueeze(1) for whole in (products.left, products.mask))
