@@ -49,7 +49,7 @@ def alike(
         pixels: finite where used.
         used: which corners count.
     """
-    products = _Products(points, pixels, used, max(FEWEST, COMPARISONS // (len(used) * used.shape[1] ** 2)), NEIGHBOURS)
+    products = _Products(points, pixels, used, max(FEWEST, COMPARISONS // used.shape[1] ** 2), NEIGHBOURS)
     count = used.sum(-1).clamp(min=1)
     seen = torch.where(used.unsqueeze(-1), pixels, 0.0)
     offset = torch.where(used.unsqueeze(-1), pixels - (seen.sum(-2) / count.unsqueeze(-1)).unsqueeze(-2), 0.0)
