@@ -29,6 +29,8 @@ COMPARISONS, FEWEST = 20_000_000, 16
 """Corners times pairs of views up to which all corners are compared; of more views fewer are, but at least so many."""
 NEIGHBOURS = 3
 """Neighbours of each corner that it is compared along with, so that some are left where corners are hidden."""
+MARKER = 11
+"""Corners of a board up to which none are neighbours, for a turn moves them apart: each is compared by itself."""
 FIRST = 8
 """Corners, with one neighbour each, that are compared first; in most sets they tell all views from each other."""
 ONE_VIEW_PX = 10.0
@@ -139,13 +141,14 @@ class _Products:
 
     def __init__(self, points: Tensor, pixels: Tensor, used: Tensor, corners: int, neighbours: int) -> None:
         seen = used.flatten(0, 1).any(0).nonzero().flatten()
-        N = max(1, len(seen))
-        some = torch.linspace(0, N - 1, min(N, corners), device=points.device).long()[: len(seen)]
-        apart = torch.cdist(points[seen[some]], points[seen])
-        apart[torch.arange(len(some)), some] = torch.inf
-        nearest = apart.topk(min(neighbours, N - 1), largest=False).indices
-        corner = seen[some].repeat_interleave(nearest.shape[-1])
-        neighbour = seen[nearest.flatten()]
+        N = len(seen)
+        corner = neighbour = seen
+        if N > MARKER:
+            some = torch.linspace(0, N - 1, min(N, corners), device=points.device).long()
+            apart = torch.cdist(points[seen[some]], points[seen])
+            apart[torch.arange(len(some)), some] = torch.inf
+            corner = seen[some].repeat_interleave(neighbours)
+            neighbour = seen[apart.topk(neighbours, largest=False).indices.flatten()]
         both = used[..., corner] & used[..., neighbour]
         self.mask = both.to(pixels)
         origin = pixels[:, :1, :1]  # near the others: squares of coordinates would cancel
