@@ -25,7 +25,8 @@ def calibrate(
 
     Args:
         views: corners `(*B, V, N, 2)` seen in photographs of known size. Views may miss any corners; one with fewer
-            than 4 takes no part.
+            than 4 takes no part. Views that show the board alike count as one, and at least two must differ, unless
+            `fixed` or `priors` hold the principal point and the lens.
         target: anything with `.points (N, 3)` on z = 0, such as `Chessboard`; its unit is the world's.
         distortion: which lens to fit: `"none"`, `"brown4"`, `"brown5"`, `"brown8"`, `"brown12"`, `"brown14"` or
             `"fisheye"`. Or `"auto"`, for one camera: all of them but the longest are fitted side by side and compared

@@ -29,6 +29,8 @@ COMPARISONS, FEWEST = 20_000_000, 16
 """Corners times pairs of views up to which all corners are compared; of more views fewer are, but at least so many."""
 NEIGHBOURS = 3
 """Neighbours of each corner that it is compared along with, so that some are left where corners are hidden."""
+MARKER = 11
+"""Corners of a board up to which none are neighbours, for a turn moves them apart: each is compared by itself."""
 FIRST = 8
 """Corners, with one neighbour each, that are compared first; in most sets they tell all views from each other."""
 ONE_VIEW_PX = 10.0
@@ -49,7 +51,7 @@ def alike(
         pixels: finite where used.
         used: which corners count.
     """
-    products = _Products(points, pixels, used, max(FEWEST, COMPARISONS // (len(used) * used.shape[1] ** 2)), NEIGHBOURS)
+    products = _Products(points, pixels, used, max(FEWEST, COMPARISONS // used.shape[1] ** 2), NEIGHBOURS)
     count = used.sum(-1).clamp(min=1)
     seen = torch.where(used.unsqueeze(-1), pixels, 0.0)
     offset = torch.where(used.unsqueeze(-1), pixels - (seen.sum(-2) / count.unsqueeze(-1)).unsqueeze(-2), 0.0)
@@ -114,6 +116,11 @@ def one_view(
     points: Float[Tensor, "n 3"], pixels: Float[Tensor, "p v n 2"], used: Bool[Tensor, "p v n"]
 ) -> Bool[Tensor, " p"]:
     """Of which cameras no two views differ by more than a few pixels, or there is but one."""
+    if bool(used.all()):  # mostly the middles tell: that spares the rest
+        middle = pixels.mean(-2)
+        far = (middle - middle[:, :1]).abs().amax((-2, -1)) > 3 * ONE_VIEW_PX
+        if bool(far.all()):
+            return ~far
     products = _Products(points, pixels, used, FEWEST, NEIGHBOURS)
     most = used.sum(-1).argmax(-1)
     left, mask = (whole[torch.arange(len(used)), most].unsqueeze(1) for whole in (products.left, products.mask))
@@ -134,13 +141,14 @@ class _Products:
 
     def __init__(self, points: Tensor, pixels: Tensor, used: Tensor, corners: int, neighbours: int) -> None:
         seen = used.flatten(0, 1).any(0).nonzero().flatten()
-        N = max(1, len(seen))
-        some = torch.linspace(0, N - 1, min(N, corners), device=points.device).long()[: len(seen)]
-        apart = torch.cdist(points[seen[some]], points[seen])
-        apart[torch.arange(len(some)), some] = torch.inf
-        nearest = apart.topk(min(neighbours, N - 1), largest=False).indices
-        corner = seen[some].repeat_interleave(nearest.shape[-1])
-        neighbour = seen[nearest.flatten()]
+        N = len(seen)
+        corner = neighbour = seen
+        if N > MARKER:
+            some = torch.linspace(0, N - 1, min(N, corners), device=points.device).long()
+            apart = torch.cdist(points[seen[some]], points[seen])
+            apart[torch.arange(len(some)), some] = torch.inf
+            corner = seen[some].repeat_interleave(neighbours)
+            neighbour = seen[apart.topk(neighbours, largest=False).indices.flatten()]
         both = used[..., corner] & used[..., neighbour]
         self.mask = both.to(pixels)
         origin = pixels[:, :1, :1]  # near the others: squares of coordinates would cancel

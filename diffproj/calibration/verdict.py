@@ -167,7 +167,7 @@ def _undetermined(lacking: list[str], R: Tensor, foreshortening: Tensor, free_pr
     if len(normals) == 1:
         why = "the only view is seen face on" if foreshortening[0] < MIN_FORESHORTENING else "one view is not enough"
         remedy = "add views tilted by 20 to 50 degrees about both axes"
-        return f"{what}: {why}; {remedy}{', or fix the principal point' * free_principal_point}"
+        return f"{what}: {why}; {remedy}{', or fix the principal point and the lens' * free_principal_point}"
     across = torch.linalg.cross(normals, normals[:1].expand_as(normals)).norm(dim=-1)
     if bool((across < math.sin(PARALLEL_ANGLE)).all()):
         what += ": all views are parallel"

@@ -256,5 +256,5 @@ def test_wrong_corners_and_patterns_do_not_hide_them() -> None:
     assert share is not None
     torch.testing.assert_close(share, torch.full((1, 40), 0.1, dtype=D), rtol=1e-12, atol=0)
     corners = torch.zeros(1, 40, 54, dtype=torch.bool)
-    corners[..., [0, 8, 45, 53]] = True
+    corners[..., [0, 8, 45, 53]] = True  # a turn of a marker moves its corners in four directions
     assert bool((alike(POINTS, frames.pixels[None], corners)[0].sum(-1) == 10).all())
