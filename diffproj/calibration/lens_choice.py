@@ -73,12 +73,12 @@ def chosen_lens(views: Views, target: Target, chosen: Options) -> Calibration:
         fits |= _fits(views, target, LONGER, chosen)
         candidates = _compared(views, target, fits, chosen, by_views)
         best = _simplest(candidates)
-    if best is None:
-        # None could be judged: the message of the lens that most cameras have says what the views lack.
-        usual = next(c for c in candidates if c.model == "brown5")
-        if chosen.throw:
-            raise CalibrationError(f"calibrate: {usual.fit.message}", usual.fit)
-        return usual.fit
+    if best is None:  # none could be judged: what most cameras have, or why even that fails
+        best = next(c for c in candidates if c.model == "brown5")
+        if not bool(best.fit.converged):
+            if chosen.throw:
+                raise CalibrationError(f"calibrate: {best.fit.message}", best.fit)
+            return best.fit
     return replace(best.fit, comparison=_comparison(candidates, best, by_views))
 
 
@@ -97,6 +97,8 @@ def _compared(
 ) -> list[_Candidate]:
     # All are judged by the same corners: without those that no lens could explain.
     outliers = torch.stack([fit.rejected for fit in fits.values() if bool(fit.converged)] or [~views.visible]).all(0)
+    if chosen.weights is not None:
+        outliers = outliers | (torch.as_tensor(chosen.weights).to(views.device).expand(outliers.shape) <= 0)
     return [_candidate(views.hiding(outliers), target, model, fit, chosen, by_views) for model, fit in fits.items()]
 
 
@@ -132,6 +134,9 @@ def _judged(candidate: _Candidate) -> bool:
 
 def _simplest(candidates: list[_Candidate]) -> _Candidate | None:
     judged = [c for c in candidates if _judged(c)]
+    # Views that do not determine an ordinary camera may still determine a fisheye: that is no reason to take it.
+    if any(c.model == "brown5" and "determine" in c.cause for c in candidates):
+        judged = [c for c in judged if MODELS[c.model].perspective]
     if not judged:
         return None
     best = min(judged, key=lambda c: float(c.squares.nanmean()))
@@ -156,7 +161,7 @@ def _difference(candidate: _Candidate, best: _Candidate) -> tuple[float, float]:
 
 
 def _comparison(candidates: list[_Candidate], taken: _Candidate, by_views: bool) -> LensComparison:
-    best = min((c for c in candidates if _judged(c)), key=lambda c: float(c.squares.nanmean()))
+    best = min(candidates, key=lambda c: float(c.squares.nanmean()))
     scale = best.squares.nanmean().sqrt()
     squares = torch.stack([c.squares.nanmean() for c in candidates])
     differences = squares.new_tensor([_difference(c, best) for c in candidates])
@@ -167,8 +172,8 @@ def _comparison(candidates: list[_Candidate], taken: _Candidate, by_views: bool)
         held_out,
         torch.stack([c.fit.rms.detach() for c in candidates]),
         squares.sqrt(),
-        squares.sqrt() - scale,
-        differences[:, 1] / (squares.sqrt() + scale),
+        (squares.sqrt() - scale).nan_to_num(torch.inf, torch.inf),
+        (differences[:, 1] / (squares.sqrt() + scale)).nan_to_num(torch.inf),
         tuple(c.cause for c in candidates),
     )
 

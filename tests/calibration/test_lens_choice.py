@@ -78,6 +78,29 @@ def test_the_table_tells_what_was_compared() -> None:
     assert all(len(line) < 80 for line in lines)
 
 
+@pytest.mark.parametrize("view", [0, 6])
+def test_one_view_is_no_fisheye_because_it_determines_one(view: int) -> None:
+    one = dp.example_views("left")[view : view + 1]
+    usual = dp.calibrate(one, BOARD, throw=False)
+    found = dp.calibrate(one, BOARD, "auto", throw=False)
+    assert torch.equal(found.shared, usual.shared)
+    assert torch.equal(found.status, usual.status)
+    held = dp.calibrate(one, BOARD, "auto", fixed=("principal_point",))
+    assert held.comparison is not None
+    assert held.comparison.chosen == "brown5"
+
+
+def test_corners_of_no_weight_are_not_judged_by() -> None:
+    views = dp.example_views("left")[:3]
+    pixels, weights = views.pixels.clone(), torch.ones(3, 54, dtype=D)
+    pixels[0, 7] += 30
+    weights[0, 7] = 0
+    found = dp.calibrate(dp.Views(pixels, size=views.size), BOARD, "auto", weights=weights)
+    assert found.comparison is not None
+    assert found.comparison.chosen == "brown5"
+    assert found.comparison.held_out_px[1] < 0.3
+
+
 def test_options_go_to_the_lenses_that_have_them() -> None:
     views = dp.example_views("left")[:4]
     found = dp.calibrate(views, BOARD, "auto", fixed=("k3",), priors={"p1": 0.01})

@@ -113,14 +113,13 @@ def test_refine_and_locate_say_it_too() -> None:
     assert bool(raised.value.calibration.rms.isinf())  # type: ignore[union-attr]
 
 
-def test_the_rest_of_the_image_is_a_remark() -> None:
+def test_the_summary_tells_what_of_the_image_is_out_of_reach() -> None:
     found = dp.calibrate(dp.example_views("left"), BOARD, "fisheye")
-    valid = found.camera.directions(border())[1]
-    share = [int(word) for word in found.message.split() if word.isdigit()]
-    assert len(share) == 1
-    assert abs(share[0] - 100 * float((~valid).double().mean())) < 5
+    lost = 100 * float((~found.camera.directions(border())[1]).double().mean())
+    (line,) = [line for line in found.summary().splitlines() if line.startswith("image ")]
+    assert abs(int(line.split()[1]) - lost) < 5
     for side in ("left", "right"):
-        assert "fold" not in dp.calibrate(dp.example_views(side), BOARD).message
+        assert "fold" not in dp.calibrate(dp.example_views(side), BOARD).summary()
 
 
 def test_cross_validation_counts_what_a_lens_loses() -> None:

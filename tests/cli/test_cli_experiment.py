@@ -46,7 +46,7 @@ def test_options_reach_the_experiment(tmp_path: Path, capsys: pytest.CaptureFixt
     assert code == 0
     assert "right14.jpg" in out
     assert "27" in out
-    assert "lens" not in out
+    assert "lens k1" not in out
     rows = (tmp_path / "table1.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows[1:]] == ["right13.jpg", "right14.jpg", "all"]
 
