@@ -41,9 +41,9 @@ def rotations(vectors: Tensor) -> Tensor:
     return axis_angle_to_rotation_matrix(vectors.reshape(-1, 3)).reshape(*vectors.shape[:-1], 3, 3)
 
 
-def pinhole(f: float) -> dp.Camera:
-    K = torch.tensor([[f, 0, 319.5], [0, f, 239.5], [0, 0, 1]], dtype=D)
-    return dp.Camera(K, size=(640, 480))
+def pinhole(f: float, side: int = 1200) -> dp.Camera:
+    middle = (side - 1) / 2
+    return dp.Camera(torch.tensor([[f, 0, middle], [0, f, middle], [0, 0, 1]], dtype=D), size=(side, side))
 
 
 def leaning(
@@ -89,7 +89,7 @@ def calibration() -> dp.Calibration:
     cameras = dp.synthetic.random_cameras(pinhole(800.0), BOARD, 13, seed=8)
     pixels, _ = cameras.project(BOARD.points)
     noise = SIGMA * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(5), dtype=D)
-    return dp.calibrate(dp.Views(pixels + noise, size=(640, 480)), BOARD, "none")
+    return dp.calibrate(dp.Views(pixels + noise, size=(1200, 1200)), BOARD, "none")
 
 
 @pytest.fixture
@@ -164,8 +164,9 @@ def test_a_view_at_the_edge_of_a_fisheye(target: Any, angle: tuple[float, float]
 def test_a_view_at_the_edge_of_a_wide_rectilinear_lens(target: Any) -> None:
     """Between 70 and 80 degrees off the axis 2 of 100 were not found."""
     depth = 5 * float((target.points - target.points.mean(0)).norm(dim=-1).max())
-    pixels, truth = leaning(pinhole(300.0), target, 100, 2 * depth, (0.0, 50.0), noise=0.0, angle=(70.0, 80.0))
-    found = dp.locate(dp.Views(pixels), target, pinhole(300.0))
+    camera = pinhole(300.0, 10_000)
+    pixels, truth = leaning(camera, target, 100, 2 * depth, (0.0, 50.0), noise=0.0, angle=(70.0, 80.0))
+    found = dp.locate(dp.Views(pixels), target, camera)
     assert found.rms < 1e-8
     assert tilt_error(found.cameras, truth).max() < 1e-4
 
@@ -349,7 +350,7 @@ def test_a_point_that_the_other_pose_puts_nowhere_is_not_determined(calibration:
     down = torch.linalg.cross(axis, torch.tensor([0.0, 0, 1], dtype=D))
     down = down / down.norm()
     plane = dp.Plane(camera.R.mT @ down, 50.0 - down @ camera.t)
-    u, v = torch.meshgrid(torch.arange(0.0, 640, 40), torch.arange(0.0, 480, 20), indexing="xy")
+    u, v = torch.meshgrid(torch.arange(280.0, 920, 40), torch.arange(360.0, 840, 20), indexing="xy")
     seen = torch.stack([u, v], dim=-1).reshape(-1, 2).to(D)
     measured = dp.measure(seen, found, plane, view)
     _, there = dp.back_project(seen, other, plane)
@@ -367,7 +368,7 @@ def test_a_point_that_the_other_pose_puts_nowhere_is_not_determined(calibration:
 def stacked(calibration: dp.Calibration, count: int) -> dp.Calibration:
     """The same calibration as many times side by side."""
     pixels = calibration.views.pixels.expand(count, *calibration.views.pixels.shape)
-    return dp.calibrate(dp.Views(pixels, size=(640, 480)), BOARD, "none")
+    return dp.calibrate(dp.Views(pixels, size=(1200, 1200)), BOARD, "none")
 
 
 @pytest.mark.usefixtures("quiet")
@@ -414,7 +415,7 @@ def test_missing_corners_and_views() -> None:
     visible = torch.ones(3, 54, dtype=torch.bool)
     visible[0], visible[1, 30:] = False, False
     with pytest.warns(dp.AmbiguousPoseWarning) as told:
-        found = dp.locate(dp.Views(pixels, visible, size=(640, 480)), BOARD, pinhole(800.0))
+        found = dp.locate(dp.Views(pixels, visible, size=(1200, 1200)), BOARD, pinhole(800.0))
     assert len(told) == 1
     assert found.ambiguous.tolist()[0] is False
     assert found.ambiguous.tolist()[1] is True
@@ -424,7 +425,7 @@ def test_missing_corners_and_views() -> None:
 
 def test_what_is_said(calibration: dp.Calibration) -> None:
     pixels, _ = leaning(pinhole(800.0), marker(27.0), 30, 800.0, (20.0, 20.0))
-    views = dp.Views(pixels, names=[f"photo {n}.jpg" for n in range(30)], size=(640, 480))
+    views = dp.Views(pixels, names=[f"photo {n}.jpg" for n in range(30)], size=(1200, 1200))
     with pytest.warns(dp.AmbiguousPoseWarning, match=r"^locate: two poses fit photo .*more views.*; see alternatives"):
         found = dp.locate(views, marker(27.0), calibration)
     assert found.message.startswith("converged: no step lowers the error any more; two poses fit photo")
@@ -442,7 +443,7 @@ def test_calibrate_tells_its_ambiguous_views_without_a_warning() -> None:
     near, _ = cameras.project(BOARD.points)
     near = near + SIGMA * torch.randn(near.shape, generator=torch.Generator().manual_seed(1), dtype=D)
     far, _ = leaning(pinhole(800.0), BOARD, 2, 5000.0, (10.0, 10.0), seed=3)
-    found = dp.calibrate(dp.Views(torch.cat([near, far]), size=(640, 480)), BOARD, "none")
+    found = dp.calibrate(dp.Views(torch.cat([near, far]), size=(1200, 1200)), BOARD, "none")
     assert found.ambiguous.tolist() == [False] * 8 + [True] * 2
     assert "two poses fit view 9, view 10" in found.message
     for view in range(10):
@@ -459,7 +460,7 @@ def test_files_keep_the_other_pose(tmp_path: Path, calibration: dp.Calibration) 
     pixels, _ = leaning(pinhole(800.0), marker(27.0), 6, 800.0, (20.0, 50.0))
     pixels = torch.cat([pixels, leaning(pinhole(800.0), marker(27.0), 1, 100.0, (30.0, 30.0), noise=0.01)[0]])
     with pytest.warns(dp.AmbiguousPoseWarning):
-        found = dp.locate(dp.Views(pixels, size=(640, 480)), marker(27.0), calibration)
+        found = dp.locate(dp.Views(pixels, size=(1200, 1200)), marker(27.0), calibration)
     dp.save_camera(tmp_path / "located.json", found)
     again = dp.load_calibration(tmp_path / "located.json")
     assert torch.equal(again.likelihood_ratio, found.likelihood_ratio)
@@ -476,7 +477,7 @@ def test_files_of_before_are_read(tmp_path: Path) -> None:
     del document["calibration"]["other_poses"]
     path.write_text(json.dumps(document))
     found = dp.load_calibration(path)
-    assert found.message == "converged: no step lowers the error any more"
+    assert "poses" not in found.message
     assert found.summary()
     assert found.covariance.shared.isfinite().all()
     assert dp.measure(found.views.pixels[0, :2], found, dp.Plane.z(0.0)).deviations.isfinite().all()

@@ -82,7 +82,7 @@ def test_where_the_lens_is_known_nothing_changes() -> None:
     first = dp.measure(places, inside, Z, pixel_sigma=0.0)
     ratio = measured.deviations[:, :2] / first.deviations[:, :2]
     assert (ratio[~measured.extrapolated] == 1).all()
-    assert ((ratio >= 1) & (ratio < 1.02)).all()
+    assert ((ratio >= 1) & (ratio < 1.1)).all()
     assert (ratio[measured.extrapolated] > 1).any()
 
 
