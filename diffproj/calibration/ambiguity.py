@@ -73,8 +73,7 @@ def difference(kept: Pose, other: Pose, middle: Float[Tensor, "*#batch 3"]) -> F
 
 def widened(covariance: Covariance, kept: Pose, others: OtherPoses, middle: Tensor) -> Covariance:
     """The covariance with the doubt between the two poses of each view in it."""
-    poses = [(R.detach(), t.detach()) for R, t in (kept, (others.R, others.t))]
-    if covariance.middle is not None:  # its poses turn about it
-        poses, middle = [(R, t + R @ covariance.middle) for R, t in poses], middle - covariance.middle
-    step = difference(*poses, middle.detach()) * others.probability.sqrt().unsqueeze(-1)
+    about = torch.zeros_like(middle) if covariance.middle is None else covariance.middle  # what its poses turn about
+    one, other = ((R.detach(), t.detach() + R.detach() @ about) for R, t in (kept, (others.R, others.t)))
+    step = difference(one, other, middle.detach() - about) * others.probability.sqrt().unsqueeze(-1)
     return replace(covariance, _alone=covariance._alone + step.unsqueeze(-1) * step.unsqueeze(-2))

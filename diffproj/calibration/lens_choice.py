@@ -20,6 +20,7 @@ from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.options import Options
 from diffproj.calibration.parametrisation import BOW, INTRINSICS
 from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.calibration.verdict import ONE_VIEW
 from diffproj.lens.models import MODELS, LensModel
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
@@ -73,8 +74,9 @@ def chosen_lens(views: Views, target: Target, chosen: Options) -> Calibration:
         fits |= _fits(views, target, LONGER, chosen)
         candidates = _compared(views, target, fits, chosen, by_views)
         best = _simplest(candidates)
-    if best is None:  # none could be judged: what most cameras have, or why even that fails
-        best = next(c for c in candidates if c.model == "brown5")
+    usual = next(c for c in candidates if c.model == "brown5")
+    if best is None or (_inadequate(best) and _lacks_views(usual)):  # what most cameras have, or why even that fails
+        best = usual
         if not bool(best.fit.converged):
             if chosen.throw:
                 raise CalibrationError(f"calibrate: {best.fit.message}", best.fit)
@@ -135,7 +137,7 @@ def _judged(candidate: _Candidate) -> bool:
 def _simplest(candidates: list[_Candidate]) -> _Candidate | None:
     judged = [c for c in candidates if _judged(c)]
     # Views that do not determine an ordinary camera may still determine a fisheye: that is no reason to take it.
-    if any(c.model == "brown5" and "determine" in c.cause for c in candidates):
+    if any(c.model == "brown5" and _lacks_views(c) for c in candidates):
         judged = [c for c in judged if MODELS[c.model].perspective]
     if not judged:
         return None
@@ -147,6 +149,11 @@ def _simplest(candidates: list[_Candidate]) -> _Candidate | None:
         if worse <= max(ALLOWED * deviation, ALIKE * float(best.squares.nanmean())):
             return candidate
     return best
+
+
+def _lacks_views(candidate: _Candidate) -> bool:
+    """Whether the views do not determine its camera."""
+    return "determine" in candidate.cause or ONE_VIEW in candidate.cause
 
 
 def _inadequate(candidate: _Candidate) -> bool:

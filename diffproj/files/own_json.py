@@ -30,9 +30,6 @@ SUFFIXES: tuple[str, ...] = (".json",)
 KIND, VERSION = "diffproj camera", 1
 """What every file says of itself."""
 
-LATER = "shares", "degrees_of_freedom", "lens_region"
-"""Fields of a calibration that files of earlier releases lack."""
-
 
 def dumps(path: Path, item: Camera | Calibration) -> str:
     """A camera or a calibration as the text of a file.
@@ -93,7 +90,9 @@ def read_calibration(path: Path) -> Calibration | None:
             tuple(found["causes"]),
             None if found["pixel_sigma"] is None else _tensor(_with_nan(found["pixel_sigma"]), torch.float64),
             skew=found.get("skew", False),
-            **{key: None if found.get(key) is None else _tensor(found[key], torch.float64) for key in LATER},
+            shares=_later(found.get("shares")),
+            degrees_of_freedom=_later(found.get("degrees_of_freedom")),
+            lens_region=_later(found.get("lens_region")),
             _covariance=None if covariance is None else partial(_same, covariance),
             _others=None if others is None else partial(_same, others),
             _remarks=partial(_same, tuple(found["remarks"])) if "remarks" in found else None,
@@ -156,6 +155,11 @@ def _other_poses(fields: dict[str, Any] | None) -> OtherPoses | None:
         return None
     R, t, ratio = (_tensor(_with_nan(fields[key]), torch.float64) for key in ("R", "t", "likelihood_ratio"))
     return OtherPoses(R, t, torch.where(ratio.isnan(), torch.inf, ratio))
+
+
+def _later(values: Any) -> Tensor | None:
+    """A field that files of earlier releases lack."""
+    return None if values is None else _tensor(_with_nan(values), torch.float64)
 
 
 def _same(known: T) -> T:

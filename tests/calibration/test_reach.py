@@ -108,8 +108,10 @@ def test_refine_and_locate_say_it_too() -> None:
     with pytest.raises(dp.CalibrationError, match=r"locate: .* beyond the fold of the lens: hide"):
         dp.locate(views, BOARD, beyond)
     rational = (-35.135, 306.48, -0.0004, 0.0, 38.38, -34.887, 297.69, 115.99)  # the lowest minimum, with a pole
+    posed = dp.calibrate(views, BOARD).cameras
+    start = dp.Camera(K, distortion=lens_of(*rational), size=SIZE)[None].expand(len(views)).at(posed.R, posed.t)
     with pytest.raises(dp.CalibrationError, match=r"refine: .* beyond the fold of the lens: fit .*'brown5'") as raised:
-        dp.refine(views, BOARD, dp.Camera(K, distortion=lens_of(*rational), size=SIZE))
+        dp.refine(views, BOARD, start)
     assert bool(raised.value.calibration.rms.isinf())  # type: ignore[union-attr]
 
 
