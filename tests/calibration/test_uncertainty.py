@@ -1,5 +1,6 @@
 """Error bars: against refits, real and simulated, for each kind of fit; and the factor for errors that views share."""
 
+import warnings
 from typing import Any
 
 import pytest
@@ -186,3 +187,32 @@ def test_a_file_of_an_earlier_version_has_no_dispersion() -> None:
     assert torch.equal(again.dispersion, covariance.dispersion)
     del fields["dispersion"]
     assert dp.Covariance.from_fields(fields).dispersion == 1
+
+
+@pytest.mark.parametrize("corners", [4, 6, 54])
+def test_few_corners_are_located_with_the_noise_of_the_calibration(corners: int) -> None:
+    """Their own residuals hardly tell it: from four corners alone, intervals of 95 % held 86 %, or were far too wide."""
+    cameras = scene(11)
+    exact, _ = cameras.project(BOARD.points)
+    generator = torch.Generator().manual_seed(6)
+    noisy = exact + SIGMA * torch.randn(600, *exact.shape, generator=generator, dtype=D)
+    found = dp.calibrate(dp.Views(noisy[:, :10], size=(640, 480)), BOARD, "brown4")
+    visible = torch.zeros(1, 54, dtype=torch.bool)
+    visible[0, [0, 53, 8, 45, 22, 31, *range(54)][:corners]] = True
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dp.AmbiguousPoseWarning)
+        located = dp.locate(dp.Views(noisy[:, 10:], visible.expand(600, -1, -1), size=(640, 480)), BOARD, found)
+    assert found.degrees_of_freedom is not None
+    assert located.degrees_of_freedom is not None
+    pooled = located.degrees_of_freedom > found.degrees_of_freedom
+    assert float(pooled.double().mean()) > 0.97
+    places = torch.tensor([[25.0, 25, 0], [175, 100, 0], [100, 60, 0]], dtype=D)
+    pixels = cameras[10].project(places)[0] + SIGMA * torch.randn(600, 3, 2, generator=generator, dtype=D)
+    low, high = dp.measure(pixels, located, dp.Plane.z(0.0)).interval()
+    inside = ((low <= places) & (places <= high))[..., :2].double().mean()
+    assert 0.93 < float(inside) < 0.97
+    # Corners that are far noisier than the calibration's tell their own noise.
+    worse = exact[10:] + 20 * SIGMA * torch.randn(1, 54, 2, generator=generator, dtype=D)
+    one = dp.calibrate(dp.Views(noisy[0, :10], size=(640, 480)), BOARD, "brown4")
+    own = dp.locate(dp.Views(worse, size=(640, 480)), BOARD, one)
+    assert own.pixel_sigma == pytest.approx(20 * SIGMA, rel=0.3)
