@@ -36,6 +36,17 @@ class Fit:
     solution: Solution
     rejected: Tensor
 
+    def part(self, rows: Tensor) -> "Fit":
+        """The fit of some of the cameras `(n,)`."""
+
+        def cut(whole: Any) -> Any:
+            if isinstance(whole, Tensor):
+                return whole[rows]
+            parts = [cut(part) for part in whole]
+            return type(whole)(*parts) if hasattr(whole, "_fields") else tuple(parts)
+
+        return Fit(self.task.part(rows), cut(self.solution), self.rejected[rows])
+
     def residual_variance(self) -> Tensor:
         """`sum |e|^2 / (2 n - parameters)` of least squares, `(P,)`; NaN without positive degrees of freedom."""
         cost = self.solution.cost

@@ -8,7 +8,8 @@ lens that stands for what the poses should explain. A camera is looked at again 
 
 Then starts compete. For focal lengths on a grid each view takes the better of its two poses, as a Gauss-Newton step
 predicts their costs; the grid's best focal lengths, with and without the lens's first estimate, are solved side
-by side, and what ends lowest is kept. A minimum is only ever replaced by a lower one.
+by side, and what ends lowest is kept, or what is reached from it with the principal point on the other side of the
+image's middle. A minimum is only ever replaced by a lower one.
 """
 
 import math
@@ -20,8 +21,8 @@ from torch import Tensor
 
 from diffproj.calibration import closed_form
 from diffproj.calibration.fit import Fit, fit
-from diffproj.calibration.parametrisation import Pose
-from diffproj.calibration.solver import Status
+from diffproj.calibration.parametrisation import INTRINSICS, Parametrisation, Pose
+from diffproj.calibration.solver import Solution, Status
 from diffproj.calibration.start import Straightened
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import predicted_costs, replaced
@@ -105,11 +106,30 @@ def second_look(
     # Side by side, as one batch: the time of few views is that of the calls. Only the best goes on to the end.
     others = fit(task.part(every), shared, poses, reject=reject, **short)
     rows = torch.arange(len(which), device=which.device)
-    best = _part(others, rows)
+    best = others.part(rows)
     for rank in range(1, len(starts)):
-        best = _lower(best, _part(others, rows + rank * len(which)), rows, reject)
+        best = _lower(best, others.part(rows + rank * len(which)), rows, reject)
     last = fit(task, best.solution.shared, best.solution.local, reject=reject, **steps)
-    return _lower(found, last, which, reject)
+    found = _lower(found, last, which, reject)
+    if straight.lens == "none" and (task.basis is None or bool(task.basis[:, 2:4].any())):
+        start = _other_side(found.task.parameters, found.part(which).solution, straight.middle[which])
+        found = _lower(found, fit(task, *start, reject=reject, **steps), which, reject)
+    return found
+
+
+def _other_side(parameters: Parametrisation, solution: Solution, middle: Tensor) -> tuple[Tensor, Pose]:
+    """The same with the principal point on the other side of the image's middle `(P, 2)`, views shifted, and no lens.
+
+    Of a long lens the principal point is hardly known, and with it decides which way the coefficients bend the image:
+    there are valleys on both sides.
+    """
+    shared, (R, t) = solution.shared.clone(), solution.local
+    moved = 2 * (middle - shared[:, 2:4])
+    lens = slice(len(INTRINSICS), parameters.lens_end)
+    # What is not the pinhole's goes back to nothing, and the views to where they are seen in the same place.
+    shared[:, lens], shared[:, 2:4] = 0.0, shared[:, 2:4] + moved
+    aside = (moved / shared[:, :2]).unsqueeze(1) * t[..., 2:]
+    return shared, (R, t - torch.nn.functional.pad(aside, (0, 1)))
 
 
 def _poorer(task: Task) -> Task | None:
@@ -123,18 +143,6 @@ def _poorer(task: Task) -> Task | None:
     basis = (basis if task.basis is None else task.basis).clone()
     basis[:, late] = 0.0
     return replace(task, basis=basis[..., (basis != 0).any(1).any(0)])
-
-
-def _part(found: Fit, rows: Tensor) -> Fit:
-    """The fit of some of the cameras `(n,)`."""
-
-    def cut(whole: object) -> object:
-        if isinstance(whole, Tensor):
-            return whole[rows]
-        parts = [cut(part) for part in whole]  # type: ignore[attr-defined]
-        return type(whole)(*parts) if hasattr(whole, "_fields") else tuple(parts)
-
-    return Fit(found.task.part(rows), cut(found.solution), found.rejected[rows])  # type: ignore[arg-type]
 
 
 def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Tensor, Pose]]:
