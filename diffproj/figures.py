@@ -119,7 +119,9 @@ def accuracy(found: AccuracyMap, unit: str = "world units") -> Figure:
             bar.set_ticks([mark for mark in marks if known.min() <= mark <= known.max()], minor=False)
         bar.ax.tick_params(labelsize=8, which="both")
     if bool(found.extrapolated.any()):
-        figure.supxlabel("hatched: outside of the calibration's corners, where the lens is extrapolated", fontsize=9)
+        note = "hatched: outside of the calibration's corners, where the lens is extrapolated"
+        lost = bool((found.deviation.isinf() | ~(found.resolution > 0)).any())
+        figure.supxlabel(note + "; grey: not determined" * lost, fontsize=9)
     return figure
 
 
