@@ -56,6 +56,11 @@ def refine(
     """
     if isinstance(views, Camera | PinholeCamera):
         raise TypeError("refine: want (views, target, camera) in this order, got the camera first")
+    if isinstance(camera, Calibration):
+        raise TypeError(
+            "camera: want dp.Camera, got Calibration; "
+            "give calibration.camera, or calibration.cameras to start from its poses"
+        )
     chosen = calibration_options("refine", options)
     data = Data(views, target, chosen.weights)
     camera = as_camera(camera)

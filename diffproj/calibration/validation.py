@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from diffproj.calibration.calibrate import calibrate
+from diffproj.calibration.distinct import alike
 from diffproj.calibration.held_out import errors_of, folds_of, repeated, without_views
 from diffproj.calibration.options import CalibrationOptions, calibration_options
 from diffproj.calibration.result import Calibration, CalibrationError
@@ -94,13 +95,17 @@ def cross_validate(
         raise ValueError(f"views: want those of one camera, got batch shape {tuple(views.batch_shape)}")
     if options.get("bow"):
         raise ValueError("bow: want False, for held-out views are located on a flat board")
-    if not 2 <= folds <= len(views):
-        raise ValueError(f"folds: want from 2 to the number of views, {len(views)}, got {folds}")
+    if not isinstance(folds, int) or not 2 <= folds <= len(views):
+        raise ValueError(f"folds: want a whole number from 2 to the number of views, {len(views)}, got {folds}")
+    _check_lens(distortion)
     chosen = calibration_options("cross_validate", options)
     fits, errors = without_views(views, target, distortion, folds_of(views, folds), chosen)
     held_out_px, held_out_world, lost = errors.over_views()
     in_sample_px, in_sample_world, _ = errors_of(fits, fits.views.pixels, fits.used).over_views()
-    return CrossValidation(fits, in_sample_px, held_out_px, in_sample_world, held_out_world, lost)
+    parts = in_sample_px, held_out_px, in_sample_world, held_out_world
+    # With throw=False some may not have converged.
+    in_px, out_px, in_world, out_world = (torch.where(fits.converged, part, torch.inf) for part in parts)
+    return CrossValidation(fits, in_px, out_px, in_world, out_world, lost)
 
 
 def bootstrap(
@@ -113,7 +118,8 @@ def bootstrap(
 ) -> Mapping[str, Float[Tensor, ""]]:
     """Standard deviations of the shared parameters over refits to views resampled with replacement.
 
-    No noise model is assumed. With few views the estimates are rough: from 13 views, accurate to about a third.
+    No noise model is assumed. With few views the estimates are rough: from 13 views, accurate to about a third. Views
+    that show the board alike are drawn together, for they are no independent evidence.
 
     Args:
         views: corners `(V, N, 2)` of one camera.
@@ -128,7 +134,7 @@ def bootstrap(
         out.
 
     Raises:
-        ValueError: more than one camera, fewer than 2 draws, or weights.
+        ValueError: more than one camera, all views alike, fewer than 2 draws, or weights.
         CalibrationError: fewer than half of the draws, or fewer than 2, converged.
 
     Example:
@@ -139,13 +145,18 @@ def bootstrap(
     """
     if views.batch_shape:
         raise ValueError(f"views: want those of one camera, got batch shape {tuple(views.batch_shape)}")
-    if draws < 2:
-        raise ValueError(f"draws: want at least 2, got {draws}")
+    if not isinstance(draws, int) or draws < 2:
+        raise ValueError(f"draws: want a whole number of at least 2, got {draws}")
+    _check_lens(distortion)
     if "weights" in options:
         raise ValueError("weights: want none, for they count here how often a view was drawn")
     generator = torch.Generator().manual_seed(seed)
-    drawn = torch.randint(len(views), (draws, len(views)), generator=generator).to(views.device)
-    counts = torch.nn.functional.one_hot(drawn, len(views)).sum(1).to(torch.float64)
+    group = _groups(views, target)
+    number = int(group.amax()) + 1
+    if number < 2:
+        raise ValueError(f"views: want some that show the board differently, got {len(views)} alike")
+    drawn = torch.randint(number, (draws, number), generator=generator).to(views.device)
+    counts = torch.nn.functional.one_hot(drawn, number).sum(1).to(torch.float64)[:, group]
     every = repeated(views, draws)
     hidden = (counts == 0).unsqueeze(-1).expand(every.visible.shape)
     options |= {"weights": counts.unsqueeze(-1), "throw": False}
@@ -154,3 +165,24 @@ def bootstrap(
     if int(kept.sum()) < max(2, draws // 2):
         raise CalibrationError(f"bootstrap: {int(kept.sum())} of {draws} draws determine the camera; add views", found)
     return dict(zip(found.parameters.names, found.shared[kept].std(0).unbind(), strict=True))
+
+
+def _check_lens(distortion: str) -> None:
+    if distortion == "auto":
+        raise ValueError(
+            "distortion: want the name of a lens, got 'auto'; calibrate with it, and give the lens it took"
+        )
+
+
+def _groups(views: Views, target: Target) -> Tensor:
+    """Numbers `(V,)`, from 0, of what is drawn together: views that show the board alike."""
+    used = views.visible & (views.visible.sum(-1, keepdim=True) >= 4)
+    points = target.points.to(views.pixels)
+    same = alike(points - points.mean(0), views.pixels.detach().unsqueeze(0), used.unsqueeze(0))[0]
+    same = same | torch.eye(len(views), dtype=torch.bool, device=views.device)
+    first = same.to(torch.uint8).argmax(-1)
+    for _ in range(len(views)):
+        if torch.equal(first[first], first):
+            break
+        first = first[first]
+    return first.unique(return_inverse=True)[1]

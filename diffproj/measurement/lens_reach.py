@@ -46,7 +46,7 @@ def stretch(
         by_theta: the derivative of the points by these `(*B, N, 3, q)`.
     """
     found = torch.ones_like(points[..., 0])
-    some = which.reshape(-1, which.shape[-1]).any(0)
+    some = which.reshape(which.shape[:-1].numel(), which.shape[-1]).any(0)
     if not bool(some.any()):
         return found
     pixels, points, along = pixels[..., some, :], points[..., some, :], by_theta[..., some, :, :]

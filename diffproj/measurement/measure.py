@@ -63,6 +63,7 @@ def measure(
 
     Returns:
         The measured points, in float64; gradients flow to pixels, plane, sigma and, where they carry one, the camera.
+        A calibration's covariance, and how much larger deviations are where the lens is extrapolated, count as given.
 
     Raises:
         ValueError: no such view, or a camera without `pixel_sigma`.
@@ -106,6 +107,7 @@ def measure(
         blocks, by_theta = [factor * blocks[0]], factor * by_theta
     if plane_covariance is not None:
         plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
+        _check_covariance(plane_covariance.detach())
         if plane.is_per_point:
             raise ValueError("plane_covariance: want one plane for all points, got one for each (Plane.per_point)")
         n = plane.normal.unsqueeze(-2).expand_as(points)
@@ -179,9 +181,16 @@ def _expanded(pixel_sigma: float | Tensor | None, like: Tensor) -> Tensor:
     except RuntimeError:
         want, got = tuple(like.shape[:-1]), tuple(sigma.shape)
         raise ValueError(f"pixel_sigma: want a number or a shape that broadcasts to {want}, got {got}") from None
-    if bool((sigma.detach() < 0).any()):
-        raise ValueError("pixel_sigma: want standard deviations of at least 0, got negative ones")
+    if not bool(((sigma.detach() >= 0) & sigma.detach().isfinite()).all()):
+        raise ValueError("pixel_sigma: want finite standard deviations of at least 0, got others")
     return sigma
+
+
+def _check_covariance(given: Tensor) -> None:
+    size = given.abs().amax((-2, -1), keepdim=True)
+    sound = given.isfinite().all() and bool(((given - given.mT).abs() <= 1e-6 * size).all())
+    if not sound or bool((torch.linalg.eigvalsh(in_float64(given)) < -1e-6 * size.squeeze(-1)).any()):
+        raise ValueError("plane_covariance: want a symmetric matrix without negative eigenvalues, got another")
 
 
 def _projection_derivatives(
@@ -195,7 +204,7 @@ def _projection_derivatives(
     s = parameters.size
     shared = parameters.pack(camera).expand(*batch, s).reshape(-1, s)
     R, t = camera.R.expand(*batch, 3, 3).reshape(-1, 1, 3, 3), camera.t.expand(*batch, 3).reshape(-1, 1, 3)
-    flat = points.reshape(len(shared), 1, -1, 3)
+    flat = points.reshape(len(shared), 1, points.shape[-2], 3)
     if middle is not None:
         flat, t = flat - middle, t + R @ middle
     bow = 0 if known is None else known.shape[-1] - s - 6

@@ -62,7 +62,9 @@ class Measurement:
     @property
     def deviations(self) -> Float[Tensor, "*batch n 3"]:
         """The standard deviations of each point's coordinates `(*B, N, 3)` in world units, to first order."""
-        return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+        variance = self.covariance.diagonal(dim1=-2, dim2=-1)
+        known = ~(variance <= 0)  # the root's slope at 0 is infinite; NaN stays
+        return torch.where(known, torch.where(known, variance, 1.0).sqrt(), 0.0)
 
     def joint(self) -> Float[Tensor, "*batch all all"]:
         """The covariance of all coordinates together, `(*B, 3 N, 3 N)`, points in order; NaN where not valid."""

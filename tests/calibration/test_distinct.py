@@ -191,6 +191,7 @@ def test_one_view_is_refused(pixels: Tensor, options: dict[str, Any]) -> None:
         dp.calibrate(dp.Views(pixels, size=VIEWS.size), BOARD, **options)
 
 
+@pytest.mark.slow
 def test_every_bundled_view_alone_is_refused_with_a_remedy() -> None:
     for side in ("left", "right"):
         for view in dp.example_views(side):

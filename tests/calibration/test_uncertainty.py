@@ -95,7 +95,7 @@ def test_joint_error_of_parameters_and_pose(kind: str) -> None:
     assert float(found.covariance.dispersion.mean()) < 1.05
 
 
-@pytest.mark.parametrize("loss", [None, dp.Huber(0.4)])
+@pytest.mark.parametrize("loss", [None, pytest.param(dp.Huber(0.4), marks=pytest.mark.slow)])
 def test_joint_error_with_few_corners_a_view(loss: dp.Loss | None) -> None:
     cameras = scene(20)
     visible = torch.zeros(20, 54, dtype=torch.bool)
@@ -189,7 +189,7 @@ def test_a_file_of_an_earlier_version_has_no_dispersion() -> None:
     assert dp.Covariance.from_fields(fields).dispersion == 1
 
 
-@pytest.mark.parametrize("corners", [4, 6, 54])
+@pytest.mark.parametrize("corners", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (6, 54))])
 def test_few_corners_are_located_with_the_noise_of_the_calibration(corners: int) -> None:
     """Their own residuals hardly tell it: from four corners alone, intervals of 95 % held 86 %, or were far too wide."""
     cameras = scene(11)

@@ -70,3 +70,35 @@ def test_bad_input_is_refused_by_name() -> None:
         dp.bootstrap(views, BOARD, draws=1)
     with pytest.raises(dp.CalibrationError, match="draws determine the camera"):
         dp.bootstrap(views[:1], BOARD, draws=4)
+
+
+def test_views_alike_are_drawn_together() -> None:
+    views = dp.example_views("left")[:6]
+    thrice = dp.Views(views.pixels.repeat(3, 1, 1), size=views.size)
+    alone, copied = (dp.bootstrap(v, dp.Chessboard(), "brown4", draws=40) for v in (views, thrice))
+    for name, spread in alone.items():
+        assert float(copied[name]) == pytest.approx(float(spread), rel=1e-3)
+    with pytest.raises(ValueError, match="views: want some that show the board differently, got 4 alike"):
+        dp.bootstrap(dp.Views(views.pixels[[3] * 4], size=views.size), dp.Chessboard(), fixed=("distortion",))
+
+
+def test_folds_that_did_not_converge_have_no_error() -> None:
+    views = dp.example_views("left")[[0, 0, 0]]
+    outcome = dp.cross_validate(views, dp.Chessboard(), folds=3, throw=False)
+    assert not outcome.fits.converged.any()
+    assert outcome.held_out_px.isinf().all()
+    assert "inf" in outcome.summary()
+
+
+@pytest.mark.plain
+def test_wrong_numbers_and_lenses_are_named() -> None:
+    views, board = dp.example_views("left"), dp.Chessboard()
+    with pytest.raises(ValueError, match="folds: want a whole number from 2 to"):
+        dp.cross_validate(views, board, folds=2.5)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"draws: want a whole number of at least 2, got 2\.5"):
+        dp.bootstrap(views, board, draws=2.5)  # type: ignore[arg-type]
+    for function in (dp.cross_validate, dp.bootstrap):
+        with pytest.raises(ValueError, match="distortion: want the name of a lens, got 'auto'; calibrate with it"):
+            function(views, board, "auto")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"camera: want dp\.Camera, got Calibration; give calibration\.camera"):
+        dp.refine(views, board, dp.calibrate(views, board))  # type: ignore[arg-type]

@@ -199,7 +199,7 @@ def test_bounds_are_the_extremes_over_all_errors_of_that_size() -> None:
     assert reached > 0.6  # random errors hardly point the best way
 
 
-@pytest.mark.parametrize("corners", [4, 5, 8])
+@pytest.mark.parametrize("corners", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (5, 8))])
 def test_estimated_from_few_corners(corners: int) -> None:
     """A view located by few corners, at its own residual level. Measured: 94.4 to 95.0 and 98.6 to 99.0 %.
 

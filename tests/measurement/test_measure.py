@@ -1,5 +1,7 @@
 """Measured points and lengths with error bars: Jacobians, limits, and what is refused. Sampling is in `test_sampling`."""
 
+import math
+
 import pytest
 import torch
 
@@ -176,7 +178,7 @@ def test_points_counted_from_the_end_are_the_same_points(calibration: dp.Calibra
         measured.lengths([[0, 3]])
     with pytest.raises(ValueError, match="pairs: want point numbers"):
         measured.lengths([[0, 1, 2]])
-    with pytest.raises(ValueError, match="pixel_sigma: want standard deviations"):
+    with pytest.raises(ValueError, match="pixel_sigma: want finite standard deviations"):
         dp.measure(calibration.views.pixels[0, :3], calibration, Z, pixel_sigma=-1.0)
     with pytest.raises(ValueError, match="pixel_sigma: want a number or a shape"):
         dp.measure(calibration.views.pixels[0, :3], calibration, Z, pixel_sigma=torch.ones(2))
@@ -234,8 +236,9 @@ def test_what_is_not_determined_is_infinite() -> None:
     angle = torch.tensor(0.5, dtype=D)
     alike = dp.rotation_from_euler(angle, 0 * angle, 0 * angle).expand(3, 3, 3)
     shifts = torch.tensor([[-100.0, -60, 500], [-80, -50, 600], [-90, -70, 450]], dtype=D)
-    views = synthetic.corner_views(dp.Camera(K, size=(640, 480)).at(alike, shifts), BOARD)
-    found = dp.calibrate(views, BOARD, "none", throw=False)
+    truth = dp.Camera(K, size=(640, 480)).at(alike, shifts)
+    views = synthetic.corner_views(truth, BOARD)
+    found = dp.refine(views, BOARD, truth, throw=False)
     covariance = found.covariance
     assert covariance.undetermined.any()
     assert not covariance.undetermined.all()
@@ -308,3 +311,30 @@ def test_bad_input_is_refused_by_name(calibration: dp.Calibration) -> None:
         dp.measure(pixels, calibration, Z).lengths().interval(1.0)
     with pytest.raises(ValueError, match="points: want at least 3, got 2"):
         dp.measure(pixels, calibration, Z).angles()
+
+
+def test_deviations_have_finite_gradients(calibration: dp.Calibration) -> None:
+    """Also on a plane where one coordinate is exact."""
+    pixels = calibration.views.pixels[0, [0, 8, 53]].clone().requires_grad_()
+    total = dp.measure(pixels, calibration, Z).deviations.sum()
+    (gradient,) = torch.autograd.grad(total, pixels)
+    assert gradient.isfinite().all()
+    step = torch.zeros_like(pixels)
+    step[1, 0] = 1e-3
+    with torch.no_grad():
+        up, down = (dp.measure(pixels + sign * step, calibration, Z).deviations.sum() for sign in (1, -1))
+    assert float(gradient[1, 0]) == pytest.approx(float(up - down) / 2e-3, rel=1e-4)
+
+
+@pytest.mark.parametrize("matrix", [-1e-2 * torch.eye(4), torch.ones(4, 4).tril(), math.nan * torch.eye(4)])
+def test_a_plane_covariance_that_is_none_is_refused(calibration: dp.Calibration, matrix: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match="plane_covariance: want a symmetric matrix without negative eigenvalues"):
+        dp.measure(calibration.views.pixels[0], calibration, Z, plane_covariance=matrix.to(D))
+
+
+def test_noise_that_is_none_is_refused_and_no_pixels_give_no_points(calibration: dp.Calibration) -> None:
+    for sigma in (math.nan, math.inf, -1.0):
+        with pytest.raises(ValueError, match="pixel_sigma: want finite standard deviations of at least 0"):
+            dp.measure(calibration.views.pixels[0], calibration, Z, pixel_sigma=sigma)
+    nothing = dp.measure(calibration.views.pixels[0, :0], calibration, Z)
+    assert nothing.points.shape == nothing.deviations.shape == (0, 3)
