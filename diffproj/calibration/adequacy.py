@@ -73,6 +73,7 @@ def other_lens(task: Task, p: int, radial: bool) -> str:
         return "let the lens's coefficients free"
     if not radial and model.count and model.perspective:
         better = {"brown12": "'brown14'", "brown14": "'fisheye'"}.get(task.lens, "'brown12'")
+        better += "" if task.skew else ", or skew=True"
     elif model.count <= 5 and model.perspective:
         better = {0: "'brown5'", 4: "'brown5', 'brown8'"}.get(model.count, "'brown8'") + " or 'fisheye'"
     else:

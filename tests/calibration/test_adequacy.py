@@ -121,3 +121,10 @@ def test_what_is_said_is_in_message_and_summary() -> None:
     found = dp.calibrate(dp.example_views("left"), BOARD, "none")
     assert found.message == f"converged: no step lowers the error any more; {found.remarks[0]}"
     assert found.summary().splitlines()[-1] == found.remarks[0]
+
+
+def test_skew_is_advised_where_it_is_missing() -> None:
+    views = dp.example_views("left")
+    skewed = dp.Views(views.pixels @ torch.tensor([[1.0, 0.005], [0, 1]], dtype=views.pixels.dtype).mT, size=views.size)
+    assert "or skew=True" in dp.calibrate(skewed, BOARD).message
+    assert "skew" not in dp.calibrate(skewed, BOARD, skew=True).message
