@@ -9,7 +9,7 @@ lens that stands for what the poses should explain. A camera is looked at again 
 Then starts compete. For focal lengths on a grid each view takes the better of its two poses, as a Gauss-Newton step
 predicts their costs; the grid's best focal lengths, with and without the lens's first estimate, are solved side
 by side, and what ends lowest is kept, or what is reached from it with the principal point on the other side of the
-image's middle. A minimum is only ever replaced by a lower one.
+image's middle, or with one view turned over. A minimum is only ever replaced by a lower one.
 """
 
 import math
@@ -25,7 +25,7 @@ from diffproj.calibration.parametrisation import INTRINSICS, Parametrisation, Po
 from diffproj.calibration.solver import Solution, Status
 from diffproj.calibration.start import Straightened
 from diffproj.calibration.task import Task
-from diffproj.calibration.two_poses import predicted_costs, replaced
+from diffproj.calibration.two_poses import near_rivals, predicted_costs, replaced
 
 FOCAL_GRID = tuple(0.3 * 1.5**i for i in range(14))
 """Focal lengths to look at, in units of the image's longer side: from a field of view of 118 degrees to one of 1."""
@@ -42,6 +42,8 @@ MANY_STEPS = 12
 """Steps of the solver from which on a minimum is looked at again."""
 SHORT_FIT = 40
 """Steps after which only the best of the starts goes on."""
+MAX_TURNS = 3
+"""Maximum number of views of a camera that are turned over, one after the other."""
 LOWER = 1e-9
 """Part of the cost by which another minimum must be lower to replace the first."""
 
@@ -114,6 +116,33 @@ def second_look(
     if straight.lens == "none" and (task.basis is None or bool(task.basis[:, 2:4].any())):
         start = _other_side(found.task.parameters, found.part(which).solution, straight.middle[which])
         found = _lower(found, fit(task, *start, reject=reject, **steps), which, reject)
+    return found if reject is not None else _with_views_turned_over(found, which, short, steps)
+
+
+def _with_views_turned_over(found: Fit, which: Tensor, short: dict[str, Any], steps: dict[str, Any]) -> Fit:
+    """The fit of some cameras `(n,)` with one view turned over where that lets all parameters end lower.
+
+    With the shared parameters held a view's other pose may cost a little more, and less when all is solved again.
+    """
+    for _ in range(MAX_TURNS):
+        part = found.part(which)
+        p, v, other = near_rivals(part.task, part.solution)
+        if len(p) == 0:
+            break
+        rows = torch.arange(len(p), device=p.device)
+        starts = tuple(z[p].index_put((rows, v), new) for z, new in zip(part.solution.local, other, strict=True))
+        tried = fit(part.task.part(p), part.solution.shared[p], starts, **short)
+        costs = torch.full(part.task.used.shape[:2], torch.inf, dtype=starts[1].dtype, device=p.device)
+        costs = costs.index_put((p, v), tried.solution.cost.nan_to_num(torch.inf))
+        number = torch.zeros_like(costs, dtype=torch.long).index_put((p, v), rows)
+        lowest, view = costs.min(-1)
+        lower = (lowest < part.solution.cost * (1 - LOWER)).nonzero().flatten()
+        if len(lower) == 0:
+            break
+        best = tried.part(number[lower, view[lower]])
+        which = which[lower]
+        last = fit(found.task.part(which), best.solution.shared, best.solution.local, **steps)
+        found = _lower(found, last, which, None)
     return found
 
 

@@ -39,6 +39,8 @@ FEW_CORNERS = 10
 """Corners of a view up to which more than two poses may fit about as well (four points: up to four)."""
 TILT = math.radians(40)
 """By which boards are tilted that a lost view's pose, or that of a few corners, is sought from."""
+WON_BACK = 10.0
+"""Residual variances that shared parameters may win back when a view is turned over."""
 MAX_ROUNDS = 8
 """Maximum number of times that poses are exchanged and the cameras solved again."""
 BETTER = 1e-6
@@ -96,6 +98,24 @@ def better_poses(task: Task, solution: Solution, cameras: Tensor) -> tuple[Pose,
     lost = seen & (_misfit(task, here) | (task.used.sum(-1) <= FEW_CORNERS))
     poses, more = _sought(task, solution.shared, poses, here, lost)
     return poses, changed | more
+
+
+def near_rivals(task: Task, solution: Solution) -> tuple[Tensor, Tensor, Pose]:
+    """The n views `(p, v)` whose other pose costs little more with the shared parameters held, and these poses.
+
+    Little is what the shared parameters may win back when they are solved for again.
+    """
+    poses, shared = solution.local, solution.shared
+    here = view_costs(task, shared, poses)
+    variance = mean_squares(task, here)
+    p, v = (task.used.any(-1) & weak_perspective(task, shared, poses, variance)).nonzero(as_tuple=True)
+    if len(p) == 0:
+        return p, v, tuple(z[p, v] for z in poses)
+    refined, costs = posed(task, shared, [closed_form.other_pose(poses[0], poses[1], task.points)], p, v)
+    level = torch.where(task.used.any(-1), variance, torch.nan).nanmedian(-1).values[p]
+    turned_over = (refined[0][0] * poses[0][p, v]).sum((-2, -1)) < 3 - 1e-4  # another pose, and not the same again
+    near = (costs[0] - here[p, v] <= WON_BACK * level) & turned_over
+    return p[near], v[near], tuple(z[0][near] for z in refined)
 
 
 def found_again(task: Task, solution: Solution, lost: Tensor) -> Solution:
