@@ -84,6 +84,7 @@ def test_refining_a_calibration(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     assert found["bow"] < 2
 
 
+@pytest.mark.slow
 def test_training_finds_the_camera(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     found = outcome(
         "03_training_pipeline",

@@ -78,7 +78,8 @@ def test_the_table_tells_what_was_compared() -> None:
     assert all(len(line) < 80 for line in lines)
 
 
-@pytest.mark.parametrize("view", [pytest.param(0, marks=pytest.mark.slow), 6])
+@pytest.mark.slow
+@pytest.mark.parametrize("view", [0, 6])
 def test_one_view_is_no_fisheye_because_it_determines_one(view: int) -> None:
     one = dp.example_views("left")[view : view + 1]
     usual = dp.calibrate(one, BOARD, throw=False)

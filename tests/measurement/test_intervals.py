@@ -271,6 +271,7 @@ def test_gradients_stay_finite_at_kinks() -> None:
         assert gradient.isfinite().all()
 
 
+@pytest.mark.slow
 def test_many_cameras_give_what_each_gives() -> None:
     both = TILTED.at(torch.stack([FRONTAL.R, TILTED.R]), torch.stack([FRONTAL.t, TILTED.t]))
     pixels = torch.tensor([[320.0, 260], [320.2, 260.3], [500, 120]], dtype=D)

@@ -279,6 +279,7 @@ def test_batched_and_differentiable() -> None:
     assert torch.autograd.gradcheck(deviation, (views.pixels[:, 1, ::27].clone().requires_grad_(),), fast_mode=True)
 
 
+@pytest.mark.slow
 def test_held_out_boards_agree_with_their_error_bars() -> None:
     """Distances between all corners of held-out views: errors over predicted deviations spread by about one."""
     pairs = torch.combinations(torch.arange(54), 2)
