@@ -60,7 +60,7 @@ def test_bootstrap_agrees_with_the_covariance() -> None:
 def test_bad_input_is_refused_by_name() -> None:
     views = dp.example_views("left")
     batch = dp.Views(views.pixels[None], size=views.size)
-    with pytest.raises(ValueError, match="folds: want from 2 to the number of views, 13, got 14"):
+    with pytest.raises(ValueError, match="folds: want a whole number from 2 to the number of views, 13, got 14"):
         dp.cross_validate(views, BOARD, folds=14)
     with pytest.raises(ValueError, match="views: want those of one camera"):
         dp.cross_validate(batch, BOARD)
