@@ -66,7 +66,7 @@ def test_bad_input_is_refused_by_name() -> None:
         dp.cross_validate(batch, BOARD)
     with pytest.raises(ValueError, match="views: want those of one camera"):
         dp.bootstrap(batch, BOARD)
-    with pytest.raises(ValueError, match="draws: want at least 2, got 1"):
+    with pytest.raises(ValueError, match="draws: want a whole number of at least 2, got 1"):
         dp.bootstrap(views, BOARD, draws=1)
     with pytest.raises(dp.CalibrationError, match="draws determine the camera"):
         dp.bootstrap(views[:1], BOARD, draws=4)
