@@ -154,7 +154,8 @@ def bootstrap(
     group = _groups(views, target)
     number = int(group.amax()) + 1
     if number < 2:
-        raise ValueError(f"views: want some that show the board differently, got {len(views)} alike")
+        alone = "one" if len(views) == 1 else f"{len(views)} alike"
+        raise ValueError(f"views: want some that show the board differently, got {alone}")
     drawn = torch.randint(number, (draws, number), generator=generator).to(views.device)
     counts = torch.nn.functional.one_hot(drawn, number).sum(1).to(torch.float64)[:, group]
     every = repeated(views, draws)

@@ -68,8 +68,10 @@ def test_bad_input_is_refused_by_name() -> None:
         dp.bootstrap(batch, BOARD)
     with pytest.raises(ValueError, match="draws: want a whole number of at least 2, got 1"):
         dp.bootstrap(views, BOARD, draws=1)
-    with pytest.raises(dp.CalibrationError, match="draws determine the camera"):
+    with pytest.raises(ValueError, match="views: want some that show the board differently, got one"):
         dp.bootstrap(views[:1], BOARD, draws=4)
+    with pytest.raises(dp.CalibrationError, match="draws determine the camera"):
+        dp.bootstrap(views[:2], BOARD, draws=2, seed=1)  # twice the same view
 
 
 def test_views_alike_are_drawn_together() -> None:
