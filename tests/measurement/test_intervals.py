@@ -6,6 +6,7 @@ Of n trials a coverage of 95 % is known to 0.22 sqrt(1e4 / n) %: 0.5 % for 2000.
 import itertools
 import math
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -179,6 +180,9 @@ def test_bounds_are_infinite_where_the_noise_reaches_the_horizon() -> None:
 def test_bounds_are_the_extremes_over_all_errors_of_that_size() -> None:
     """Against the slow way: thousands of errors of that size, each followed on the curve."""
     setup = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+    known = setup.covariance_of_kept_poses  # as small as for corners that err independently: random draws reach more
+    small = replace(known, **{n: getattr(known, n) / known.dispersion for n in ("shared", "_mixed", "_alone")})
+    setup = replace(setup, _covariance=lambda: small)
     plane = dp.Plane([0.0, 1.0, 0.02], 300.0)
     spread = torch.diag(torch.tensor([1e-6, 1e-6, 1e-6, 1.0], dtype=D))
     pixels = torch.tensor([[320.0, 160.0], [330, 170]], dtype=D)
@@ -196,7 +200,7 @@ def test_bounds_are_the_extremes_over_all_errors_of_that_size() -> None:
     assert low <= lengths.min()
     assert lengths.max() <= high
     reached = (lengths.max() - lengths.min()) / (high - low)
-    assert reached > 0.6  # random errors hardly point the best way
+    assert reached > 0.8  # random errors hardly point the best way
 
 
 @pytest.mark.parametrize("corners", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (5, 8))])
