@@ -29,6 +29,8 @@ from diffproj.calibration.task import Task
 
 FEW_VIEWS = 2.5
 """The excess counts `1 + FEW_VIEWS / (views - 1)` fold."""
+BELIEF = 4.0
+"""Degrees of freedom below which phi counts little: what one or two of them say is mostly chance."""
 SINGULAR = 1e-9
 """Eigenvalue of K_v, relative to the largest, below which the view says nothing in this direction."""
 
@@ -45,7 +47,7 @@ def dispersion(found: Fit) -> Tensor:
         return torch.ones_like(shared[:, 0])
     with torch.inference_mode():
         phi, spare, views = _between_over_within(task, shared, local, found.degrees_of_freedom())
-        excess = (phi - 1).clamp(min=0)
+        excess = (phi - 1).clamp(min=0) * spare.square() / (spare.square() + BELIEF**2)
         excess = excess.pow(3) / (excess.square() + 2 / spare)  # 2 / spare: phi's own variance for independent corners
         factor = 1 + excess * (1 + FEW_VIEWS / (views - 1).clamp(min=1))
         factor = torch.where((spare >= 1) & factor.isfinite(), factor, 1.0)
