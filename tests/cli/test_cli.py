@@ -88,7 +88,7 @@ def test_help_and_mistakes_load_no_command(arguments: list[str], code: int, text
         f"try: cli.main({arguments})\n"
         "except SystemExit as error: code = error.code\n"
         "loaded = {name.partition('.')[0] for name in set(sys.modules) - before}\n"
-        "print(*(name for name in sys.modules if name.startswith('diffproj.cli.')), loaded & {'rich', 'matplotlib'})\n"
+        "print(*(name for name in sys.modules if name.startswith('diffproj.cli.')), loaded & {'rich', 'matplotlib', 'torch'})\n"
         "sys.exit(code)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
