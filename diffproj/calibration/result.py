@@ -79,6 +79,7 @@ class Calibration:
             board as it does, to within 2 px, which bring nothing new. `None` where all counted fully.
         skew: whether the skew of K is among the parameters: it was fitted, or K had some that was held.
         comparison: how the lenses fared, where `distortion="auto"` compared them.
+        unit: the world's unit, such as `"mm"`, where it is known; files keep it.
     """
 
     camera: Camera
@@ -98,6 +99,7 @@ class Calibration:
     degrees_of_freedom: Float[Tensor, "*batch"] | None = None
     lens_region: Float[Tensor, "*#batch directions"] | None = None
     comparison: LensComparison | None = None
+    unit: str | None = None
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
     _remarks: Callable[[], tuple[str, ...]] | None = None

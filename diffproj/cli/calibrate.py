@@ -1,8 +1,8 @@
 """`diffproj calibrate`: from photographs of a chessboard to a camera file."""
 
 import argparse
-import tempfile
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -11,8 +11,11 @@ from rich.table import Table
 
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.result import Calibration
-from diffproj.cli.inputs import board_size, camera_file, find_corners, photographs, square_side
+from diffproj.cli.drawing import check_drawing, drawing, write_drawing
+from diffproj.cli.inputs import board_size, camera_file, check_writable, writing
+from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import RESULTS, aligned, in_options, progress_bars, result, rounded
+from diffproj.cli.units import square_side
 from diffproj.files.save import save_camera
 from diffproj.lens.models import LensModel
 from diffproj.targets.chessboard import Chessboard
@@ -25,14 +28,15 @@ it found and writes a camera file.
 Take 10 to 20 photographs with one focus and one zoom, the board flat, sharp,
 wholly in view and tilted by 20 to 50 degrees this way and that, so that it
 reaches every part of the image in some of them. A photograph in which no board
-is found is named and skipped.
+is found is named and skipped; so are, in a folder, files that cannot be read,
+hidden files and those that are no photographs. Copies count once.
 """
 
 EPILOG = """\
 examples:
-  diffproj calibrate photos/ --board 9x6 --square 25
-  diffproj calibrate left*.jpg --board 9x6 --square 25 -o camera.yaml
-  diffproj calibrate wide/ --board 11x8 --square 0.03 --distortion auto
+  diffproj calibrate photos/ --board 9x6 --square 25mm
+  diffproj calibrate left*.jpg --board 9x6 --square 25mm -o camera.yaml
+  diffproj calibrate wide/ --board 11x8 --square 3cm --distortion auto --draw wide.png
 
 The file is for diffproj.load_camera("camera.json") in Python; OpenCV reads the
 YAML and XML by cv2.FileStorage: camera_matrix, distortion_coefficients.
@@ -63,7 +67,8 @@ def add_options(command: argparse.ArgumentParser) -> None:
         type=square_side,
         required=True,
         metavar="SIDE",
-        help="side of a square, measured on the print; its unit, such as mm, becomes the world's (required)",
+        help="side of a square, measured on the print, such as 25mm, 2.5cm or 1in; its unit becomes the world's "
+        "(required)",
     )
     board.add_argument(
         "--bow",
@@ -81,11 +86,16 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "corners held out and takes the simplest that is no worse than the best (default: brown5)",
     )
     lens.add_argument(
+        "--skew",
+        action="store_true",
+        help="the sensor's rows and columns may not be at right angles: fit the skew, too",
+    )
+    lens.add_argument(
         "--reject-outliers",
         action="store_true",
         help="leave out corners that lie more than 5 standard deviations off, and name them",
     )
-    file = command.add_argument_group("the file")
+    file = command.add_argument_group("the files")
     file.add_argument(
         "-o",
         "--output",
@@ -95,14 +105,22 @@ def add_options(command: argparse.ArgumentParser) -> None:
         help="the camera file, replaced if there is one. Its ending says what it holds: .json the whole calibration; "
         ".yaml, .yml or .xml what OpenCV's calibration program writes (default: camera.json)",
     )
+    file.add_argument(
+        "--draw",
+        type=drawing,
+        metavar="FILE",
+        help="draw where in the image the corners lie and how far off they are: a .png, .svg or .pdf, replaced if "
+        "there is one",
+    )
     command.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    _check_writable(options.output)
+    check_writable("--output", options.output)
+    check_drawing(options.draw)
     columns, rows = options.board
-    board = Chessboard(columns, rows, options.square)
+    board = Chessboard(columns, rows, options.square.side)
     with progress_bars() as bars:
         views = find_corners(photographs(options.photographs), board, bars)
         task = bars.add_task("Solving", total=None)
@@ -111,36 +129,27 @@ def run(options: argparse.Namespace) -> int:
             board,
             options.distortion,
             bow=options.bow,
+            skew=options.skew,
             reject_outliers=options.reject_outliers,
             progress=lambda done, total: bars.update(task, completed=done, total=total),
         )
+    calibration = replace(calibration, unit=options.square.unit)
     if calibration.comparison is not None:
         result(f"Lenses compared\n{calibration.comparison.summary()}\n")
     RESULTS.print(_views_table(calibration))
     result("")
     RESULTS.print(_parameters_table(calibration))
     _say_how_it_ended(calibration, options.reject_outliers)
-    try:
+    with writing("--output", options.output):
         save_camera(options.output, calibration)
-    except OSError as error:
-        raise OSError(f"--output: could not write {options.output} ({error.strerror}); choose another place") from error
     more = "" if options.output.suffix.lower() == ".json" else "; a .json file would hold the whole calibration"
     result(f"\nWritten to {options.output}{more}")
+    if options.draw is not None:
+        from diffproj import figures  # here, for it loads matplotlib
+
+        write_drawing(options.draw, figures.corners(calibration))
+        result(f"Drawn to {options.draw}")
     return 0
-
-
-def _check_writable(path: Path) -> None:
-    """Find out before the long work, and not after it, whether the file can be written."""
-    if path.is_dir():
-        raise ValueError(f"--output: want a file, got a folder: {path}")
-    if not path.parent.is_dir():
-        raise ValueError(f"--output: no such folder: {path.parent}; make it first, or choose another")
-    try:
-        tempfile.TemporaryFile(dir=path.parent).close()
-    except OSError as error:
-        raise OSError(
-            f"--output: cannot write to the folder {path.parent} ({error.strerror}); choose another"
-        ) from error
 
 
 def _views_table(calibration: Calibration) -> Table:
@@ -173,14 +182,16 @@ def _parameters_table(calibration: Calibration) -> Table:
     table.add_column("value", no_wrap=True)
     table.add_column("standard deviation", no_wrap=True)
     for name, *pair in zip(known, *(aligned(column) for column in zip(*pairs, strict=True)), strict=True):
-        table.add_row(_title(name), *pair)
+        table.add_row(_title(name, calibration.unit), *pair)
     return table
 
 
-def _title(name: str) -> str:
+def _title(name: str, unit: str | None) -> str:
     """What a parameter is, with its unit."""
     if name.startswith("bow"):
-        return f"board's bow along {name[-1]}, unit of --square"
+        return f"board's bow along {name[-1]}, {unit or 'unit of --square'}"
+    if name == "skew":
+        return "skew, px"
     titles = {"f": "focal length {}, px", "c": "principal point {}, px"}
     return titles.get(name[0], "lens {}").format(name)
 
@@ -194,4 +205,9 @@ def _say_how_it_ended(calibration: Calibration, reject_outliers: bool) -> None:
     how, *remarks = calibration.message.split("; ")
     result(f"Solver {how}")
     for remark in remarks:
-        result(textwrap.fill(in_options(remark[0].upper() + remark[1:]), 79))
+        result(textwrap.fill(_with_unit(in_options(remark[0].upper() + remark[1:]), calibration.unit), 79))
+
+
+def _with_unit(text: str, unit: str | None) -> str:
+    """A remark with the world's unit by its name."""
+    return text if unit is None else text.replace("world units", unit)

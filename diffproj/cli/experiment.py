@@ -1,6 +1,7 @@
 """`diffproj experiment`: the paper's Table 1 and Fig. 7."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -8,8 +9,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from diffproj._core.atomic import write_whole
-from diffproj.cli.inputs import board_size, find_corners, photographs, square_side
+from diffproj.cli.inputs import board_size
+from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import RESULTS, progress_bars, result
+from diffproj.cli.units import Square, heading, square_side
 from diffproj.files.save import save_camera
 from diffproj.lens.models import LensModel
 from diffproj.paper.experiment import Experiment, choose, default_split, parse_split, run_experiment
@@ -46,9 +49,9 @@ def add_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--square",
         type=square_side,
-        default=25.0,
+        default=Square(25.0, "mm"),
         metavar="SIDE",
-        help="side of a square; its unit is the unit of all results (default: 25)",
+        help="side of a square, such as 25mm or 1in; its unit is that of all results (default: 25mm)",
     )
     command.add_argument(
         "--distortion", choices=get_args(LensModel), default="brown5", help="the lens that is fitted (default: brown5)"
@@ -81,6 +84,7 @@ def run(options: argparse.Namespace) -> int:
         split = parse_split(options.split, len(views))
     fit, test = choose(views, split)
     outcome = run_experiment(fit, test, board, options.distortion, options.strict)
+    outcome = replace(outcome, fit=replace(outcome.fit, unit=options.square.unit))
     RESULTS.print(_table(outcome))
     result(f"\n{outcome.fit.summary()}")
     options.output.mkdir(parents=True, exist_ok=True)
@@ -94,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
 def _corners(options: argparse.Namespace) -> tuple[Views, Chessboard, tuple[list[int], list[int]]]:
     """The views, the board and the default split that the options ask for."""
     columns, rows = options.board
-    board = Chessboard(columns, rows, options.square, axes="paper")
+    board = Chessboard(columns, rows, options.square.side, axes="paper")
     if options.images is None and (columns, rows) != (9, 6):
         raise ValueError(f"--board: want 9x6 for --data, got {columns}x{rows}; --images takes your own photographs")
     if options.images is not None:
@@ -118,7 +122,8 @@ def _corners(options: argparse.Namespace) -> tuple[Views, Chessboard, tuple[list
 
 
 def _table(outcome: Experiment) -> Table:
-    table = Table(title="Table 1. Errors on the board (world units), mean ± standard deviation")
+    unit = heading(outcome.fit.unit) or "world units"
+    table = Table(title=f"Table 1. Errors on the board ({unit}), mean ± standard deviation")
     table.add_column("view", overflow="fold")
     table.add_column("corners", justify="right")
     for axis in ("E_x", "E_y", "E_z"):

@@ -1,17 +1,11 @@
-"""Options and inputs that commands share: the board, camera files, photographs and the corners in them."""
+"""What options take, in several commands: a board, numbers, camera files and places to write to."""
 
 import argparse
 import math
-from collections.abc import Iterable
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-
-from rich.progress import Progress
-
-from diffproj.targets.chessboard import Chessboard
-from diffproj.targets.detection import detect
-from diffproj.targets.images import SUFFIXES, Source, listed
-from diffproj.targets.views import Views
 
 CAMERA_SUFFIXES = (".json", ".yaml", ".yml", ".xml")
 SMALLEST_BOARD = 3
@@ -30,17 +24,6 @@ def board_size(text: str) -> tuple[int, int]:
     return int(columns), int(rows)
 
 
-def square_side(text: str) -> float:
-    """Read the side of a square."""
-    try:
-        side = float(text)
-    except ValueError:
-        side = math.nan
-    if not (math.isfinite(side) and side > 0):
-        raise argparse.ArgumentTypeError(f"want the side of a square as a positive number, such as 25, got {text!r}")
-    return side
-
-
 def camera_file(text: str) -> Path:
     """Read the name of a camera file."""
     if Path(text).suffix.lower() not in CAMERA_SUFFIXES:
@@ -57,26 +40,29 @@ def numbers(text: str, count: int) -> tuple[float, ...] | None:
     return values if len(values) == count and all(map(math.isfinite, values)) else None
 
 
-def photographs(paths: Iterable[Path]) -> list[Source]:
-    """Files as they are, and the photographs in folders, in natural order; each once, however often it is named.
+def check_writable(option: str, path: Path) -> None:
+    """Find out before the long work, and not after it, whether a file can be written.
 
     Raises:
-        ValueError: a folder holds no photograph.
-        FileNotFoundError: there is no such file.
+        ValueError: it is a folder, or its own folder does not exist.
+        OSError: its folder cannot be written to.
     """
-    found: dict[Path, Source] = {}
-    for path in paths:
-        if path.is_dir() and not any(file.suffix.lower() in SUFFIXES for file in path.iterdir()):
-            raise ValueError(
-                f"{path}: want a folder with photographs ({', '.join(sorted(SUFFIXES))}), found none in it"
-            )
-        for photograph in listed(str(path)):
-            # The same corners twice would make the standard deviations look smaller than they are.
-            found.setdefault(Path(str(photograph.source)).resolve(), photograph.source)
-    return list(found.values())
+    if path.is_dir():
+        raise ValueError(f"{option}: want a file, got a folder: {path}")
+    if not path.parent.is_dir():
+        raise ValueError(f"{option}: no such folder: {path.parent}; make it first, or choose another")
+    try:
+        tempfile.TemporaryFile(dir=path.parent).close()
+    except OSError as error:
+        raise OSError(
+            f"{option}: cannot write to the folder {path.parent} ({error.strerror}); choose another"
+        ) from error
 
 
-def find_corners(sources: list[Any], board: Chessboard, bars: Progress, title: str = "Finding corners") -> Views:
-    """The board's corners in photographs, under a progress bar."""
-    task = bars.add_task(title, total=None)
-    return detect(sources, board, lambda done, total: bars.update(task, completed=done, total=total))
+@contextmanager
+def writing(option: str, path: Path) -> Iterator[None]:
+    """Say of which option a file was that could not be written."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(f"{option}: could not write {path} ({error.strerror}); choose another place") from error

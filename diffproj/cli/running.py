@@ -3,19 +3,20 @@
 import argparse
 import warnings
 
-from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.result import CalibrationError
-from diffproj.cli.terminal import failure, note
-from diffproj.targets.detection import BoardNotFoundWarning
+from diffproj.cli.terminal import failure, in_options, note
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command that was understood; returns the exit code."""
+    """Run the command that was understood; returns the exit code.
+
+    What was warned of is in `options.warned`, for documents that hold all that was said.
+    """
     try:
         with warnings.catch_warnings():
-            for kind in (AmbiguousPoseWarning, BoardNotFoundWarning):
-                warnings.simplefilter("always", kind)
-            warnings.showwarning = lambda message, *_: note(str(message))
+            warnings.simplefilter("always", UserWarning)
+            options.warned = []
+            warnings.showwarning = lambda message, *_: _warn(options.warned, in_options(str(message)))
             return options.run(options)
     except (ValueError, OSError, CalibrationError) as error:
         note(failure(error))
@@ -23,3 +24,8 @@ def run(options: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         note("interrupted")
         return 130
+
+
+def _warn(warned: list[str], text: str) -> None:
+    warned.append(text)
+    note(text)

@@ -26,9 +26,19 @@ def result(text: str) -> None:
     RESULTS.print(text, markup=False, soft_wrap=True)
 
 
+def counted(count: int, thing: str) -> str:
+    """`1 file`, `2 files`."""
+    return f"{count} {thing}" + "s" * (count != 1)
+
+
 def in_options(text: str) -> str:
     """What a calibration advises, with the command's options in place of Python's."""
-    return text.replace("distortion=", "--distortion ").replace("bow=True", "--bow").replace("'auto'", "auto")
+    return (
+        text.replace("distortion=", "--distortion ")
+        .replace("bow=True", "--bow")
+        .replace("skew=True", "--skew")
+        .replace("'auto'", "auto")
+    )
 
 
 def failure(error: Exception) -> str:
