@@ -11,8 +11,8 @@ from rich.table import Table
 
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.result import Calibration
-from diffproj.cli.drawing import check_drawing, drawing, write_drawing
-from diffproj.cli.inputs import board_size, camera_file, check_writable, writing
+from diffproj.cli.drawing import check_drawing, check_no_photograph, drawing, write_drawing
+from diffproj.cli.inputs import board_size, camera_file, check_writable, some_path, writing
 from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import RESULTS, aligned, in_options, progress_bars, result, rounded
 from diffproj.cli.units import square_side
@@ -52,7 +52,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     command.formatter_class = argparse.RawDescriptionHelpFormatter
     command.usage = "%(prog)s PHOTO [PHOTO ...] --board CxR --square SIDE [options]"
     command.add_argument(
-        "photographs", nargs="+", type=Path, metavar="PHOTO", help="photographs by one camera, or folders of them"
+        "photographs", nargs="+", type=some_path, metavar="PHOTO", help="photographs by one camera, or folders of them"
     )
     board = command.add_argument_group("the board")
     board.add_argument(
@@ -121,8 +121,10 @@ def run(options: argparse.Namespace) -> int:
     check_drawing(options.draw)
     columns, rows = options.board
     board = Chessboard(columns, rows, options.square.side)
+    sources = photographs(options.photographs)
+    check_no_photograph(options.draw, sources)
     with progress_bars() as bars:
-        views = find_corners(photographs(options.photographs), board, bars)
+        views = find_corners(sources, board, bars)
         task = bars.add_task("Solving", total=None)
         calibration = calibrate(
             views,

@@ -1,6 +1,7 @@
 """Pictures that `--draw` asks for: checked before the work, written whole after it."""
 
 import argparse
+from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,6 +33,16 @@ def check_drawing(path: Path | None) -> None:
     if path is not None:
         check_writable("--draw", path)
         import_module("diffproj.figures")
+
+
+def check_no_photograph(path: Path | None, photographs: Iterable[object]) -> None:
+    """Check that a picture does not replace a photograph.
+
+    Raises:
+        ValueError: it would.
+    """
+    if path is not None and path.exists() and path.resolve() in (Path(str(p)).resolve() for p in photographs):
+        raise ValueError(f"--draw: want another file than the photographs, got {path}; choose another name")
 
 
 def write_drawing(path: Path, figure: "Figure") -> None:

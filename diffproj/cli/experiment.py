@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from diffproj._core.atomic import write_whole
-from diffproj.cli.inputs import board_size
+from diffproj.cli.inputs import board_size, check_folder, some_path
 from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import RESULTS, progress_bars, result
 from diffproj.cli.units import Square, heading, square_side
@@ -41,7 +41,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "package; or photographs rendered with known truth (default: left)",
     )
     source.add_argument(
-        "--images", nargs="+", type=Path, metavar="PHOTO", help="your own photographs, or folders of them"
+        "--images", nargs="+", type=some_path, metavar="PHOTO", help="your own photographs, or folders of them"
     )
     command.add_argument(
         "--board", type=board_size, default=(9, 6), metavar="CxR", help="inner corners of your board (default: 9x6)"
@@ -67,7 +67,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--output",
-        type=Path,
+        type=some_path,
         default=Path("diffproj-experiment"),
         metavar="FOLDER",
         help="where the files go (default: diffproj-experiment)",
@@ -79,9 +79,13 @@ def run(options: argparse.Namespace) -> int:
     """Run the command."""
     from diffproj import figures  # here, for matplotlib takes long to load; first of all, for it may be missing
 
+    check_folder("--output", options.output)
     views, board, split = _corners(options)
     if options.split is not None:
-        split = parse_split(options.split, len(views))
+        try:
+            split = parse_split(options.split, len(views))
+        except ValueError as error:
+            raise ValueError(f"--{error}") from None
     fit, test = choose(views, split)
     outcome = run_experiment(fit, test, board, options.distortion, options.strict)
     outcome = replace(outcome, fit=replace(outcome.fit, unit=options.square.unit))

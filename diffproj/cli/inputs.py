@@ -1,27 +1,38 @@
 """What options take, in several commands: a board, numbers, camera files and places to write to."""
 
 import argparse
-import math
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 CAMERA_SUFFIXES = (".json", ".yaml", ".yml", ".xml")
-SMALLEST_BOARD = 3
-"""Inner corners each way that the corner detector needs."""
+SMALLEST_BOARD, LARGEST_BOARD = 3, 1000
+"""Inner corners each way that the corner detector needs, and more than any photograph resolves."""
+
+LARGEST_NUMBER = 1e100
+"""Numbers beyond it are mistakes; with them, squares would overflow."""
 
 
 def board_size(text: str) -> tuple[int, int]:
     """Read inner corners such as `9x6`."""
     columns, separator, rows = text.lower().partition("x")
-    if not (separator and columns.isdecimal() and rows.isdecimal()):
+    if not (separator and columns.isdecimal() and rows.isdecimal() and len(text) < 100):
         raise argparse.ArgumentTypeError(f"want inner corners as COLUMNSxROWS, such as 9x6, got {text!r}")
     if min(int(columns), int(rows)) < SMALLEST_BOARD:
         raise argparse.ArgumentTypeError(
             f"want at least {SMALLEST_BOARD}x{SMALLEST_BOARD} inner corners (one less than the squares), got {text!r}"
         )
+    if max(int(columns), int(rows)) > LARGEST_BOARD:
+        raise argparse.ArgumentTypeError(f"want at most {LARGEST_BOARD} inner corners each way, got {text!r}")
     return int(columns), int(rows)
+
+
+def some_path(text: str) -> Path:
+    """Read the name of a file or folder; an empty one would be that of the folder where one is."""
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError(f"want the name of a file, got {text!r}")
+    return Path(text)
 
 
 def camera_file(text: str) -> Path:
@@ -32,12 +43,12 @@ def camera_file(text: str) -> Path:
 
 
 def numbers(text: str, count: int) -> tuple[float, ...] | None:
-    """Read so many finite numbers with commas between them; `None` where it is something else."""
+    """Read so many numbers with commas between them; `None` where it is something else, or beyond 1e100."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         return None
-    return values if len(values) == count and all(map(math.isfinite, values)) else None
+    return values if len(values) == count and all(abs(value) <= LARGEST_NUMBER for value in values) else None
 
 
 def check_writable(option: str, path: Path) -> None:
@@ -51,12 +62,28 @@ def check_writable(option: str, path: Path) -> None:
         raise ValueError(f"{option}: want a file, got a folder: {path}")
     if not path.parent.is_dir():
         raise ValueError(f"{option}: no such folder: {path.parent}; make it first, or choose another")
+    _check_place(option, path.parent)
+
+
+def check_folder(option: str, path: Path) -> None:
+    """Find out before the long work whether a folder can be written to, or be made.
+
+    Raises:
+        ValueError: there is a file in its place.
+        OSError: it cannot be written to.
+    """
+    there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not there.is_dir():
+        raise ValueError(f"{option}: want a folder, got the file {there}; choose another")
+    _check_place(option, there)
+
+
+def _check_place(option: str, folder: Path) -> None:
+    """Check that files can be made in a folder."""
     try:
-        tempfile.TemporaryFile(dir=path.parent).close()
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise OSError(
-            f"{option}: cannot write to the folder {path.parent} ({error.strerror}); choose another"
-        ) from error
+        raise OSError(f"{option}: cannot write to the folder {folder} ({error.strerror}); choose another") from error
 
 
 @contextmanager

@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from diffproj.cli.drawing import check_drawing, drawing, write_drawing
-from diffproj.cli.inputs import board_size, camera_file, numbers
+from diffproj.cli.drawing import check_drawing, check_no_photograph, drawing, write_drawing
+from diffproj.cli.inputs import LARGEST_NUMBER, board_size, camera_file, numbers, some_path
 from diffproj.cli.measure_csv import as_csv
 from diffproj.cli.measure_document import PixelNoise, document
 from diffproj.cli.measure_plane import plane_at_height
@@ -83,7 +83,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "       %(prog)s --camera FILE --view NAME --points u,v ... [options]"
     )
     photograph = command.add_argument(
-        "photograph", type=Path, metavar="PHOTO", help="the photograph, with --board; --view needs none"
+        "photograph", type=some_path, metavar="PHOTO", help="the photograph, with --board; --view needs none"
     )
     # Not nargs="?": argparse would fill that with nothing as soon as an option comes before the photograph.
     photograph.required = False
@@ -106,7 +106,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
     pixels.add_argument(
         "--points-file",
-        type=Path,
+        type=some_path,
         metavar="FILE",
         help="a CSV file with the pixels to measure, a line name,u,v for each",
     )
@@ -164,6 +164,8 @@ def run(command: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     """Run the command."""
     _check_which_pose(command, options)
     check_drawing(options.draw)
+    if options.photograph is not None:
+        check_no_photograph(options.draw, [options.photograph])
     given = _given_pixels(options)
     scene = stored_view(options) if options.view is not None else new_photograph(options)
     noise = _noise(options, scene)
@@ -241,7 +243,7 @@ def _pixel(text: str) -> tuple[float, ...]:
 
 def _plane(text: str) -> tuple[float, ...]:
     values = numbers(text, 4)
-    if values is None or not any(values[:3]):
+    if values is None or max(map(abs, values[:3])) < 1 / LARGEST_NUMBER:
         raise argparse.ArgumentTypeError(
             "want a plane a x + b y + c z = d as a,b,c,d without spaces, a, b and c not all 0, such as 0,0,1,25, "
             f"got {text.strip()!r}"

@@ -65,7 +65,7 @@ def _point(cells: list[str], separator: str, number: int) -> Pixel | None:
     if len(cells) not in (2, 3):
         return None
     name, (u, v) = cells[0] if len(cells) == 3 else "", (_number(cell, separator) for cell in cells[-2:])
-    return None if u is None or v is None else Pixel(name or str(number), u, v)
+    return None if u is None or v is None or not name.isprintable() else Pixel(name or str(number), u, v)
 
 
 def _number(text: str, separator: str) -> float | None:

@@ -1,7 +1,11 @@
 """Running a command: its warnings and failures as one line each on standard error, and the exit code."""
 
 import argparse
+import io
+import sys
+import traceback
 import warnings
+from pathlib import Path
 
 from diffproj.calibration.result import CalibrationError
 from diffproj.cli.terminal import failure, in_options, note
@@ -12,6 +16,9 @@ def run(options: argparse.Namespace) -> int:
 
     What was warned of is in `options.warned`, for documents that hold all that was said.
     """
+    for stream in (sys.stdout, sys.stderr):  # a terminal that has no ± shows a question mark
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
@@ -24,6 +31,13 @@ def run(options: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         note("interrupted")
         return 130
+    except ImportError:  # of what the command line needs, see `__main__`
+        raise
+    except Exception as error:  # a mistake of ours; who calls the command has no use for its traceback
+        *_, (frame, line) = traceback.walk_tb(error.__traceback__)
+        where = f"{Path(frame.f_code.co_filename).name}:{line}"
+        note(f"unexpected {type(error).__name__} at {where}: {failure(error)}; please report it with the command")
+        return 1
 
 
 def _warn(warned: list[str], text: str) -> None:

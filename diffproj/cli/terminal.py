@@ -1,6 +1,7 @@
 """What commands say and where: results on standard output, progress, warnings and failures on standard error."""
 
 import math
+import re
 from collections.abc import Sequence
 
 from rich.console import Console
@@ -14,6 +15,14 @@ NOTES = Console(stderr=True, highlight=False, emoji=False)
 
 HUGE = 1e5
 """Standard deviation from which numbers are shown with a power of ten, as for points close to the horizon."""
+
+
+REMEDIES = {
+    FileNotFoundError: "; check its name and its folder",
+    IsADirectoryError: "; want a file in its place",
+    PermissionError: "; choose another place, or change who may use it",
+}
+"""What to do about errors of the system."""
 
 
 def note(text: str) -> None:
@@ -32,7 +41,8 @@ def counted(count: int, thing: str) -> str:
 
 
 def in_options(text: str) -> str:
-    """What a calibration advises, with the command's options in place of Python's."""
+    """What a calibration advises, with the command's options in place of Python's, and without what it has not."""
+    text = re.sub(r", or let fixed or priors hold [^(]*\([^)]*\)", "", text)
     return (
         text.replace("distortion=", "--distortion ")
         .replace("bow=True", "--bow")
@@ -52,7 +62,7 @@ def failure(error: Exception) -> str:
             )
         return in_options(" ".join(str(error).split()))
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror}"
+        return f"{error.filename}: {error.strerror}" + REMEDIES.get(type(error), "")
     return " ".join(str(error).split())
 
 

@@ -11,6 +11,9 @@ METRES = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.025
 IN_WORDS = {"in": "inches", "ft": "feet"}
 """Units whose signs read badly in headings."""
 
+SMALLEST = 1e-20
+"""Sides of squares below it, and above one over it, are mistakes."""
+
 SAME = 1e-6
 """Relative difference below which two sides are the same one, written in different units."""
 
@@ -38,7 +41,7 @@ def square_side(text: str) -> Square:
         side = float(match[1]) if match else math.nan
     except ValueError:
         side = math.nan
-    if not (match and math.isfinite(side) and side > 0):
+    if not (match and SMALLEST <= side <= 1 / SMALLEST):
         raise argparse.ArgumentTypeError(
             f"want the side of a square as a positive number, with its unit or without, such as 25mm, got {text!r}"
         )
@@ -64,11 +67,14 @@ def agreed(square: Square, calibrated: Square, file: object) -> tuple[Square, st
         file: the camera file, for the warning.
     """
     given = f"--square: {square} here, and {calibrated} in {file}"
-    if square.unit is None or calibrated.unit is None:
+    if not {square.unit, calibrated.unit} <= set(METRES):
         if math.isclose(square.side, calibrated.side, rel_tol=SAME):
-            return Square(square.side, square.unit or calibrated.unit), None
+            unit = square.unit or calibrated.unit
+            if calibrated.unit in (None, unit):
+                return Square(square.side, unit), None
         return square, f"{given}: right only where it is another board, measured in the unit that you have in mind"
-    ratio = square.side * METRES[square.unit] / (calibrated.side * METRES[calibrated.unit])
+    now, then = METRES[square.unit or ""], METRES[calibrated.unit or ""]
+    ratio = square.side * now / (calibrated.side * then)
     if not math.isclose(ratio, 1, rel_tol=SAME):
         return square, f"{given}: right only where it is another board"
     if square.unit != calibrated.unit:

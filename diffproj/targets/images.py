@@ -38,8 +38,8 @@ def listed(photographs: Source | Iterable[Source]) -> list[Photograph]:
     """List the input photographs one by one.
 
     Args:
-        photographs: a file, a folder (its photographs in natural order: `view2` before `view10`; hidden files are none),
-            a pattern such as `photos/left*.jpg`, an array, a tensor, or a list of files, arrays and tensors.
+        photographs: a file, a folder (its photographs in natural order: `view2` before `view10`; hidden files are
+            none), a pattern such as `photos/left*.jpg`, an array, a tensor, or a list of files, arrays and tensors.
 
     Raises:
         TypeError: an entry is none of these.

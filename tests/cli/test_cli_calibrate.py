@@ -46,7 +46,9 @@ def test_calibrate_writes_the_whole_calibration(
     file = tmp_path / "camera.json"
     code, out, err = calibrate(capsys, photographs, "--distortion", "none", "-o", file)
     assert code == 0
-    assert "5.png: found no board with 8 x 5 inner corners; photograph skipped" in one_line(err)
+    left_out, missed = err.splitlines()
+    assert left_out == f"diffproj: {photographs}: skipped 1 file that is no photograph"
+    assert "5.png: found no board with 8 x 5 inner corners; photograph skipped" in missed
     calibration = dp.load_calibration(file)
     assert calibration.views.names == ("1.png", "2.png", "3.png", "4.png", "6.png")
     f_x = calibration.camera.K[0, 0]
@@ -162,7 +164,11 @@ def test_calibrate_refuses_photographs_by_name(
         (["--board", "9x6"], "the following arguments are required: --square"),
         (["--board", "9", "--square", "25"], "--board: want inner corners as COLUMNSxROWS, such as 9x6, got '9'"),
         (["--board", "9x2", "--square", "25"], "--board: want at least 3x3 inner corners"),
-        (["--board", "9x6", "--square", "25mm"], "--square: want the side of a square as a positive number"),
+        (
+            ["--board", "9x6", "--square", "25px"],
+            "--square: want one of the units um, µm, mm, cm, m, in, ft, such as 25mm",
+        ),
+        (["--board", "9x6", "--square", "2,5cm"], "--square: want the side of a square as a positive number"),
         (["--board", "9x6", "--square", "inf"], "--square: want the side of a square as a positive number"),
         (["--board", "9x6", "--square", "25", "--distortion", "brown6"], "invalid choice: 'brown6'"),
         (

@@ -15,7 +15,8 @@ import diffproj as dp
 from diffproj import cli, synthetic
 from diffproj.cli import shielded
 from diffproj.cli.measure_document import REASONS, between, crosses, listed
-from diffproj.cli.measure_tables import coordinate, equation, shown
+from diffproj.cli.measure_plane import equation
+from diffproj.cli.measure_tables import coordinate, shown
 
 D = torch.float64
 BOARD = ("--board", "8x5", "--square", "25")
@@ -101,8 +102,8 @@ def test_new_photograph(capsys: pytest.CaptureFixture[str]) -> None:
     document = parsed(capsys, "photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS)
     board = dp.Chessboard(8, 5, 25.0)
     located = dp.locate(dp.detect("photo.png", board), board, dp.load_calibration("camera.json"))
-    same(document, dp.measure(pixels(*CORNERS), located, dp.Plane.z(0.0)))
-    assert document["pixel_sigma"] == float(located.pixel_sigma)  # type: ignore[arg-type]
+    same(document, dp.measure(pixels(*CORNERS), located, dp.Plane.z(0.0), 0, 0.5))
+    assert (document["pixel_sigma"], document["pixel_sigma_from"]) == (0.5, "hand")
     assert document["deviations_include"] == ["pixels", "pose", "camera"]
     assert (document["photograph"], document["view"], document["remarks"]) == ("photo.png", "photo.png", [])
 
@@ -110,7 +111,8 @@ def test_new_photograph(capsys: pytest.CaptureFixture[str]) -> None:
 def test_corners_of_the_board_come_out_where_they_are(capsys: pytest.CaptureFixture[str]) -> None:
     corners = dp.detect("photo.png", dp.Chessboard(8, 5, 25.0)).pixels[0, [0, 7, 39, 32]]
     texts = [f"{u},{v}" for u, v in corners.tolist()]
-    document = parsed(capsys, "photo.png", "--camera", "camera.json", *BOARD, "--points", *texts)
+    options = ("--camera", "camera.json", *BOARD, "--points", *texts)
+    document = parsed(capsys, "photo.png", *options, "--pixel-sigma", "detector")
     for found, true in zip([*document["lengths"], document["area"]], [175, 100, 175, 175 * 100], strict=True):
         assert abs(found["value"] - true) < 4 * found["deviation"] < 0.01 * true
 
@@ -142,7 +144,7 @@ def test_camera_without_covariance(file: str, capsys: pytest.CaptureFixture[str]
     document = parsed(capsys, *options)
     board = dp.Chessboard(8, 5, 25.0)
     located = dp.locate(dp.detect("photo.png", board), board, dp.load_camera(file))
-    same(document, dp.measure(pixels(*CORNERS), located, dp.Plane.z(0.0)))
+    same(document, dp.measure(pixels(*CORNERS), located, dp.Plane.z(0.0), 0, 0.5))
     assert document["deviations_include"] == ["pixels", "pose"]
     code, out, _ = run(capsys, *options)
     assert code == 0
@@ -151,12 +153,12 @@ def test_camera_without_covariance(file: str, capsys: pytest.CaptureFixture[str]
 
 def test_view_without_covariance(capsys: pytest.CaptureFixture[str]) -> None:
     options = ("--camera", "older.json", "--view", "1.png", "--points", *CORNERS)
-    code, out, err = run(capsys, *options)
+    code, out, err = run(capsys, *options, "--pixel-sigma", "detector")
     assert (code, out) == (1, "")
-    assert "--pixel-sigma: want the noise of the pixels in px, for older.json does not tell it" in err
-    assert parsed(capsys, *options, "--pixel-sigma", "0.5")["deviations_include"] == ["pixels"]
-    _, out, _ = run(capsys, *options, "--pixel-sigma", "0.5")
-    assert "the pixels' noise of 0.5 px ONLY" in out
+    assert "--pixel-sigma: want a number of px, for older.json does not tell the detector's noise" in err
+    assert parsed(capsys, *options)["deviations_include"] == ["pixels"]
+    _, out, _ = run(capsys, *options, "--pixel-sigma", "0.7")
+    assert "hold 0.7 px for each pixel ONLY" in out
 
 
 def test_a_view_whose_pose_may_be_the_wrong_one_is_told(capsys: pytest.CaptureFixture[str]) -> None:
@@ -171,7 +173,7 @@ def test_a_view_whose_pose_may_be_the_wrong_one_is_told(capsys: pytest.CaptureFi
     try:
         document = parsed(capsys, *options)
         assert document["remarks"][-1].startswith("The board's corners fit two poses, and the one taken is only ")
-        same(document, dp.measure(pixels("320,240", "330,250"), found, dp.Plane.z(0.0)))
+        same(document, dp.measure(pixels("320,240", "330,250"), found, dp.Plane.z(0.0), 0, 0.5))
         assert "tells them apart" in " ".join(run(capsys, *options)[1].split())
     finally:
         Path("far.json").unlink()
@@ -195,13 +197,14 @@ def test_text_for_people(capsys: pytest.CaptureFixture[str]) -> None:
     assert (code, err) == (0, "")
     assert all(len(line) <= 80 for line in out.splitlines())
     assert re.match(r"photo.png: board found\nRMS 0\.\d+ px over 40 corners \(0\.\d+ px in the calibration\)\n", out)
-    assert "Points on the plane z = 0, in the unit of --square" in out
+    assert "Points on the plane z = 0, the board's face, in the unit of --square" in " ".join(out.split())
     assert re.search(r"│ +2 │ 402, 140.5 +│ +[\d.]+ ± [\d.]+ +│ +[\d.]+ ± [\d.]+ +│ 0 +│\n", out)
     assert re.search(r"│ +5 │ -2000, -4000.5 │ none +│ none +│ none +│\n", out)
     assert re.search(r"│ 1, 2 +│ +[\d.]+ +│ +[\d.]+ +│ [\d.]+ to [\d.]+ +│\n", out)
     assert re.search(r"│ 4, 5 +│ none +│ +│ +│\n", out)
     assert "The length 3 to 4 is below three deviations: it cannot be told from 0.\n" in out
     assert "Point 5 is not on the plane: its ray meets the plane only behind the camera" in out
+    assert "The deviations hold 0.5 px for each pixel, as for points picked by hand" in " ".join(out.split())
     assert "Area of the outline 1 to 5: not known, for not all points are on the plane\n" in out
     assert "how surely the pose and the camera are known" in " ".join(out.split())
 
@@ -212,8 +215,8 @@ def test_points_without_a_place_are_null(capsys: pytest.CaptureFixture[str]) -> 
     first = document["points"][0]
     assert (first["valid"], first["reason"], first["world"], first["deviation"]) == (False, "BEHIND", None, None)
     unknown = {"value": None, "deviation": None, "interval_95": None, "significant": None}
-    assert document["area"] == unknown
-    assert document["lengths"][0] == {"from": 1, "to": 2, **unknown}
+    assert document["area"] == {"name": "1 to 3", **unknown}
+    assert document["lengths"][0] == {"from": 1, "to": 2, "name": "1, 2", **unknown}
     assert document["lengths"][1]["value"] > 0
     assert set(REASONS) == set(dp.Reason) - {dp.Reason.VALID}
 
@@ -231,7 +234,7 @@ def test_remarks_on_lengths_and_areas(capsys: pytest.CaptureFixture[str]) -> Non
     assert document["remarks"] == [
         "The outline crosses itself, so its area means little: give the points in order around it."
     ]
-    _, out, _ = run(capsys, *options, "300,200", "300,200")
+    _, out, _ = run(capsys, *options, "300,200", "300,200", "--pixel-sigma", "detector")
     assert re.search(r"│ 1, 2 +│ 0\.00+ +│ 0\.\d\d+ +│ 0\.00+ to 0\.\d+ +│\n", out)
     _, out, _ = run(capsys, *options, "100,100", "300,300", "100,300")
     assert re.search(r"\nArea of the outline 1 to 3: [\d.]+ ± [\d.]+, 95 % interval [\d.]+ to [\d.]+\n", out)
@@ -249,7 +252,7 @@ def test_remarks_on_lengths_and_areas(capsys: pytest.CaptureFixture[str]) -> Non
         (["--view", "1.png", "--camera", "nowhere.json"], "nowhere.json: No such file or directory"),
         (["empty.png", *BOARD], "want a board with 8 x 5 inner corners, found none in empty.png. Check"),
         (["nowhere.png", *BOARD], "no such file: nowhere.png"),
-        ([".", *BOARD], "PHOTO: want one photograph, got 3 in ."),
+        ([".", *BOARD], "PHOTO: want one photograph, got the folder ."),
         (["small.png", *BOARD], "PHOTO: want 640 x 480 px as in camera.json, got 600 x 480 px in small.png; take"),
     ],
 )
@@ -279,7 +282,7 @@ def test_corners_that_no_pose_explains(capsys: pytest.CaptureFixture[str], monke
         (["--view", "1.png", "--points", "-1,2,3"], "got '-1,2,3'"),
         (["--view", "1.png", "--points", "1,nan"], "got '1,nan'"),
         (["--view", "1.png", "--points", "1,2", "photo.png"], "got 'photo.png'; the photograph comes first"),
-        (["--view", "1.png"], "the following arguments are required: --points"),
+        (["--view", "1.png"], "one of the arguments --points --points-file is required"),
         (["--points", "1,2"], "one of the arguments --board --view is required"),
         (["--view", "1.png", *BOARD, "--points", "1,2"], "argument --board: not allowed with argument --view"),
         (["photo.png", "--view", "1.png", "--points", "1,2"], "PHOTO: not with --view"),
@@ -340,5 +343,5 @@ def test_intervals_and_lists_for_people() -> None:
     assert between(-math.inf, 12.6, 3.0) == "up to 12.6"
     assert between(-math.inf, math.inf, math.inf) == "unknown"
     assert between(5.0, 5.0, 0.0) == "5.000 to 5.000"
-    assert listed("Point", [2]) == "Point 2 lies"
-    assert listed("Point", [2, 3, 5]) == "Points 2, 3 and 5 lie"
+    assert listed("Point", ["2"]) == "Point 2 lies"
+    assert listed("Point", ["2", "3", "5"]) == "Points 2, 3 and 5 lie"
