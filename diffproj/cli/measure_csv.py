@@ -31,9 +31,10 @@ def as_csv(document: dict[str, Any]) -> str:
     for row in document["points"]:
         u, v = row["pixel"]
         cells = {"what": "point", "name": row["name"], "u": u, "v": v, "unit": unit, "remark": row["reason"] or ""}
-        for axis, value, deviation in zip(AXES, row["world"] or (), row["deviation"] or (), strict=True):
-            cells |= {axis: value, f"{axis}_deviation": deviation}
-        if row["extrapolated"]:
+        if row["valid"]:
+            cells |= dict(zip(AXES, row["world"], strict=True))
+            cells |= {f"{axis}_deviation": value for axis, value in zip(AXES, row["deviation"], strict=True)}
+        if row["valid"] and row["extrapolated"]:
             cells["remark"] = "EXTRAPOLATED"
         writer.writerow(cells)
     for length in document["lengths"]:

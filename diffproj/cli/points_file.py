@@ -2,9 +2,10 @@
 
 import csv
 import io
-import math
 from pathlib import Path
 from typing import NamedTuple
+
+from diffproj.cli.inputs import LARGEST_NUMBER
 
 
 class Pixel(NamedTuple):
@@ -73,7 +74,7 @@ def _number(text: str, separator: str) -> float | None:
         value = float(text if separator == "," else text.replace(",", "."))
     except ValueError:
         return None
-    return value if math.isfinite(value) else None
+    return value if abs(value) <= LARGEST_NUMBER else None
 
 
 def _titles(cells: list[str]) -> bool:

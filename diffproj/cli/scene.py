@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from diffproj.calibration.locate import located
+from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import progress_bars
@@ -109,7 +109,7 @@ def new_photograph(options: argparse.Namespace) -> Scene:
             "it with the camera as it was calibrated, and do not resize or crop it"
         )
     try:
-        found = located(views, board, camera if calibration is None else calibration)
+        found = locate(views, board, camera if calibration is None else calibration)
     except CalibrationError as error:
         raise ValueError(
             f"{options.photograph}: no pose of the board explains its corners; check --camera, --board and --square"

@@ -1,8 +1,11 @@
 """`diffproj measure` as a stranger meets it: what it prints, its JSON, its exit codes and its one-line errors."""
 
+import csv
+import io
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,7 @@ import torch
 import diffproj as dp
 from diffproj import cli, synthetic
 from diffproj.cli import shielded
+from diffproj.cli.measure import HAND
 from diffproj.cli.measure_document import REASONS, between, crosses, listed
 from diffproj.cli.measure_plane import equation
 from diffproj.cli.measure_tables import coordinate, shown
@@ -269,7 +273,7 @@ def test_corners_that_no_pose_explains(capsys: pytest.CaptureFixture[str], monke
     def fail(*_: object) -> None:
         raise dp.CalibrationError("locate: diverged")
 
-    monkeypatch.setattr("diffproj.cli.scene.located", fail)
+    monkeypatch.setattr("diffproj.cli.scene.locate", fail)
     code, out, err = run(capsys, "photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS)
     assert (code, out) == (1, "")
     assert "photo.png: no pose of the board explains its corners; check --camera, --board and --square" in err
@@ -345,3 +349,123 @@ def test_intervals_and_lists_for_people() -> None:
     assert between(5.0, 5.0, 0.0) == "5.000 to 5.000"
     assert listed("Point", ["2"]) == "Point 2 lies"
     assert listed("Point", ["2", "3", "5"]) == "Points 2, 3 and 5 lie"
+
+
+@pytest.mark.parametrize(("axes", "towards"), [("opencv", -1), ("paper", 1)])
+def test_heights_are_above_the_face_in_every_frame(
+    axes: str, towards: int, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Towards the camera, where things look larger: the same pixels lie closer together."""
+    seen = synthetic.corner_views(dp.paper_setup().fit, dp.Chessboard(8, 5, 25.0, axes="paper"))
+    file = str(tmp_path / "camera.json")
+    dp.save_camera(file, dp.calibrate(seen, dp.Chessboard(8, 5, 25.0, axes=axes), "none"))
+    options = ("--camera", file, "--view", seen.names[3], "--points", "300,200", "420,300")
+    above = parsed(capsys, *options, "--height", "12")
+    below = parsed(capsys, *options, "--height", "-3")
+    assert (above["plane"], above["height"]) == ([0, 0, 1, 12 * towards], 12)
+    assert (below["plane"], below["height"]) == ([0, 0, 1, -3 * towards], -3)
+    assert above["lengths"][0]["value"] < below["lengths"][0]["value"]
+    _, out, _ = run(capsys, *options, "--plane", "0,0,-2,-24")  # z = 12, whatever the frame
+    side = {-1: "below", 1: "above"}[towards]
+    assert f"Points on the plane -2 z = -24, 12 {side} the board's face, in" in " ".join(out.split())
+    assert parsed(capsys, *options, "--plane", "0.1,0,1,0")["height"] is None
+
+
+def test_units_stand_in_every_table(capsys: pytest.CaptureFixture[str]) -> None:
+    located = ("photo.png", "--camera", "units.json", "--board", "8x5", "--points", *CORNERS)
+    calibration = dp.load_calibration("camera.json")
+    dp.save_camera("units.json", replace(calibration, unit="mm"))
+    try:
+        _, out, err = run(capsys, *located, "--square", "25", "--height", "2")
+        text = " ".join(out.split())
+        assert err == ""
+        assert "Points on the plane z = -2, 2 mm above the board's face, in mm" in text
+        assert "Lengths in mm" in text
+        assert re.search(r"Area of the outline 1 to 3: \d+ ± \d+ mm², 95 %", text)
+        _, out, _ = run(capsys, "--camera", "units.json", "--view", "4.png", "--points", *CORNERS)
+        assert "Lengths in mm" in out
+        _, out, err = run(capsys, *located, "--square", "1in", "--json")
+        warned = "--square: 1 in here, and 25 mm in units.json: right only where it is another board"
+        assert err == f"diffproj: {warned}\n"
+        document = json.loads(out)
+        assert (document["unit"], document["square"], document["warnings"]) == ("in", 1.0, [warned])
+    finally:
+        Path("units.json").unlink()
+
+
+def test_named_points_from_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "points.csv"
+    file.write_text("name;u;v\nhinge [left];210,5;133\nlatch;402;140,5\nfoot;395;300\n")
+    options = ("photo.png", "--camera", "camera.json", *BOARD, "--points-file", str(file))
+    document = parsed(capsys, *options)
+    plain = parsed(capsys, "photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS)
+    assert [point["name"] for point in document["points"]] == ["hinge [left]", "latch", "foot"]
+    assert [point["world"] for point in document["points"]] == [point["world"] for point in plain["points"]]
+    assert document["lengths"][0]["name"] == "hinge [left], latch"
+    _, out, _ = run(capsys, *options)
+    assert "│ hinge [left], latch │" in out
+    assert "Area of the outline hinge [left] to foot: " in out
+
+
+def test_tables_for_spreadsheets(capsys: pytest.CaptureFixture[str]) -> None:
+    options = ("photo.png", "--camera", "camera.json", "--board", "8x5", "--square", "25mm", "--points", *CORNERS)
+    document = parsed(capsys, *options, "-2000,-4000.5")
+    code, out, err = run(capsys, *options, "-2000,-4000.5", "--csv")
+    assert (code, err) == (0, "")
+    rows = list(csv.DictReader(io.StringIO(out)))
+    assert [row["what"] for row in rows] == ["point"] * 4 + ["length"] * 3 + ["area"]
+    for row, point in zip(rows, document["points"], strict=False):
+        cells = [float(row[axis]) for axis in "xyz"] if point["valid"] else None
+        assert cells == point["world"]
+        assert [float(row["u"]), float(row["v"])] == point["pixel"]
+    assert (rows[0]["unit"], rows[3]["remark"], rows[3]["x"]) == ("mm", "BEHIND", "")
+    first, length = rows[4], document["lengths"][0]
+    assert [float(first[key]) for key in ("value", "deviation", "low_95", "high_95")] == [
+        length["value"],
+        length["deviation"],
+        *length["interval_95"],
+    ]
+    assert (first["name"], first["unit"], rows[-1]["unit"], rows[-1]["value"]) == ("1, 2", "mm", "mm^2", "")
+
+
+def test_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "measured.png"
+    points = ("--points", *CORNERS, "-60,200", "-9000,100", "-2000,-4000.5")
+    options = ("photo.png", "--camera", "camera.json", *BOARD, *points)
+    code, out, _ = run(capsys, *options, "--draw", str(file))
+    assert code == 0
+    assert out.endswith(f"\nDrawn to {file}\n")
+    image = cv2.imread(str(file))
+    assert image is not None
+    assert image.shape[1] == 1200
+    json.loads(
+        run(capsys, "--camera", "camera.json", "--view", "4.png", "--points", *CORNERS, "--draw", str(file), "--json")[
+            1
+        ]
+    )
+    blank = cv2.imread(str(file))
+    assert blank is not None
+    assert blank.mean() > image.mean()  # no photograph is there
+
+
+def test_hand_picked_lengths_are_covered() -> None:
+    """300 cameras calibrated from 10 views, and a photograph by each, in which 6 points are picked by hand.
+
+    Measured: 94.5 % of the 1500 intervals hold the truth; with the noise of the detector it was 30 %.
+    """
+    board, generator = dp.Chessboard(), torch.Generator().manual_seed(0)
+    truth = dp.calibrate(dp.example_views("left"), board).cameras
+    corners, _ = truth.project(board.points)
+
+    def seen(which: slice) -> dp.Views:
+        places = corners[which].expand(300, -1, -1, -1)
+        noise = 0.1 * torch.randn(places.shape, generator=generator, dtype=D)
+        return dp.Views(places + noise, size=(640, 480))
+
+    located = dp.locate(seen(slice(10, 11)), board, dp.calibrate(seen(slice(10)), board))
+    points = torch.tensor([[10.0, 20], [150, 30], [120, 110], [20, 90], [60, -20], [190, 60]], dtype=D)
+    points = torch.nn.functional.pad(points, (0, 1))
+    lengths = (points[1:] - points[:-1]).norm(dim=-1)
+    picked = truth[10].project(points)[0] + 0.5 * torch.randn(300, 6, 2, generator=generator, dtype=D)
+    low, high = dp.measure(picked, located, dp.Plane.z(0.0), 0, HAND).lengths().interval()
+    assert 0.93 <= float(((low <= lengths) & (lengths <= high)).double().mean()) <= 0.97
