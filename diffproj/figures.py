@@ -75,7 +75,8 @@ def fig7(experiment: Experiment, magnification: float = 50.0) -> Figure:
         axes.plot(*torch.stack([known, tip]).permute(2, 0, 1), color=ERROR, linewidth=1.4)
         axes.plot(*approximated.T, ".", color=APPROXIMATED, markersize=4)
         row = experiment.rows[position]
-        axes.set_title(f"{name}: mean $E_x$ {row.mean[0]:.3f}, $E_y$ {row.mean[1]:.3f}", fontsize=10)
+        plain = name.replace("$", r"\$")
+        axes.set_title(f"{plain}: mean $E_x$ {row.mean[0]:.3f}, $E_y$ {row.mean[1]:.3f}", fontsize=10)
         horizontal, vertical = ("y", "x") if experiment.board.axes == "paper" else ("x", "y")
         axes.set_xlabel(horizontal, labelpad=1)
         axes.set_ylabel(vertical, labelpad=1)
@@ -251,12 +252,19 @@ def measured(
             (u, v), (u2, v2) = pixels[i], pixels[i + 1]
             axes.plot([u, u2], [v, v2], color=ERROR, linewidth=1.2, path_effects=OUTLINE)
             middle = ((u + u2) / 2, (v + v2) / 2)
-            axes.annotate(text, middle, color=ERROR, fontsize=9, ha="center", va="center", bbox=LABEL)
+            axes.annotate(text, middle, color=ERROR, fontsize=9, ha="center", va="center", bbox=LABEL, parse_math=False)
     for (u, v), name, shown in zip(pixels, names, near, strict=True):
         if shown:
             axes.plot(u, v, "+", color=ERROR, markersize=9, markeredgewidth=1.5, path_effects=OUTLINE)
             axes.annotate(
-                name, (u, v), (5, 5), textcoords="offset points", color=ERROR, fontsize=10, path_effects=OUTLINE
+                name,
+                (u, v),
+                (5, 5),
+                textcoords="offset points",
+                color=ERROR,
+                fontsize=10,
+                path_effects=OUTLINE,
+                parse_math=False,
             )
     _as_image(axes, size)
     for u, v in (pixel for pixel, shown in zip(pixels, near, strict=True) if shown):
@@ -266,8 +274,8 @@ def measured(
         axes.set_ylim(max(bottom, v + MARGIN * height), min(top, v - MARGIN * height))
     left_out = [name for name, near_enough in zip(names, near, strict=True) if not near_enough]
     if left_out:
-        figure.supxlabel(f"far outside: {', '.join(left_out)}", fontsize=9)
-    axes.set_title(title, fontsize=10)
+        figure.supxlabel(f"far outside: {', '.join(left_out)}", fontsize=9, parse_math=False)
+    axes.set_title(title, fontsize=10, parse_math=False)
     return figure
 
 

@@ -36,7 +36,8 @@ EPILOG = """\
 examples:
   diffproj calibrate photos/ --board 9x6 --square 25mm
   diffproj calibrate left*.jpg --board 9x6 --square 25mm -o camera.yaml
-  diffproj calibrate wide/ --board 11x8 --square 3cm --distortion auto --draw wide.png
+  diffproj calibrate wide/ --board 11x8 --square 3cm --distortion auto \\
+      --draw wide.png
 
 The file is for diffproj.load_camera("camera.json") in Python; OpenCV reads the
 YAML and XML by cv2.FileStorage: camera_matrix, distortion_coefficients.

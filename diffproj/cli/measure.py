@@ -218,7 +218,7 @@ def _draw(path: Path, scene: Scene, found: dict[str, Any]) -> None:
         scene.calibration,
         scene.view,
         [row["pixel"] for row in found["points"]],
-        [row["name"] if row["valid"] else f"{row['name']}: not on the plane" for row in found["points"]],
+        [row["name"] if row["valid"] else f"{row['name']} (not on the plane)" for row in found["points"]],
         [_length_in_words(length, scene.square.unit) for length in found["lengths"]],
         photograph=None if scene.photograph is None else grey(listed(scene.photograph)[0]),
         title=f"{found['view']}: {found['plane_in_words']}",
@@ -229,7 +229,8 @@ def _draw(path: Path, scene: Scene, found: dict[str, Any]) -> None:
 def _length_in_words(length: dict[str, Any], unit: str | None) -> str:
     """`199.9 ± 0.2 mm`; empty where the length is not known."""
     value, deviation, _ = shown(length)
-    return "" if length["value"] is None else f"{value} ± {deviation}" + (f" {unit}" if unit else "")
+    known = f" ± {deviation}" if length["deviation"] is not None else ""
+    return "" if length["value"] is None else f"{value}{known}" + (f" {unit}" if unit else "")
 
 
 def _pixel(text: str) -> tuple[float, ...]:

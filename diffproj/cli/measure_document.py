@@ -52,7 +52,7 @@ def document(
         for number, length in enumerate(found, start=1)
     ]
     for (start, end), length in zip(pairwise(names), lengths, strict=True):
-        if length["significant"] is False:
+        if length["significant"] is False and length["deviation"] is not None:
             remarks.append(f"The length {start} to {end} is below three deviations: it cannot be told from 0.")
     area = None
     if len(points) > 2:
@@ -60,7 +60,7 @@ def document(
     normal = plane.normal.tolist()
     if area is not None and area["value"] is not None and crosses(measured.points.tolist(), normal):
         remarks.append("The outline crosses itself, so its area means little: give the points in order around it.")
-    elif area is not None and area["significant"] is False:
+    elif area is not None and area["significant"] is False and area["deviation"] is not None:
         remarks.append("The area is below three deviations: it cannot be told from 0.")
     if scene.calibration.has_alternatives and bool(scene.calibration.ambiguous[scene.view]):
         ratio = float(scene.calibration.likelihood_ratio[scene.view])
