@@ -10,6 +10,12 @@ CAMERA_SUFFIXES = (".json", ".yaml", ".yml", ".xml")
 SMALLEST_BOARD, LARGEST_BOARD = 3, 1000
 """Inner corners each way that the corner detector needs, and more than any photograph resolves."""
 
+HAND = 0.5
+"""Standard deviation in px, along u and along v, of points that a person picks in a photograph."""
+
+DETECTOR = "detector"
+"""What `--pixel-sigma` takes for pixels that a program found as well as the board's corners."""
+
 LARGEST_NUMBER = 1e100
 """Numbers beyond it are mistakes; with them, squares would overflow."""
 

@@ -5,6 +5,7 @@ import io
 import sys
 import traceback
 import warnings
+from importlib import import_module
 from pathlib import Path
 
 from diffproj.calibration.result import CalibrationError
@@ -24,7 +25,7 @@ def run(options: argparse.Namespace) -> int:
             warnings.simplefilter("always", UserWarning)
             options.warned = []
             warnings.showwarning = lambda message, *_: _warn(options.warned, in_options(str(message)))
-            return options.run(options)
+            return import_module(f"diffproj.cli.{options.work}").run(options)
     except (ValueError, OSError, CalibrationError) as error:
         note(failure(error))
         return 1

@@ -13,7 +13,7 @@ import pytest
 
 import diffproj as dp
 from diffproj import cli
-from diffproj.cli import calibrate as calibrate_command
+from diffproj.cli import calibrating
 
 PHOTOGRAPHS = Path(os.environ.get("DIFFPROJ_PHOTOS", "/usr/share/doc/opencv-doc/examples/data"))
 needs_photographs = pytest.mark.skipif(
@@ -228,7 +228,7 @@ def test_interrupting_is_no_traceback(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(calibrate_command, "find_corners", interrupt)
+    monkeypatch.setattr(calibrating, "find_corners", interrupt)
     code, _, err = calibrate(capsys, photographs / "1.png", "-o", tmp_path / "camera.json")
     assert (code, one_line(err)) == (130, "diffproj: interrupted")
     assert not list(tmp_path.iterdir())

@@ -17,7 +17,7 @@ import torch
 import diffproj as dp
 from diffproj import cli, synthetic
 from diffproj.cli import shielded
-from diffproj.cli.measure import HAND
+from diffproj.cli.inputs import HAND
 from diffproj.cli.measure_document import REASONS, between, crosses, listed
 from diffproj.cli.measure_plane import equation
 from diffproj.cli.measure_tables import coordinate, shown

@@ -1,4 +1,4 @@
-"""Files of points, sides of squares with units, and numbers of photographs: what is read, and what it means."""
+"""Files of points, and sides of squares with their units: what is read, and what it means."""
 
 from pathlib import Path
 
