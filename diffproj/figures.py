@@ -185,10 +185,11 @@ def corners(calibration: Calibration) -> Figure:
             )
     left.plot(*seen[used].T, ".", color=APPROXIMATED, markersize=3)
     left.set_title(f"{int(used.sum())} corners in {int(used.any(-1).sum())} views", fontsize=10)
-    rms = float(calibration.rms)
-    arrow = ARROW * max(size) / rms if rms > 0 else 1.0
-    magnification = float(f"{arrow:.3g}")
-    tails, residuals = seen[used], calibration.residuals.detach().cpu()[used]
+    residuals = calibration.residuals.detach().cpu()[used]
+    projected = residuals.isfinite().all(-1)  # those beyond the fold of the lens are not
+    tails, residuals = seen[used][projected], residuals[projected]
+    rms = float(residuals.square().sum(-1).mean().sqrt())
+    magnification = float(f"{ARROW * max(size) / rms:.3g}") if rms > 0 else 1.0
     right.quiver(
         *tails.T, *(magnification * residuals).T, angles="xy", scale_units="xy", scale=1, color=ERROR, width=0.0022
     )

@@ -22,7 +22,7 @@ def run(options: argparse.Namespace) -> int:
     check_writable("--output", options.output)
     check_drawing(options.draw)
     columns, rows = options.board
-    board = Chessboard(columns, rows, options.square.side)
+    board = Chessboard(columns, rows, options.square.value)
     sources = photographs(options.photographs)
     check_no_photograph(options.draw, sources)
     with progress_bars() as bars:

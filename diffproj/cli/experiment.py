@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import get_args
 
 from diffproj.cli.inputs import board_size, some_path
-from diffproj.cli.units import Square, square_side
+from diffproj.cli.units import Length, square_side
 from diffproj.lens.names import LensModel
 
 DESCRIPTION = (
@@ -35,7 +35,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--square",
         type=square_side,
-        default=Square(25.0, "mm"),
+        default=Length(25.0, "mm"),
         metavar="SIDE",
         help="side of a square, such as 25mm or 1in; its unit is that of all results (default: 25mm)",
     )

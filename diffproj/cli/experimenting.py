@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
 def _corners(options: argparse.Namespace) -> tuple[Views, Chessboard, tuple[list[int], list[int]]]:
     """The views, the board and the default split that the options ask for."""
     columns, rows = options.board
-    board = Chessboard(columns, rows, options.square.side, axes="paper")
+    board = Chessboard(columns, rows, options.square.value, axes="paper")
     if options.images is None and (columns, rows) != (9, 6):
         raise ValueError(f"--board: want 9x6 for --data, got {columns}x{rows}; --images takes your own photographs")
     if options.images is not None:

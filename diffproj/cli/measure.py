@@ -5,7 +5,7 @@ import functools
 
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import DETECTOR, HAND, LARGEST_NUMBER, board_size, camera_file, numbers, some_path
-from diffproj.cli.units import square_side
+from diffproj.cli.units import Length, height, square_side
 
 DESCRIPTION = """\
 Turns pixels of a photograph into points on a plane, and prints them with the
@@ -108,10 +108,11 @@ def add_options(command: argparse.ArgumentParser) -> None:
     which = plane.add_mutually_exclusive_group()
     which.add_argument(
         "--height",
-        type=_height,
-        default=0.0,
+        type=height,
+        default=Length(0.0),
         metavar="H",
-        help="a plane parallel to the board, H above its face as the camera sees it (default: 0, the face itself)",
+        help="a plane parallel to the board, H above its face as the camera sees it, such as 12 or 12mm (default: 0, "
+        "the face itself)",
     )
     which.add_argument(
         "--plane", type=_plane, metavar="a,b,c,d", help="the plane a x + b y + c z = d in the board's frame"
@@ -155,15 +156,6 @@ def _plane(text: str) -> tuple[float, ...]:
             f"got {text.strip()!r}"
         )
     return values
-
-
-def _height(text: str) -> float:
-    values = numbers(text, 1)
-    if values is None:
-        raise argparse.ArgumentTypeError(
-            f"want a height in the unit of --square, without a unit, such as 12, got {text!r}"
-        )
-    return values[0]
 
 
 def _pixel_sigma(text: str) -> float | str:

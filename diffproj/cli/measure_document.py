@@ -75,7 +75,7 @@ def document(
         "view": scene.calibration.views.names[scene.view],
         "view_rms": _known(float(scene.calibration.view_rms[scene.view])),
         "unit": scene.square.unit,
-        "square": scene.square.side,
+        "square": scene.square.value,
         "plane": [*normal, float(plane.offset)],
         "height": height,
         "plane_in_words": described(plane, height, scene.square.unit),

@@ -4,25 +4,31 @@ import torch
 
 from diffproj.calibration.result import Calibration
 from diffproj.cli.scene import Scene
+from diffproj.cli.units import Length, in_unit
 from diffproj.geometry.plane import Plane
 
 FLAT = 1e-9
 """Parts of the board's size by which its corners may lie off a plane z = const, and still be flat."""
 
 
-def plane_at_height(scene: Scene, height: float) -> Plane:
-    """The plane at a height above the face that the camera sees, in the world's unit; negative below.
+def plane_at_height(scene: Scene, height: Length) -> Plane:
+    """The plane at a height above the face that the camera sees; negative below.
 
     Raises:
-        ValueError: the board does not lie in a plane z = const.
+        ValueError: the board does not lie in a plane z = const, or its unit is not known and the height has one.
     """
-    face = _face(scene)
+    face, value = _face(scene), in_unit(height, scene.square.unit)
+    if value is None:
+        raise ValueError(
+            f"--height: want it in {scene.unit_in_words}, got {height}; leave its unit out, or give --square with its "
+            "unit"
+        )
     if face is None:
         raise ValueError(
             f"--height: want a board in a plane z = const, got another one in {scene.camera_file}; give --plane"
         )
     z, towards_camera = face
-    return Plane.z(z + towards_camera * height)
+    return Plane.z(z + towards_camera * value)
 
 
 def height_above_face(scene: Scene, plane: Plane) -> float | None:

@@ -11,7 +11,7 @@ from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import progress_bars
-from diffproj.cli.units import Square, agreed, heading
+from diffproj.cli.units import Length, agreed, heading
 from diffproj.files.load import load
 from diffproj.geometry.camera import Camera
 from diffproj.targets.chessboard import Chessboard
@@ -38,7 +38,7 @@ class Scene:
     view: int
     includes: tuple[str, ...]
     title: str
-    square: Square
+    square: Length
     unit_in_words: str
 
     @property
@@ -99,7 +99,7 @@ def new_photograph(options: argparse.Namespace) -> Scene:
     if len(sources) > 1:
         raise ValueError(f"PHOTO: want one photograph, got {len(sources)} of the form {options.photograph}")
     columns, rows = options.board
-    board = Chessboard(columns, rows, square.side)
+    board = Chessboard(columns, rows, square.value)
     with progress_bars() as bars:
         views = find_corners(sources, board, bars)
     if camera.size is not None and camera.size != views.size:
@@ -132,7 +132,7 @@ def _loaded(path: Path) -> tuple[Camera, Calibration | None]:
     return camera, calibration
 
 
-def _calibrated_square(calibration: Calibration) -> Square:
+def _calibrated_square(calibration: Calibration) -> Length:
     """The side of the squares of the board that a camera was calibrated with: from its first corner to its second."""
     first, second, *_ = calibration.points
-    return Square(float(torch.linalg.vector_norm(second - first)), calibration.unit)
+    return Length(float(torch.linalg.vector_norm(second - first)), calibration.unit)

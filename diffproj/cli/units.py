@@ -1,4 +1,4 @@
-"""The side of a square with its unit, such as 25mm: the unit of everything that is measured."""
+"""Lengths with their units, such as 25mm: the unit of the board's squares is that of everything that is measured."""
 
 import argparse
 import math
@@ -18,37 +18,63 @@ SAME = 1e-6
 """Relative difference below which two sides are the same one, written in different units."""
 
 
-class Square(NamedTuple):
-    """The side of a board's square.
+class Length(NamedTuple):
+    """A length in its unit, such as the side of a board's square.
 
     Attributes:
-        side: in its unit.
+        value: in its unit.
         unit: one of `METRES`, or `None` where it was not given.
     """
 
-    side: float
+    value: float
     unit: str | None = None
 
     def __str__(self) -> str:
         """`25 mm`, or `25` without a unit."""
-        return f"{self.side:.6g}" + (f" {self.unit}" if self.unit else "")
+        return f"{self.value:.6g}" + (f" {self.unit}" if self.unit else "")
 
 
-def square_side(text: str) -> Square:
+def square_side(text: str) -> Length:
     """Read the side of a square, such as `25mm`, `2.5cm`, `1in` or `25`."""
-    match = re.fullmatch(r"([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*([^\d\s]*)", text.strip().replace("μ", "µ"))
-    try:
-        side = float(match[1]) if match else math.nan
-    except ValueError:
-        side = math.nan
-    if not (match and SMALLEST <= side <= 1 / SMALLEST):
+    found = _length(text)
+    if found is None or not SMALLEST <= found.value <= 1 / SMALLEST:
         raise argparse.ArgumentTypeError(
             f"want the side of a square as a positive number, with its unit or without, such as 25mm, got {text!r}"
         )
+    return found
+
+
+def height(text: str) -> Length:
+    """Read a height, such as `12`, `-3` or `1.2cm`."""
+    found = _length(text)
+    if found is None or abs(found.value) > 1 / SMALLEST:
+        raise argparse.ArgumentTypeError(
+            f"want a height as a number, with its unit or in that of the board, such as 12mm, got {text!r}"
+        )
+    return found
+
+
+def in_unit(length: Length, unit: str | None) -> float | None:
+    """A length in another unit; in that unit already where it has none. `None` where they cannot be compared."""
+    if length.unit in (None, unit):
+        return length.value
+    if length.unit not in METRES or unit not in METRES:
+        return None
+    return length.value * METRES[length.unit] / METRES[unit]
+
+
+def _length(text: str) -> Length | None:
+    match = re.fullmatch(r"([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*([^\d\s]*)", text.strip().replace("μ", "µ"))
+    try:
+        value = float(match[1]) if match else math.nan
+    except ValueError:
+        return None
+    if match is None or not math.isfinite(value):
+        return None
     unit = match[2].lower()
     if unit and unit not in METRES:
         raise argparse.ArgumentTypeError(f"want one of the units {', '.join(METRES)}, such as 25mm, got {text!r}")
-    return Square(side, unit or None)
+    return Length(value, unit or None)
 
 
 def heading(unit: str | None) -> str | None:
@@ -56,7 +82,7 @@ def heading(unit: str | None) -> str | None:
     return None if unit is None else IN_WORDS.get(unit, unit)
 
 
-def agreed(square: Square, calibrated: Square, file: object) -> tuple[Square, str | None]:
+def agreed(square: Length, calibrated: Length, file: object) -> tuple[Length, str | None]:
     """The side with its unit, and a warning where it is not that of the calibration.
 
     Where no unit is given and the number is the calibration's, so is the unit.
@@ -68,14 +94,12 @@ def agreed(square: Square, calibrated: Square, file: object) -> tuple[Square, st
     """
     given = f"--square: {square} here, and {calibrated} in {file}"
     if not {square.unit, calibrated.unit} <= set(METRES):
-        if math.isclose(square.side, calibrated.side, rel_tol=SAME):
+        if math.isclose(square.value, calibrated.value, rel_tol=SAME):
             unit = square.unit or calibrated.unit
             if calibrated.unit in (None, unit):
-                return Square(square.side, unit), None
+                return Length(square.value, unit), None
         return square, f"{given}: right only where it is another board, measured in the unit that you have in mind"
-    now, then = METRES[square.unit or ""], METRES[calibrated.unit or ""]
-    ratio = square.side * now / (calibrated.side * then)
-    if not math.isclose(ratio, 1, rel_tol=SAME):
+    if not math.isclose(in_unit(calibrated, square.unit) or math.nan, square.value, rel_tol=SAME):
         return square, f"{given}: right only where it is another board"
     if square.unit != calibrated.unit:
         return square, f"{given}: the same side, but results are in {square.unit}"

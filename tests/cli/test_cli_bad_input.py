@@ -160,7 +160,13 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
     # What is measured on.
     ((*VIEW, *POINTS, "--plane", "1,2,3"), 2, "--plane: want a plane a x"),
     ((*VIEW, *POINTS, "--plane", "0,0,1e-320,1"), 2, "--plane: want a plane a x"),
-    ((*VIEW, *POINTS, "--height", "12mm"), 2, "--height: want a height in the unit of --square"),
+    (
+        (*VIEW, *POINTS, "--height", "12mm"),
+        1,
+        "--height: want it in the calibration's unit, got 12 mm; leave its unit out",
+    ),
+    ((*VIEW, *POINTS, "--height", "12px"), 2, "--height: want one of the units um, "),
+    ((*VIEW, *POINTS, "--height", "1,5"), 2, "--height: want a height as a number"),
     ((*VIEW, *POINTS, "--height", "nan"), 2, "--height: want a height"),
     ((*VIEW, *POINTS, "--height", "1", "--plane", "0,0,1,0"), 2, "--plane: not allowed with argument --height"),
     ((*VIEW, *POINTS, "--pixel-sigma", "-1"), 2, "--pixel-sigma: want a positive number of pixels, .* or detector"),

@@ -376,7 +376,7 @@ def test_units_stand_in_every_table(capsys: pytest.CaptureFixture[str]) -> None:
     calibration = dp.load_calibration("camera.json")
     dp.save_camera("units.json", replace(calibration, unit="mm"))
     try:
-        _, out, err = run(capsys, *located, "--square", "25", "--height", "2")
+        _, out, err = run(capsys, *located, "--square", "25", "--height", "0.2cm")
         text = " ".join(out.split())
         assert err == ""
         assert "Points on the plane z = -2, 2 mm above the board's face, in mm" in text

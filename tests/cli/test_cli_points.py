@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from diffproj.cli.points_file import Pixel, read_points
-from diffproj.cli.units import Square, agreed, square_side
+from diffproj.cli.units import Length, agreed, square_side
 
 
 @pytest.mark.parametrize(
@@ -35,22 +35,22 @@ def test_points_without_names_have_numbers(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "square"),
     [
-        ("25", Square(25.0)),
-        ("25mm", Square(25.0, "mm")),
-        ("2.5cm", Square(2.5, "cm")),
-        (" 2.5 CM ", Square(2.5, "cm")),
-        ("1in", Square(1.0, "in")),
-        ("3e-2m", Square(0.03, "m")),
-        ("40μm", Square(40.0, "µm")),  # the Greek letter and the sign of micro
-        ("1e-12", Square(1e-12)),
-        ("1e9", Square(1e9)),
+        ("25", Length(25.0)),
+        ("25mm", Length(25.0, "mm")),
+        ("2.5cm", Length(2.5, "cm")),
+        (" 2.5 CM ", Length(2.5, "cm")),
+        ("1in", Length(1.0, "in")),
+        ("3e-2m", Length(0.03, "m")),
+        ("40μm", Length(40.0, "µm")),  # the Greek letter and the sign of micro
+        ("1e-12", Length(1e-12)),
+        ("1e9", Length(1e9)),
     ],
 )
-def test_sides_of_squares(text: str, square: Square) -> None:
+def test_sides_of_squares(text: str, square: Length) -> None:
     assert square_side(text) == square
 
 
-MM, CM, INCH, BARE = Square(25.0, "mm"), Square(2.5, "cm"), Square(1.0, "in"), Square(25.0)
+MM, CM, INCH, BARE = Length(25.0, "mm"), Length(2.5, "cm"), Length(1.0, "in"), Length(25.0)
 
 
 @pytest.mark.parametrize(
@@ -60,18 +60,18 @@ MM, CM, INCH, BARE = Square(25.0, "mm"), Square(2.5, "cm"), Square(1.0, "in"), S
         (BARE, MM, "mm", None),
         (MM, BARE, "mm", None),
         (BARE, BARE, None, None),
-        (Square(25.4, "mm"), Square(1.0, "in"), "mm", "the same side, but results are in mm"),
+        (Length(25.4, "mm"), Length(1.0, "in"), "mm", "the same side, but results are in mm"),
         (CM, MM, "cm", "--square: 2.5 cm here, and 25 mm in camera.json: the same side, but results are in cm"),
         (INCH, MM, "in", "--square: 1 in here, and 25 mm in camera.json: right only where it is another board"),
-        (Square(30.0, "mm"), MM, "mm", "right only where it is another board"),
-        (Square(1.0), MM, None, "right only where it is another board, measured in the unit that you have in mind"),
-        (Square(30.0), BARE, None, "right only where it is another board"),
-        (MM, Square(25.0, "furlong"), "mm", "right only where it is another board"),
+        (Length(30.0, "mm"), MM, "mm", "right only where it is another board"),
+        (Length(1.0), MM, None, "right only where it is another board, measured in the unit that you have in mind"),
+        (Length(30.0), BARE, None, "right only where it is another board"),
+        (MM, Length(25.0, "furlong"), "mm", "right only where it is another board"),
     ],
 )
 def test_another_side_than_the_calibrations(
-    square: Square, calibrated: Square, unit: str | None, warning: str | None
+    square: Length, calibrated: Length, unit: str | None, warning: str | None
 ) -> None:
     found, said = agreed(square, calibrated, "camera.json")
-    assert found == Square(square.side, unit)
+    assert found == Length(square.value, unit)
     assert said is None if warning is None else warning in (said or "")
