@@ -128,3 +128,8 @@ def __getattr__(name: str) -> Any:
         return import_module("diffproj.figures")
     remedy = f"; it is diffproj.{_RENAMED[name]} now" if name in _RENAMED else ""
     raise AttributeError(f"module 'diffproj' has no attribute {name!r}{remedy}")
+
+
+def __dir__() -> list[str]:
+    """The public names, whether they were asked for yet or not."""
+    return sorted([*__all__, "__version__", "figures", "synthetic"])

@@ -96,6 +96,13 @@ def test_public_names_are_documented_and_sorted() -> None:
     assert all(getattr(diffproj, name).__doc__ for name in diffproj.__all__)
 
 
+def test_public_names_are_there_before_they_are_asked_for() -> None:
+    command = "import diffproj; print(*(name for name in dir(diffproj) if not name.startswith('_')))"
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True)
+    assert done.stdout.split() == sorted([*diffproj.__all__, "figures", "synthetic"])
+    assert done.stderr == ""
+
+
 def test_importing_waits_for_nothing_before_a_public_name_is_asked_for() -> None:
     """And that loads neither the compiler nor matplotlib, each of which takes as long as PyTorch itself."""
     command = (
