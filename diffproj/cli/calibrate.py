@@ -1,6 +1,7 @@
 """The command line of `diffproj calibrate`; `calibrating.py` does the work."""
 
 import argparse
+import functools
 from pathlib import Path
 from typing import get_args
 
@@ -102,4 +103,10 @@ def add_options(command: argparse.ArgumentParser) -> None:
         help="draw where in the image the corners lie and how far off they are: a .png, .svg or .pdf, replaced if "
         "there is one",
     )
-    command.set_defaults(work="calibrating")
+    command.set_defaults(work="calibrating", check=functools.partial(_check_together, command))
+
+
+def _check_together(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Check that the file can hold what is fitted."""
+    if options.skew and options.output.suffix.lower() != ".json":
+        command.error(f"--output: want a .json with --skew, which OpenCV's formats do not hold, got {options.output}")

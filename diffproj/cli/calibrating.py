@@ -44,14 +44,15 @@ def run(options: argparse.Namespace) -> int:
     result("")
     RESULTS.print(_parameters_table(calibration))
     _say_how_it_ended(calibration, options.reject_outliers)
+    if options.draw is not None:
+        from diffproj import figures  # here, for it loads matplotlib
+
+        write_drawing(options.draw, figures.corners(calibration))
     with writing("--output", options.output):
         save_camera(options.output, calibration)
     more = "" if options.output.suffix.lower() == ".json" else "; a .json file would hold the whole calibration"
     result(f"\nWritten to {options.output}{more}")
     if options.draw is not None:
-        from diffproj import figures  # here, for it loads matplotlib
-
-        write_drawing(options.draw, figures.corners(calibration))
         result(f"Drawn to {options.draw}")
     return 0
 

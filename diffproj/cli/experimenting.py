@@ -7,7 +7,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from diffproj._core.atomic import write_whole
-from diffproj.cli.inputs import check_folder
+from diffproj.cli.inputs import check_folder, writing
 from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import RESULTS, progress_bars, result
 from diffproj.cli.units import heading
@@ -36,10 +36,12 @@ def run(options: argparse.Namespace) -> int:
     outcome = replace(outcome, fit=replace(outcome.fit, unit=options.square.unit))
     RESULTS.print(_table(outcome))
     result(f"\n{outcome.fit.summary()}")
-    options.output.mkdir(parents=True, exist_ok=True)
-    write_whole(options.output / "table1.csv", outcome.to_csv())
-    write_whole(options.output / "fig7.png", figures.png(figures.fig7(outcome)))
-    save_camera(options.output / "camera.json", outcome.fit)
+    picture = figures.png(figures.fig7(outcome))
+    with writing("--output", options.output):
+        options.output.mkdir(parents=True, exist_ok=True)
+        write_whole(options.output / "table1.csv", outcome.to_csv())
+        write_whole(options.output / "fig7.png", picture)
+        save_camera(options.output / "camera.json", outcome.fit)
     result(f"\nWritten to {options.output}: table1.csv, fig7.png, camera.json")
     return 0
 

@@ -100,6 +100,7 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
     (("calibrate", "photo.png", *BOARD, "--distortion", "brown6"), 2, "--distortion: invalid choice: 'brown6'"),
     # Places to write to.
     (("calibrate", "photo.png", *BOARD, "-o", "camera.txt"), 2, r"--output: want a file ending in \.json"),
+    (("calibrate", "photo.png", *BOARD, "--skew", "-o", "a.yaml"), 2, "--output: want a .json with --skew"),
     (("calibrate", "photo.png", *BOARD, "-o", "gone/camera.json"), 1, "--output: no such folder: gone; make it"),
     (("calibrate", "photo.png", *BOARD, "-o", "folder.json"), 1, "--output: want a file, got a folder"),
     (("calibrate", "photo.png", *BOARD, "--draw", "a.gif"), 2, r"--draw: want a file ending in \.png, \.svg, \.pdf"),
