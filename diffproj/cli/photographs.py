@@ -48,11 +48,13 @@ def find_corners(sources: list[Any], board: Chessboard, bars: Progress, title: s
 
 
 def _named(path: Path) -> list[Path]:
-    """A file, or those of a pattern, whether they can be read or not."""
-    for suffixes, remedy in REMEDIES.items():
-        if path.suffix.lower() in suffixes:
-            raise ValueError(f"{path}: {remedy.format('')}")
-    return [Path(str(photograph.source)) for photograph in listed(str(path))]
+    """A file, or those of a pattern; what is named is not left out."""
+    files = [Path(str(photograph.source)) for photograph in listed(str(path))]
+    for file in files:
+        for suffixes, remedy in REMEDIES.items():
+            if file.suffix.lower() in suffixes:
+                raise ValueError(f"{file}: {remedy.format('')}")
+    return files
 
 
 def _in_folder(folder: Path) -> list[Path]:
@@ -78,10 +80,11 @@ def _in_folder(folder: Path) -> list[Path]:
         note(f"{path}: cannot be read as an image; skipped")
     for text in told:
         note(f"{folder}: skipped {text}")
-    left = [counted(len(hidden), "hidden file")] if hidden else []
-    left += [counted(others, "file") + (" that is no photograph" if others == 1 else " that are no photographs")] * (
-        others > 0
-    )
+    left = []
+    if hidden:
+        left.append(counted(len(hidden), "hidden file"))
+    if others:
+        left.append(counted(others, "file") + (" that is no photograph" if others == 1 else " that are no photographs"))
     if left:
         note(f"{folder}: skipped {' and '.join(left)}")
     return readable

@@ -79,6 +79,7 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
     (("calibrate", "nothing", *BOARD), 1, r"nothing: want a folder with photographs \(\.bmp, .*\), found none in it"),
     (("calibrate", "phones", *BOARD), 1, "phones: .* found none in it; it holds 1 HEIC .* convert to JPEG"),
     (("calibrate", "phone.heic", *BOARD), 1, r"phone\.heic: HEIC .* convert to JPEG in full size"),
+    (("calibrate", "phone*", *BOARD), 1, r"phone\.heic: HEIC .* convert to JPEG in full size|phones"),
     (("calibrate", "raw.cr2", *BOARD), 1, r"raw\.cr2: raw photograph, .* convert to TIFF"),
     (("calibrate", "broken", *BOARD), 1, "broken: .* its 1 image file cannot be read"),
     (("calibrate", "noise.png", *BOARD), 1, r"noise\.png: want an image"),
