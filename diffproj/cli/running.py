@@ -42,5 +42,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _warn(warned: list[str], text: str) -> None:
-    warned.append(text)
-    note(text)
+    """Say a warning, once."""
+    if text not in warned:
+        warned.append(text)
+        note(text)

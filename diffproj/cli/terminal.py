@@ -41,7 +41,8 @@ def counted(count: int, thing: str) -> str:
 
 
 def in_options(text: str) -> str:
-    """What a calibration advises, with the command's options in place of Python's, and without what it has not."""
+    """What the library says, with the command's options in place of Python's, and without what it has not."""
+    text = re.sub(r"^(calibrate|locate|measure): ", "", text)
     text = re.sub(r", or (let fixed or priors hold|fix) the principal point and the lens( \([^)]*\))?", "", text)
     return (
         text.replace("distortion=", "--distortion ")
