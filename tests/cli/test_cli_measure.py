@@ -5,6 +5,7 @@ import io
 import json
 import math
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -469,3 +470,17 @@ def test_hand_picked_lengths_are_covered() -> None:
     picked = truth[10].project(points)[0] + 0.5 * torch.randn(300, 6, 2, generator=generator, dtype=D)
     low, high = dp.measure(picked, located, dp.Plane.z(0.0), 0, HAND).lengths().interval()
     assert 0.93 <= float(((low <= lengths) & (lengths <= high)).double().mean()) <= 0.97
+
+
+def test_warnings_are_in_the_document(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each once, whatever function of the library it came from."""
+
+    def locate(*arguments: Any) -> dp.Calibration:
+        for name in ("locate", "measure", "measure"):
+            warnings.warn(f"{name}: the photograph is odd: look again", stacklevel=2)
+        return dp.locate(*arguments)
+
+    monkeypatch.setattr("diffproj.cli.scene.locate", locate)
+    _, out, err = run(capsys, "photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS, "--json")
+    assert json.loads(out)["warnings"] == ["the photograph is odd: look again"]
+    assert err == "diffproj: the photograph is odd: look again\n"
