@@ -60,7 +60,7 @@ def _left_over(task: Task, left: Leftover, i: int, p: int, sigma: float) -> str:
     def counts(effect: Effect, share: float) -> bool:
         return float(effect.deviations[i]) > SIGNIFICANT and float(effect.least_share[i]) > share
 
-    if not task.skew and counts(left.skew, max(SMOOTH_SHARE, SKEW_PART * float(left.smooth.share[i]))):
+    if not task.skew and counts(left.skew, max(SMOOTH_SHARE, SKEW_PART * float(left.smooth.least_share[i]))):
         part = f"{100 * float(left.skew.share[i]):.0f} % of their sum of squares"
         return f"the residuals {LENS_WORDS} over the image, as through a K with skew ({part}): take skew=True"
     for radial, effect, share in ((True, left.radial, RADIAL_SHARE), (False, left.smooth, SMOOTH_SHARE)):
