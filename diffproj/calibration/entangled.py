@@ -1,7 +1,7 @@
 """Whether the views tell a tilted sensor, a thin prism and skew from a principal point that lies elsewhere.
 
 All of them bend the image to one side, each a little differently. Together they can carry the principal point a hundred
-pixels away for a hair of the error: along such a valley the image hardly changes. Its deviation tells a part of it only:
+pixels away for a hair of the error: along such a valley the image hardly changes. Its deviation tells a part of it:
 it is that of the place where the fit ended, in a valley that is curved; and the little that the board is uneven moves
 the minimum along it, in all views alike.
 

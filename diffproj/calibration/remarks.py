@@ -48,9 +48,9 @@ def remarks(found: Fit, status: Tensor, doubt: Entangled) -> tuple[str, ...]:
 def _not_told(other: Simpler) -> str:
     it = "them" if len(other.held) > 1 else "it"
     return (
-        f"these views hardly tell {', '.join(other.held)} from {other.name}: without {it} it is {other.there:.1f} px, not "
-        f"{other.here:.1f}, at residuals {100 * other.growth:.1f} % larger; the error bars hold both; fix {it}, or take "
-        "a simpler lens"
+        f"these views hardly tell {', '.join(other.held)} from {other.name}: without {it} it is {other.there:.1f} px, "
+        f"not {other.here:.1f}, at residuals {100 * other.growth:.1f} % larger; the error bars hold both; fix {it}, or "
+        "take a simpler lens"
     )
 
 

@@ -9,6 +9,7 @@ A world point reaches its pixel in three steps, and a pixel goes back by the sam
 `F` may be any invertible 2x2 matrix: skew, or an image that an augmentation has turned, stays exact.
 """
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -371,7 +372,8 @@ def as_camera(camera: Camera | PinholeCamera) -> Camera:
         return camera
     if isinstance(camera, PinholeCamera):
         return Camera.from_kornia(camera)
-    raise TypeError(f"camera: want dp.Camera or kornia's PinholeCamera, got {type(camera).__name__}")
+    remedy = "; load it with dp.load_camera(path)" if isinstance(camera, str | os.PathLike) else ""
+    raise TypeError(f"camera: want dp.Camera or kornia's PinholeCamera, got {type(camera).__name__}{remedy}")
 
 
 def _pinhole(direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
