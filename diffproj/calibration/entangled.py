@@ -144,8 +144,9 @@ def _without(found: Fit, held: tuple[str, ...]) -> Fit:
 def _noticed(whole: Fit, simpler: Fit, held: tuple[str, ...]) -> Tensor:
     """How improbable it is that the corners want what was held `(n,)`, as deviations of a normal variable.
 
-    As far as corners err together within a view, as many say as little as fewer would.
+    As far as corners err together within a view, as many say as little as fewer would. How far they do, the richer camera
+    tells: the residuals of one that is too simple go together.
     """
     more, cost = simpler.solution.cost - whole.solution.cost, simpler.solution.cost
     unknowns = torch.full_like(cost, len(held))
-    return effect(more / dispersion(simpler), unknowns, cost, simpler.degrees_of_freedom()).deviations
+    return effect(more / dispersion(whole), unknowns, cost, simpler.degrees_of_freedom()).deviations
