@@ -144,8 +144,8 @@ def _without(found: Fit, held: tuple[str, ...]) -> Fit:
 def _noticed(whole: Fit, simpler: Fit, held: tuple[str, ...]) -> Tensor:
     """How improbable it is that the corners want what was held `(n,)`, as deviations of a normal variable.
 
-    As far as corners err together within a view, as many say as little as fewer would. How far they do, the richer camera
-    tells: the residuals of one that is too simple go together.
+    As far as corners err together within a view, as many say as little as fewer would. The richer camera tells how far
+    they do, for the residuals of one that is too simple go together.
     """
     more, cost = simpler.solution.cost - whole.solution.cost, simpler.solution.cost
     unknowns = torch.full_like(cost, len(held))
