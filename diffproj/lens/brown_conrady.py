@@ -16,7 +16,7 @@ from torch import Tensor
 
 from diffproj._core.numerics import in_blocks, rounding
 from diffproj.lens import brown_domain
-from diffproj.lens.brown_equations import COUNTS, Terms, bend, radial
+from diffproj.lens.brown_equations import COUNTS, Terms, bend, by_coefficients, radial, tilted
 from diffproj.lens.brown_inverse import newton, search, squared_domain, untilted
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.compiling import derivative_wanted
@@ -140,6 +140,24 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
         """Directions `(x, y, 1)` whose projections are the distorted points; (0, 0, 1) where not valid."""
         xy, valid = self.undistort(xy_distorted)
         return torch.nn.functional.pad(xy, (0, 1), value=1.0), valid
+
+    def by_direction(self, direction: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*out n 2 3"]:
+        """Derivatives of the distorted points by valid directions `(*B, N, 3)`: `(*B, N, 2, 3)`."""
+        x, y, z = direction.unbind(-1)
+        x, y = x / z, y / z
+        found = tilted(self._terms(), x, y)
+        depth = found.depth * z
+        a, b, c, d = (part / depth for part in found.jacobian)
+        rows = [torch.stack([a, b, -(a * x + b * y)], dim=-1), torch.stack([c, d, -(c * x + d * y)], dim=-1)]
+        return torch.stack(rows, dim=-2)
+
+    def by_coefficients(self, direction: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*out n 2 k"]:
+        """Derivatives of the distorted points of valid directions `(*B, N, 3)` by the coefficients `(*B, N, 2, k)`."""
+        x, y, z = direction.unbind(-1)
+        return by_coefficients(self._terms(), x / z, y / z, self.coefficients.shape[-1])
+
+    def _terms(self) -> Terms:
+        return Terms.of(self._usable(self._domain()))
 
     def turned(
         self, cosine: Float[Tensor, "*lens"], sine: Float[Tensor, "*lens"]
