@@ -321,10 +321,12 @@ def _largest_singular_value(by_u: Tensor, by_v: Tensor) -> Tensor:
 
 
 def _denominator(b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
-    """`b . p`, and the size below which rounding decides its sign."""
-    terms = [entry if component is None else component * entry for component, entry in zip(sight, b, strict=True)]
-    threshold = (terms[0].abs() + terms[1].abs() + terms[2].abs()) * rounding(terms[0].dtype)
-    return terms[0] + terms[1] + terms[2], threshold
+    """`b . p`, and the size below which rounding decides its sign: that of its terms, and of what b was built from."""
+    sizes = [entry.detach().abs() for entry in b]
+    least = torch.stack(sizes).amax(0) * torch.finfo(b[0].dtype).eps
+    bounds = [(size + least) * rounding(b[0].dtype) for size in sizes]
+    threshold = linear([bounds], [component if component is None else component.detach().abs() for component in sight])
+    return linear([b], sight)[0], threshold[0]
 
 
 def _plane_matrix(camera: Camera, plane: Plane) -> Tensor:

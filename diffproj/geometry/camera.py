@@ -27,6 +27,7 @@ from diffproj._core.numerics import (
     entries,
     has_values,
     in_blocks,
+    least_depth,
     linear,
     transform,
 )
@@ -37,6 +38,9 @@ from diffproj.lens.protocol import Lens
 
 ROTATION_TOLERANCE = 1e-5
 """How far `R^T R` may be from the identity, entry by entry, where a user hands a camera in."""
+
+SQUARED = 0.45
+"""The power of the largest number up to which a pixel counts as finite: its square, and what is left of it, are."""
 
 
 class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distortion",), constants=("size",)):
@@ -282,6 +286,8 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         points = self._checked("points", points, 3)
 
         def project(points: Tensor) -> tuple[Tensor, Tensor]:
+            finite = points.detach().sum(-1).isfinite()
+            points = points.nan_to_num(0.0, 0.0, 0.0)  # the slope by R is the point, and 0 times infinity is NaN
             rotated = linear(entries(self.R), points.unbind(-1))
             direction = [x + shift.unsqueeze(-1) for x, shift in zip(rotated, self.t.unbind(-1), strict=True)]
             if self.distortion is None:
@@ -289,6 +295,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             else:
                 xy_lens, valid = self.distortion.project_direction(torch.stack(direction, dim=-1))
                 xy = list(xy_lens.unbind(-1))
+            valid = valid & finite
             uv = linear(entries(self.K[..., :2, :]), [*xy, None])
             return torch.stack([torch.where(valid, x, 0.0) for x in uv], dim=-1), valid
 
@@ -312,7 +319,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             ValueError: wrong shape or device, or batch shapes that do not broadcast.
         """
         pixels = self._checked("pixels", pixels, 2)
-        finite = pixels.isfinite().all(dim=-1)
+        finite = (pixels.abs() < torch.finfo(pixels.dtype).max ** SQUARED).all(dim=-1)
         offset = torch.where(finite.unsqueeze(-1), pixels - self.K[..., None, :2, 2], 0.0)
         xy = transform(pixel_to_normalized(self.K), offset)
         if self.distortion is None:
@@ -372,10 +379,11 @@ def as_camera(camera: Camera | PinholeCamera) -> Camera:
 def _pinhole(direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
     """Perspective division, valid where the point is finite and in front."""
     x, y, z = direction
-    reach = x.abs() + y.abs()
-    valid = (z > torch.finfo(z.dtype).eps * reach) & (reach + z).isfinite()
-    inverse_depth = torch.where(valid, z, 1.0).reciprocal()
-    return [torch.where(valid, component, 0.0) * inverse_depth for component in (x, y)], valid
+    reach, limits = x.abs() + y.abs(), torch.finfo(z.dtype)
+    # Derivatives hold 1 / z, which must not overflow; and x / z, not x times 1 / z, whose derivative would sooner.
+    valid = (z > limits.eps * reach + least_depth(z.dtype)) & (reach + z).isfinite()
+    depth = torch.where(valid, z, 1.0)
+    return [torch.where(valid, component, 0.0) / depth for component in (x, y)], valid
 
 
 def is_rotation(R: Float[Tensor, "*shape 3 3"]) -> Bool[Tensor, "*shape"]:

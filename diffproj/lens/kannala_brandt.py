@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj._core.numerics import has_values, in_blocks, in_float64
+from diffproj._core.numerics import has_values, in_blocks, in_float64, least_depth
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.compiling import coordinates, derivative_wanted, with_batch_in_front
 from diffproj.lens.domain import first_failure
@@ -82,8 +82,8 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
             direction: `(*B, N, 3)`, of any length; `z` may be negative.
 
         Returns:
-            Distorted points `(*B, N, 2)`, and `valid`: inside the domain, finite, not the zero vector, and not exactly
-            on the negative axis. (0, 0) with zero gradient where not valid.
+            Distorted points `(*B, N, 2)`, and `valid`: inside the domain, finite, not the zero vector, and not on the
+            negative axis to within rounding. (0, 0) with zero gradient where not valid.
         """
         domain = self._domain()
 
@@ -211,17 +211,19 @@ def _slope(k: list[Tensor], angle_squared: Tensor) -> Tensor:
 
 
 def _largest_component(direction: Tensor) -> Tensor:
-    """Largest absolute component, without gradient, to normalise by; 1 if it is 0 or not finite."""
+    """Largest absolute component, without gradient, to normalise by; 1 if it is next to 0 or not finite."""
     size = direction.detach().abs().amax(-1, keepdim=True)
-    return torch.where((size > 0) & (size < torch.inf), size, 1)
+    return torch.where((size > least_depth(size.dtype)) & (size < torch.inf), size, 1)
 
 
 def _within(domain: Tensor, direction: Tensor) -> Tensor:
-    """Whether directions lie in the domain and have a unique projection: not 0, nor exactly backwards."""
+    """Whether directions lie in the domain and have a unique projection: not 0, nor backwards to within rounding."""
     x, y, z = (direction / _largest_component(direction)).unbind(-1)
     side = torch.hypot(x, y)
     within = torch.atan2(side, z) <= domain.unsqueeze(-1)
-    return within & torch.isfinite(side + z) & ((side > 0) | (z > 0)) & (domain > 0).unsqueeze(-1)
+    eps = torch.finfo(side.dtype).eps
+    aside = (side > eps) | (z > eps)
+    return within & torch.isfinite(side + z) & aside & (domain > 0).unsqueeze(-1)
 
 
 def _newton(k: list[Tensor], rho_squared: Tensor, sigma: Tensor) -> Tensor:
