@@ -193,26 +193,58 @@ def _stacked(name: str, parts: list[Any], dim: int) -> Any:
 # -------------------------------------------------------------------------------------------------------- indexing
 
 
-INDEX = (int, slice, list, Tensor, np.ndarray, np.integer)
-
-
 def check_index(index: Any) -> None:
     """Check that an index is one that tensors take.
 
     Raises:
-        TypeError: it is not. (PyTorch itself would read any object with a length, number by number.)
+        TypeError: it is not. (PyTorch itself would read any object with a length, number by number, also one inside of
+            a list, and crashes where that never ends.)
     """
     for part in index if isinstance(index, tuple) else (index,):
-        if not (part is None or part is Ellipsis or isinstance(part, INDEX)):
-            raise TypeError(f"index: want numbers, slices, lists or masks, got {type(part).__name__}")
+        if not (part is None or part is Ellipsis or _is_index(part)):
+            raise TypeError(
+                f"index: want numbers, slices, lists or masks, got {_described(part)}; "
+                "some of a batch is batch[3], batch[2:5], batch[[0, 4]] or batch[mask]"
+            )
+
+
+def _is_index(part: Any) -> bool:
+    if isinstance(part, list):
+        return all(_is_index(element) and not isinstance(element, slice) for element in part)
+    if isinstance(part, slice):
+        return all(end is None or isinstance(end, int | np.integer) for end in (part.start, part.stop, part.step))
+    if isinstance(part, Tensor):
+        return not (part.is_floating_point() or part.is_complex())
+    if isinstance(part, np.ndarray):
+        return part.dtype.kind in "biu"
+    return isinstance(part, int | np.integer | np.bool_)
+
+
+def _described(part: Any) -> str:
+    """The kind of a thing that is no index; of a list, that of what does not belong there."""
+    if isinstance(part, list):
+        return f"a list with {_described(next(element for element in part if not _is_index(element)))}"
+    if isinstance(part, Tensor | np.ndarray):
+        return f"{type(part).__name__} of {part.dtype}"
+    return type(part).__name__
 
 
 def index_batch(tensor: Tensor, index: Any, behind: int) -> Tensor:
     """Index the batch axes of a tensor and keep the `behind` axes behind them whole, also with an ellipsis."""
-    index = index if isinstance(index, tuple) else (index,)
+    index = tuple(_for_tensors(part) for part in (index if isinstance(index, tuple) else (index,)))
     if not any(part is Ellipsis for part in index):
         index = (*index, Ellipsis)
-    return tensor[(*index, *(slice(None),) * behind)]
+    try:
+        return tensor[(*index, *(slice(None),) * behind)]
+    except (ValueError, OverflowError) as error:  # numbers beyond 64 bits
+        raise IndexError(f"index: want numbers of the batch, got others ({error})") from None
+
+
+def _for_tensors(part: Any) -> Any:
+    """Arrays as what every release of PyTorch takes."""
+    if isinstance(part, np.ndarray) and part.dtype.kind in "iu":
+        return torch.from_numpy(part.astype(np.int64))
+    return part.copy() if isinstance(part, np.ndarray) else part
 
 
 # ---------------------------------------------------------------------------------------------------------- PyTrees
