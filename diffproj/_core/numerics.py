@@ -112,6 +112,21 @@ def has_values(*tensors: Tensor) -> bool:
     return not (tracing or any(tensor.is_meta for tensor in tensors))
 
 
+def as_values(value: Any, like: Tensor) -> Tensor:
+    """A tensor as it is; numbers, nested lists and arrays in float64 on the device of `like`.
+
+    Python's numbers would take on PyTorch's default dtype, with 7 digits, and its default device.
+    """
+    if isinstance(value, Tensor):
+        return value
+    return torch.as_tensor(value, dtype=torch.float64 if like.device.type != "mps" else None, device=like.device)
+
+
+def spread_evenly(total: int, count: int, device: torch.device) -> Tensor:
+    """`count` of the numbers from 0 to `total - 1`, evenly apart, with the first and the last."""
+    return torch.arange(count, device=device) * (total - 1) // max(count - 1, 1)
+
+
 def converted(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
     """`tensor.to(...)`, with axes that are only expanded left so: a million poses go on sharing one K.
 

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._core.numerics import in_float64
+from diffproj._core.numerics import as_values, in_float64
 from diffproj.calibration.distinct import shares
 from diffproj.calibration.task import Task
 from diffproj.lens.models import LensModel
@@ -60,7 +60,7 @@ class Data:
         visible = views.visible
         self.given_weights, self.weights = None, None
         if weights is not None:
-            given = torch.as_tensor(weights).to(views.device)
+            given = as_values(weights, views.pixels).to(views.device)
             try:
                 given = in_float64(given).expand(visible.shape)
             except RuntimeError:

@@ -235,7 +235,9 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
 def _as_tensors(normal: Any, offset: Any) -> tuple[Any, Any]:
     """Python numbers in the dtype and on the device of the tensor beside them, in float64 if there is none."""
     given = normal if isinstance(normal, Tensor) else offset if isinstance(offset, Tensor) else None
-    kind = torch.empty(0, dtype=torch.float64) if given is None or not given.is_floating_point() else given
+    if given is None or not given.is_floating_point():
+        given = torch.empty(0, dtype=torch.float64, device="cpu")
+    kind = given
 
     def convert(name: str, value: Any) -> Any:
         if isinstance(value, Tensor):

@@ -243,7 +243,7 @@ def by_coefficients(terms: Terms, x: Tensor, y: Tensor, count: int) -> Tensor:
     powers = [s, s * s, s * s * s]
     below = denominator(terms, s)
     numerator = [(x * power / below, y * power / below) for power in powers]
-    columns = numerator[:2] + [(2 * x * y, s + 2 * y * y), (s + 2 * x * x, 2 * x * y)] + numerator[2:]
+    columns = [*numerator[:2], (2 * x * y, s + 2 * y * y), (s + 2 * x * x, 2 * x * y), *numerator[2:]]
     factor = radial(terms, s)
     columns += [(-factor * u, -factor * v) for u, v in numerator]
     columns += [(s, zero), (powers[1], zero), (zero, s), (zero, powers[1])]
@@ -252,9 +252,7 @@ def by_coefficients(terms: Terms, x: Tensor, y: Tensor, count: int) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in zip(*columns[:count], strict=True)], dim=-2)
 
 
-def _by_tilt(
-    tilt: Tilt, x: Tensor, y: Tensor, columns: list[tuple[Tensor, Tensor]]
-) -> list[tuple[Tensor, Tensor]]:
+def _by_tilt(tilt: Tilt, x: Tensor, y: Tensor, columns: list[tuple[Tensor, Tensor]]) -> list[tuple[Tensor, Tensor]]:
     """Derivatives of the point `(x', y')` by other coefficients, as those of the tilted one; then its own by both."""
     x_tilted, y_tilted = tilt.apply(x, y)
     depth = tilt.depth(x, y)

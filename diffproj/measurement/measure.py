@@ -100,7 +100,7 @@ def measure(
     T = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)  # (*B, N, 3, 2)
     D = torch.where(valid[..., None, None], T @ _inverse2(by_point @ T), 0.0)
     region = calibration.region if isinstance(calibration, Calibration) else None
-    blocks, covariances = [-D @ by_theta], [torch.zeros(*batch, 0, 0).to(D) if known is None else known]
+    blocks, covariances = [-D @ by_theta], [D.new_zeros(*batch, 0, 0) if known is None else known]
     beyond = torch.zeros_like(valid)
     if region is not None and known is not None:
         extrapolated = valid & ~in_region(pixels, region)
@@ -124,9 +124,9 @@ def measure(
         doubt = of_the_pose(pixels, calibration, view_number(calibration, view), plane, points, valid)
         away, covariances = [doubt.columns], [*covariances, doubt.covariance]
     if bool(beyond.any()):  # a parameter of which nothing is known, and no two points follow it alike
-        unlike = torch.linspace(1, 2, points.shape[-2]).to(points).unsqueeze(-1)
+        unlike = torch.linspace(1, 2, points.shape[-2], dtype=points.dtype, device=points.device).unsqueeze(-1)
         away.append(torch.where(beyond.unsqueeze(-1), unlike * T.abs().sum(-1), 0.0).unsqueeze(-1))
-        covariances.append(torch.full((1, 1), torch.inf).to(D))
+        covariances.append(D.new_full((1, 1), torch.inf))
     beside = torch.cat(away, dim=-1)
     common = torch.where(valid[..., None, None], torch.cat([*blocks, beside], dim=-1), 0.0)
     sight = Sight(pixels.expand(*batch, *pixels.shape[-2:]), sigma, camera, plane, by_theta, beside)

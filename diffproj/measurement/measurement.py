@@ -279,11 +279,12 @@ class Measurement:
         N = self.points.shape[-2]
         if k > N:
             raise ValueError(f"points: want at least {k}, got {N}")
-        return torch.arange(N - k + 1).unsqueeze(-1) + torch.arange(k)
+        first, following = (torch.arange(count, device=self.points.device) for count in (N - k + 1, k))
+        return first.unsqueeze(-1) + following
 
 
 def _sets(name: str, which: Sequence[Sequence[int]] | Tensor, k: int) -> Tensor:
-    index = torch.as_tensor(which)
+    index = which if isinstance(which, Tensor) else torch.as_tensor(which, device="cpu")
     if index.ndim != 2 or index.shape[-1] != k:
         raise ValueError(f"{name}: want point numbers of shape (M, {k}), got {tuple(index.shape)}")
     return index

@@ -45,7 +45,7 @@ class LearnablePlane(GeometryModule):
         check_one_plane(plane)
         plane = plane.detach()
         length = plane.normal.norm(dim=-1)
-        self.register_buffer("scale", torch.as_tensor(scale).to(length))
+        self.register_buffer("scale", torch.as_tensor(scale, dtype=length.dtype, device=length.device))
         self.register_buffer("length_0", length)
         self.register_buffer("unit_0", plane.normal / length.unsqueeze(-1))
         self.register_buffer("distance_0", plane.offset / length)

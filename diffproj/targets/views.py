@@ -168,7 +168,7 @@ def _as_tensor(name: str, value: Any) -> Tensor:
         array = np.asarray(value)
         if array is not value and np.issubdtype(array.dtype, np.integer):
             array = array.astype(np.float64)
-        return torch.tensor(array)
+        return torch.tensor(array, device="cpu")
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name}: want a tensor or an array, got {type(value).__name__} ({error})") from None
 
