@@ -92,12 +92,31 @@ class Batched:
         return self._rearranged(lambda tensor, _: tensor.detach(), lambda part: part.detach())
 
     def expand(self: B, *batch_shape: int) -> B:
-        """The same with its batch axes broadcast to `batch_shape`, as `torch.Tensor.expand`: nothing is copied."""
+        """The same with its batch axes broadcast to `batch_shape`, as `torch.Tensor.expand`: nothing is copied.
+
+        Raises:
+            TypeError: the shape is not whole numbers.
+            ValueError: the batch axes do not broadcast to it.
+        """
+        shape = batch_shape[0] if len(batch_shape) == 1 and isinstance(batch_shape[0], tuple | list) else batch_shape
+        batch_shape = self._stretched(shape)
 
         def stretch(tensor: Tensor, behind: int) -> Tensor:
             return tensor.expand((*batch_shape, *tensor.shape[tensor.ndim - behind :]))
 
         return self._rearranged(stretch, lambda part: part.expand(*batch_shape))
+
+    def _stretched(self, shape: Sequence[int]) -> torch.Size:
+        """The shape that the batch is asked to take on, with -1 for the length that an axis has already."""
+        own = self.batch_shape
+        if not all(isinstance(length, int | torch.SymInt) for length in shape):
+            raise TypeError(f"batch_shape: want whole numbers, got {tuple(shape)}")
+        new = len(shape) - len(own)
+        wanted = [own[k - new] if length == -1 and k >= new else length for k, length in enumerate(shape)]
+        fits = new >= 0 and all(length >= 0 for length in wanted[:new])
+        if not fits or any(length not in (1, want) for length, want in zip(own, wanted[new:], strict=True)):
+            raise ValueError(f"batch_shape: want one that {tuple(own)} broadcasts to, got {tuple(shape)}")
+        return torch.Size(wanted)
 
     def __getitem__(self: B, index: Any) -> B:
         """Some of the batch, chosen as one indexes a tensor of shape `*B`.

@@ -74,6 +74,27 @@ def check_tensor(name: str, value: object, *shape: int | str) -> Tensor:
     return at_least_float32(value)
 
 
+def check_number(name: str, value: object) -> None:
+    """Check that `value` is a finite number, or a tensor of one.
+
+    Raises:
+        TypeError: it is neither.
+        ValueError: it is NaN or infinite, where its value can be read.
+    """
+    if isinstance(value, Tensor):
+        if value.numel() != 1 or value.dtype == torch.bool or value.is_complex():
+            raise TypeError(f"{name}: want a number, got a tensor of shape {tuple(value.shape)} and {value.dtype}")
+        if not has_values(value):
+            return
+        value = value.item()
+    try:
+        finite = math.isfinite(value)  # type: ignore[arg-type]
+    except TypeError:
+        raise TypeError(f"{name}: want a number, got {type(value).__name__}") from None
+    if not finite:
+        raise ValueError(f"{name}: want a finite number, got {value}")
+
+
 def check_same_kind(**tensors: Kind | None) -> None:
     """Check that all tensors share one dtype and one device, naming the first that does not.
 

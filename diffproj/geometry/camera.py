@@ -21,6 +21,7 @@ from torch.utils._pytree import tree_leaves
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
     broadcast_batches,
+    check_number,
     check_same_kind,
     check_tensor,
     dot,
@@ -175,6 +176,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             stretched: whether the whole image was stretched to another aspect, as networks of a fixed input size do.
 
         Raises:
+            TypeError: the size is not two whole numbers.
             ValueError: the camera does not know its own size, or another aspect. A camera's video mode of another
                 aspect shows a part of the sensor: crop first.
 
@@ -188,6 +190,8 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             raise ValueError(
                 "resized: want a camera with a size, got size=None; give Camera(..., size=(width, height))"
             )
+        if size is None:
+            raise TypeError("size: want (width, height) of the resized image, got None")
         width, height = checked_size(size) or self.size
         scale = (width / self.size[0], height / self.size[1])
         # Rounding moves each side by a pixel at most: is there one scale that both may have been rounded from?
@@ -202,7 +206,14 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         return self._with(K=self.K * factors + shift, size=(width, height))
 
     def cropped(self, left: float, top: float, width: int, height: int) -> "Camera":
-        """The camera of the crop whose first pixel was pixel `(left, top)`: the principal point moves along."""
+        """The camera of the crop whose first pixel was pixel `(left, top)`: the principal point moves along.
+
+        Raises:
+            TypeError: `left` or `top` is no number, or width and height are not whole.
+            ValueError: `left` or `top` is not finite, or width or height is not positive.
+        """
+        for name, number in (("left", left), ("top", top)):
+            check_number(name, number)
         shift = self.K.new_tensor([[0, 0, left], [0, 0, top], [0, 0, 0]])
         return self._with(K=self.K - shift, size=checked_size((width, height)))
 

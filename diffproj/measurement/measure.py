@@ -26,7 +26,7 @@ from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from diffproj._core.numerics import check_tensor, in_float64, transform
+from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64, transform
 from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.region import in_region
 from diffproj.calibration.result import Calibration
@@ -92,6 +92,13 @@ def measure(
         raise ValueError(f"pixel_sigma: want the noise of the pixels, for {source} does not know it")
     warn_if_rounded(camera, plane)
     camera, plane = camera.to(torch.float64), plane.to(torch.float64)
+    if plane_covariance is not None:
+        plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
+        _check_covariance(plane_covariance.detach())
+        if plane.is_per_point:
+            raise ValueError("plane_covariance: want one plane for all points, got one for each (Plane.per_point)")
+        many = broadcast_batches(pixels=pixels.shape[:-2], plane_covariance=plane_covariance.shape[:-2])
+        pixels = pixels.expand(*many, *pixels.shape[-2:])
     points, valid = back_project(pixels, camera, plane)
     batch = points.shape[:-2]
     sigma = _expanded(level if pixel_sigma is None else pixel_sigma, like=points)
@@ -109,12 +116,8 @@ def measure(
         factor = torch.where(beyond, 1.0, factor)[..., None, None]
         blocks, by_theta = [factor * blocks[0]], factor * by_theta
     if plane_covariance is not None:
-        plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
-        _check_covariance(plane_covariance.detach())
-        if plane.is_per_point:
-            raise ValueError("plane_covariance: want one plane for all points, got one for each (Plane.per_point)")
-        n = plane.normal.unsqueeze(-2).expand_as(points)
-        lift = n / n.square().sum(-1, keepdim=True)
+        n = plane.unit_normal.unsqueeze(-2).expand_as(points)
+        lift = n / plane.length[..., None, None]
         lift = lift - (D @ (by_point @ lift.unsqueeze(-1))).squeeze(-1)
         with_offset = torch.cat([-points, torch.ones_like(points[..., :1])], dim=-1)
         blocks.append(lift.unsqueeze(-1) * with_offset.unsqueeze(-2))
