@@ -15,6 +15,7 @@ import torch
 import torch.utils._pytree as torch_pytree
 from torch import Tensor
 
+from diffproj._core.copying import Copied
 from diffproj._core.numerics import at_least_float32, converted
 
 T = TypeVar("T")
@@ -23,7 +24,7 @@ Rearrange = Callable[[Tensor, int], Tensor]
 """Takes a tensor and how many axes it has behind those of the batch to the same in another arrangement."""
 
 
-class Batched:
+class Batched(Copied):
     """Tensors that share batch axes `*B`, parts with the same batch axes, and constants."""
 
     __slots__ = ()

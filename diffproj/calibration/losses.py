@@ -14,7 +14,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-
 SMALLEST = 1e-100
 """The smallest scale; its inverse is the largest. What is computed of their squares is still right."""
 
