@@ -92,22 +92,22 @@ class Batched(Copied):
         """The same cut off from the graph."""
         return self._rearranged(lambda tensor, _: tensor.detach(), lambda part: part.detach())
 
-    def expand(self: B, *batch_shape: int) -> B:
+    def expand(self: B, *batch_shape: int | Sequence[int]) -> B:
         """The same with its batch axes broadcast to `batch_shape`, as `torch.Tensor.expand`: nothing is copied.
 
         Raises:
             TypeError: the shape is not whole numbers.
             ValueError: the batch axes do not broadcast to it.
         """
-        shape = batch_shape[0] if len(batch_shape) == 1 and isinstance(batch_shape[0], tuple | list) else batch_shape
-        batch_shape = self._stretched(shape)
+        first = batch_shape[0] if len(batch_shape) == 1 else None
+        shape = self._stretched(first if isinstance(first, tuple | list) else batch_shape)
 
         def stretch(tensor: Tensor, behind: int) -> Tensor:
-            return tensor.expand((*batch_shape, *tensor.shape[tensor.ndim - behind :]))
+            return tensor.expand((*shape, *tensor.shape[tensor.ndim - behind :]))
 
-        return self._rearranged(stretch, lambda part: part.expand(*batch_shape))
+        return self._rearranged(stretch, lambda part: part.expand(*shape))
 
-    def _stretched(self, shape: Sequence[int]) -> torch.Size:
+    def _stretched(self, shape: Sequence[Any]) -> torch.Size:
         """The shape that the batch is asked to take on, with -1 for the length that an axis has already."""
         own = self.batch_shape
         if not all(isinstance(length, int | torch.SymInt) for length in shape):
