@@ -94,7 +94,7 @@ def _points(
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """The points, and remarks on those that are not on the plane or not in the photograph."""
     rows, remarks = [], []
-    pixels = torch.tensor([[pixel.u, pixel.v] for pixel in given], dtype=torch.float64)
+    pixels = torch.tensor([[pixel.u, pixel.v] for pixel in given], dtype=torch.float64, device="cpu")
     seen = camera.in_image(pixels).tolist() if camera.size is not None else [True] * len(pixels)
     beyond = [None] * len(pixels) if measured.extrapolated is None else measured.extrapolated.tolist()
     bent, outside = measured.nonlinear.tolist(), []
