@@ -80,6 +80,7 @@ class Calibration(Copied):
             board as it does, to within 2 px, which bring nothing new. `None` where all counted fully.
         skew: whether the skew of K is among the parameters: it was fitted, or K had some that was held.
         comparison: how the lenses fared, where `distortion="auto"` compared them.
+        unit: the world's unit, such as `"mm"`, where it is known; files keep it.
     """
 
     camera: Camera
@@ -99,6 +100,7 @@ class Calibration(Copied):
     degrees_of_freedom: Float[Tensor, "*batch"] | None = None
     lens_region: Float[Tensor, "*#batch directions"] | None = None
     comparison: LensComparison | None = None
+    unit: str | None = None
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
     _remarks: Callable[[], tuple[str, ...]] | None = None

@@ -63,6 +63,8 @@ def read_camera(path: Path) -> Camera:
         K, dist = storage.getNode("camera_matrix").mat(), storage.getNode("distortion_coefficients").mat()
         width, height = (int(storage.getNode(key).real()) for key in ("image_width", "image_height"))
         fisheye = bool(storage.getNode("fisheye_model").real())
+    except (cv2.error, ValueError, OverflowError) as error:
+        raise ValueError(f"{path}: want a camera as OpenCV writes it, got other values under its keys") from error
     finally:
         storage.release()
     if K is None:

@@ -71,6 +71,7 @@ def read_calibration(path: Path) -> Calibration | None:
         visible = torch.tensor(found["visible"], dtype=torch.bool, device="cpu")
         views = Views(pixels, visible, found["names"], _size(found["size"]))
         used, rejected = (torch.tensor(found[key], dtype=torch.bool, device="cpu") for key in ("used", "rejected"))
+        _check_shapes(views, points, used, rejected)
         status, iterations = (torch.tensor(found[key], device="cpu") for key in ("status", "iterations"))
         bow = None if found["bow"] is None else _tensor(found["bow"], torch.float64)
         posed = camera if not camera.batch_shape else camera[..., None]
@@ -93,12 +94,28 @@ def read_calibration(path: Path) -> Calibration | None:
             shares=_later(found.get("shares")),
             degrees_of_freedom=_later(found.get("degrees_of_freedom")),
             lens_region=_later(found.get("lens_region")),
+            unit=_unit(found.get("unit")),
             _covariance=None if covariance is None else partial(_same, covariance),
             _others=None if others is None else partial(_same, others),
             _remarks=partial(_same, tuple(found["remarks"])) if "remarks" in found else None,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
+
+
+def _unit(unit: Any) -> str | None:
+    """The world's unit; files of earlier releases lack it."""
+    if not isinstance(unit, str | None):
+        raise TypeError(f"unit: want a text, got {unit!r}")
+    return unit
+
+
+def _check_shapes(views: Views, points: Tensor, used: Tensor, rejected: Tensor) -> None:
+    """Check that the parts of a calibration belong together."""
+    corners = views.visible.shape
+    if points.shape != (corners[-1], 3) or used.shape != corners or rejected.shape != corners:
+        got = ", ".join(str(tuple(part.shape)) for part in (points, used, rejected))
+        raise ValueError(f"points, used, rejected: want those of corners {tuple(corners)}, got {got}")
 
 
 def _camera_fields(path: Path, camera: Camera) -> dict[str, Any]:
@@ -123,6 +140,7 @@ def _calibration_fields(item: Calibration) -> dict[str, Any]:
         "status": item.status.tolist(),
         "iterations": item.iterations.tolist(),
         "objective": item.objective,
+        "unit": item.unit,
         "skew": item.skew,
         "bow": None if item.bow is None else item.bow.tolist(),
         "R": item.cameras.R.tolist(),

@@ -6,7 +6,7 @@ of another package needs no entry, only what `Lens` asks for, and `register_lens
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeVar, get_args
+from typing import TypeVar, get_args
 
 import torch.utils._pytree as torch_pytree
 from torch import Tensor
@@ -15,10 +15,8 @@ from diffproj._core.batched import register_pytree
 from diffproj.lens.brown_conrady import BrownConrady
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.kannala_brandt import KannalaBrandt
+from diffproj.lens.names import LensModel
 from diffproj.lens.protocol import Lens
-
-LensModel = Literal["none", "brown4", "brown5", "brown8", "brown12", "brown14", "fisheye"]
-"""The lenses that can be fitted: none, Brown-Conrady by its number of coefficients, Kannala-Brandt."""
 
 T = TypeVar("T")
 

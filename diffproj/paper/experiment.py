@@ -153,9 +153,9 @@ def parse_split(text: str, count: int) -> tuple[list[int], list[int]]:
     """
     try:
         if "/" in text:
-            fit, test = (_positions(part) for part in text.split("/"))
+            fit, test = (_positions(part, count) for part in text.split("/"))
         else:
-            fit = list(range(int(text)))
+            fit = list(range(min(int(text), count + 1)))
             test = list(range(len(fit), count))
     except ValueError:
         raise ValueError(f"split: want a number such as 8, or lists such as 1-5,9/6-8, got {text!r}") from None
@@ -169,11 +169,12 @@ def parse_split(text: str, count: int) -> tuple[list[int], list[int]]:
     return fit, test
 
 
-def _positions(text: str) -> list[int]:
+def _positions(text: str, count: int) -> list[int]:
+    """Positions from 0; of those beyond the last view, one."""
     positions: list[int] = []
     for part in text.split(","):
         first, _, last = part.partition("-")
-        positions += range(int(first) - 1, int(last or first))
+        positions += range(int(first) - 1, min(int(last or first), max(count, int(first) - 1) + 1))
     return positions
 
 

@@ -38,8 +38,8 @@ def listed(photographs: Source | Iterable[Source]) -> list[Photograph]:
     """List the input photographs one by one.
 
     Args:
-        photographs: a file, a folder (its photographs in natural order: `view2` before `view10`), a pattern such as
-            `photos/left*.jpg`, an array, a tensor, or a list of files, arrays and tensors.
+        photographs: a file, a folder (its photographs in natural order: `view2` before `view10`; hidden files are
+            none), a pattern such as `photos/left*.jpg`, an array, a tensor, or a list of files, arrays and tensors.
 
     Raises:
         TypeError: an entry is none of these.
@@ -71,13 +71,24 @@ def _entries(photographs: Any) -> list[Any]:
     if isinstance(photographs, str | os.PathLike):
         path = Path(photographs)
         if path.is_dir():
-            return sorted((file for file in path.iterdir() if file.suffix.lower() in SUFFIXES), key=_natural)
+            return sorted((file for file in path.iterdir() if _is_photograph(file)), key=_natural)
         if not path.exists() and re.search(r"[*?\[]", path.name):
-            return sorted(path.parent.glob(path.name), key=_natural)
+            hidden = path.name.startswith(".")
+            return sorted((file for file in path.parent.glob(path.name) if hidden or not _hidden(file)), key=_natural)
         return [path]
     if isinstance(photographs, Iterable):
         return list(photographs)
     raise TypeError(f"photographs: want file names, arrays or tensors, got {type(photographs).__name__}")
+
+
+def _is_photograph(file: Path) -> bool:
+    """Whether a file in a folder counts as a photograph."""
+    return file.suffix.lower() in SUFFIXES and not _hidden(file) and file.is_file()
+
+
+def _hidden(file: Path) -> bool:
+    """Hidden files beside photographs are none: macOS keeps what it knows of `left1.jpg` in `._left1.jpg`."""
+    return file.name.startswith(".")
 
 
 def _natural(path: Path) -> list[Any]:

@@ -448,6 +448,13 @@ def test_an_empty_list(photographs):
         detect(photographs, BOARD)
 
 
+def test_hidden_files_and_folders_are_no_photographs(folder):
+    (folder / "._b1.PNG").write_bytes(b"what macOS keeps of b1.PNG")
+    (folder / "album.png").mkdir()
+    assert detect(folder, BOARD).names == ALL
+    assert detect(str(folder / "*b10.*"), BOARD).names == ("b10.png",)
+
+
 def test_an_empty_folder_and_an_empty_pattern(tmp_path):
     with pytest.raises(ValueError, match="photographs: want at least one, got none in"):
         detect(tmp_path, BOARD)
