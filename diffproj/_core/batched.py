@@ -15,6 +15,7 @@ import torch
 import torch.utils._pytree as torch_pytree
 from torch import Tensor
 
+from diffproj._core.arguments import called, listing, whole_number
 from diffproj._core.numerics import at_least_float32, converted
 
 T = TypeVar("T")
@@ -75,10 +76,18 @@ class Batched:
         """The same in another dtype or on another device: arguments as `torch.Tensor.to`; half becomes float32.
 
         Raises:
-            TypeError: the dtype is not of floating-point type.
+            TypeError: the arguments name no dtype and no device, or a dtype that is not of floating-point type.
+            ValueError: there is no such device.
         """
         # An empty tensor shows what the arguments ask for.
-        wanted = at_least_float32(torch.empty(0, dtype=self.dtype, device=self.device).to(*args, **kwargs))
+        try:
+            wanted = torch.empty(0, dtype=self.dtype, device=self.device).to(*args, **kwargs)
+        except TypeError:
+            given = ", ".join(called(value) for value in (*args, *kwargs.values()))
+            raise TypeError(f"dtype: want a torch.dtype, a device, a tensor or two of them, got {given}") from None
+        except (RuntimeError, AssertionError, NotImplementedError) as error:
+            raise ValueError(f"device: want one that is here, got {(*args, *kwargs.values())} ({error})") from None
+        wanted = at_least_float32(wanted)
         if not wanted.is_floating_point():
             raise TypeError(f"dtype: want a floating-point one, got {wanted.dtype}")
 
@@ -92,19 +101,31 @@ class Batched:
         return self._rearranged(lambda tensor, _: tensor.detach(), lambda part: part.detach())
 
     def expand(self: B, *batch_shape: int) -> B:
-        """The same with its batch axes broadcast to `batch_shape`, as `torch.Tensor.expand`: nothing is copied."""
+        """The same with its batch axes broadcast to `batch_shape`, as `torch.Tensor.expand`: nothing is copied.
+
+        Raises:
+            TypeError: no whole numbers.
+            ValueError: the batch axes do not broadcast to them.
+        """
 
         def stretch(tensor: Tensor, behind: int) -> Tensor:
             return tensor.expand((*batch_shape, *tensor.shape[tensor.ndim - behind :]))
 
-        return self._rearranged(stretch, lambda part: part.expand(*batch_shape))
+        try:
+            return self._rearranged(stretch, lambda part: part.expand(*batch_shape))
+        except TypeError:
+            got = ", ".join(map(called, batch_shape))
+            raise TypeError(f"batch_shape: want whole numbers, as in expand(2, 3), got {got}") from None
+        except (RuntimeError, OverflowError):
+            mine = tuple(self.batch_shape)
+            raise ValueError(f"batch_shape: want one that {mine} broadcasts to, got {batch_shape}") from None
 
     def __getitem__(self: B, index: Any) -> B:
         """Some of the batch, chosen as one indexes a tensor of shape `*B`.
 
         Raises:
             TypeError: the index is not one that tensors take.
-            IndexError: there is no such element.
+            IndexError: there is no such element, or the index does not fit the batch shape.
         """
         check_index(index)
         return self._rearranged(lambda tensor, behind: index_batch(tensor, index, behind), lambda part: part[index])
@@ -119,9 +140,9 @@ class Batched:
 
         Raises:
             TypeError: others than this class among them, or different dtypes or kinds of parts.
-            ValueError: none, different constants, or batch shapes that do not broadcast.
+            ValueError: none, different constants, or batch shapes that do not broadcast, or no such axis.
         """
-        items = list(items)
+        items = listing("items", items, f"several {cls.__name__}")
         if not items or not all(isinstance(item, cls) for item in items):
             got = ", ".join(sorted({type(item).__name__ for item in items})) or "none"
             raise (TypeError if items else ValueError)(f"items: want at least one {cls.__name__}, got {got}")
@@ -133,7 +154,8 @@ class Batched:
             got = ", ".join(str(tuple(item.batch_shape)) for item in items)
             raise ValueError(f"items: batch shapes do not broadcast: {got}") from None
         items = [item.expand(*batch) for item in items]
-        dim = dim % (len(batch) + 1)
+        axes = len(batch) + 1
+        dim = whole_number("dim", dim, f"an axis from {-axes} to {axes - 1}", least=-axes, most=axes - 1) % axes
         fields = {name: torch.stack([getattr(item, name) for item in items], dim) for name in cls._tensors}
         fields |= {name: _stacked(name, [getattr(item, name) for item in items], dim) for name in cls._parts}
         return cls.unchecked(**fields, **{name: cls._agreed(name, items) for name in cls._constants})
@@ -212,7 +234,11 @@ def index_batch(tensor: Tensor, index: Any, behind: int) -> Tensor:
     index = index if isinstance(index, tuple) else (index,)
     if not any(part is Ellipsis for part in index):
         index = (*index, Ellipsis)
-    return tensor[(*index, *(slice(None),) * behind)]
+    try:
+        return tensor[(*index, *(slice(None),) * behind)]
+    except (IndexError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        shape = tuple(tensor.shape[: tensor.ndim - behind])
+        raise IndexError(f"index: want one that fits the batch shape {shape}, got another ({error})") from None
 
 
 # ---------------------------------------------------------------------------------------------------------- PyTrees

@@ -12,27 +12,17 @@ Three rules live here because they are easy to break one call at a time:
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from diffproj._core.arguments import Kind, tensor_of
 from diffproj._core.torch_private import in_forward_mode, in_functional_transform
 
 BLOCK_POINTS = 2**16
 """Points handled at once when no derivative is asked: large enough to hide the cost of dispatch, small enough that
 the intermediate results stay in the processor's cache."""
-
-
-@runtime_checkable
-class Kind(Protocol):
-    """What has a dtype and a device: a tensor, a lens."""
-
-    @property
-    def dtype(self) -> torch.dtype: ...
-
-    @property
-    def device(self) -> torch.device: ...
 
 
 # ----------------------------------------------------------------------------------------------- argument checks
@@ -43,24 +33,27 @@ def at_least_float32(tensor: Tensor) -> Tensor:
     return tensor.float() if tensor.dtype in (torch.float16, torch.bfloat16) else tensor
 
 
-def check_tensor(name: str, value: object, *shape: int | str) -> Tensor:
+def check_tensor(name: str, value: object, *shape: int | str, like: Kind | None = None) -> Tensor:
     """Check that `value` is a floating-point tensor whose trailing axes fit `shape`, and lift it.
+
+    NumPy arrays and lists of numbers are taken as well: see `diffproj._core.arguments`.
 
     Args:
         name: the argument's name, for the message.
         value: what the caller handed in.
         shape: the trailing axes: a number where the length is fixed, a word where it is free; `"*"` in front of them
             stands for any leading axes and is implied.
+        like: whose dtype and device an array takes on.
 
     Returns:
         The tensor, in float32 if it came in half precision.
 
     Raises:
-        TypeError: not a tensor, or not of floating-point type.
+        TypeError: no tensor, array or numbers, or a tensor that is not of floating-point type.
         ValueError: the trailing axes do not fit.
     """
     if not isinstance(value, Tensor):
-        raise TypeError(f"{name}: want a torch.Tensor, got {type(value).__name__}; torch.as_tensor(...) makes one")
+        value = tensor_of(name, value, like)
     if not value.is_floating_point():
         raise TypeError(f"{name}: want a floating-point tensor, got {value.dtype}; .double() or .float() makes one")
     fits = value.ndim >= len(shape) and all(
@@ -84,7 +77,9 @@ def check_same_kind(**tensors: Kind | None) -> None:
     (first, reference), *others = present
     for name, tensor in others:
         if tensor.dtype != reference.dtype:
-            raise TypeError(f"{name}: want {reference.dtype} as {first} has, got {tensor.dtype}; .to(...) converts")
+            raise TypeError(
+                f"{name}: want {reference.dtype} as {first} has, got {tensor.dtype}; {name}.to({reference.dtype}) converts"
+            )
         if tensor.device != reference.device:
             raise ValueError(f"{name}: want device {reference.device} as {first} has, got {tensor.device}")
 

@@ -7,13 +7,15 @@ in iteratively reweighted least squares. All are twice differentiable at `e2 = 0
 Sources: Huber 1964; Triggs, McLauchlan, Hartley and Fitzgibbon 2000, "Bundle adjustment", section 3.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from diffproj._core.arguments import called, number
+from diffproj._core.numerics import check_tensor
 
 
 @runtime_checkable
@@ -34,8 +36,8 @@ class _Scaled:
     scale: float
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.scale, int | float) and math.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"scale: want a positive number in the residual's unit, got {self.scale!r}")
+        scale = number("scale", self.scale, "a positive number in the residual's unit", above=0)
+        object.__setattr__(self, "scale", scale)
 
 
 class Huber(_Scaled):
@@ -48,11 +50,13 @@ class Huber(_Scaled):
 
     def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`e2`, and `2 scale |e| - scale^2` beyond `scale`."""
+        squared = check_tensor("squared", squared)
         far = squared > self.scale**2
         return torch.where(far, 2 * self.scale * torch.where(far, squared, 1).sqrt() - self.scale**2, squared)
 
     def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """1, and `scale / |e|` beyond `scale`."""
+        squared = check_tensor("squared", squared)
         far = squared > self.scale**2
         return torch.where(far, self.scale / torch.where(far, squared, 1).sqrt(), torch.ones_like(squared))
 
@@ -67,11 +71,12 @@ class SoftL1(_Scaled):
 
     def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`2 scale^2 (sqrt(1 + e2 / scale^2) - 1)`, without cancellation."""
+        squared = check_tensor("squared", squared)
         return 2 * squared / (1 + (1 + squared / self.scale**2).sqrt())
 
     def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`1 / sqrt(1 + e2 / scale^2)`."""
-        return (1 + squared / self.scale**2).rsqrt()
+        return (1 + check_tensor("squared", squared) / self.scale**2).rsqrt()
 
 
 class Cauchy(_Scaled):
@@ -84,11 +89,21 @@ class Cauchy(_Scaled):
 
     def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`scale^2 log(1 + e2 / scale^2)`."""
-        return self.scale**2 * (squared / self.scale**2).log1p()
+        return self.scale**2 * (check_tensor("squared", squared) / self.scale**2).log1p()
 
     def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`1 / (1 + e2 / scale^2)`."""
-        return 1 / (1 + squared / self.scale**2)
+        return 1 / (1 + check_tensor("squared", squared) / self.scale**2)
+
+
+def check_loss(loss: Loss | None) -> None:
+    """Check that something is a loss, or `None`.
+
+    Raises:
+        TypeError: it is neither.
+    """
+    if isinstance(loss, type) or not (loss is None or isinstance(loss, Loss)):
+        raise TypeError(f"loss: want one such as dp.Huber(0.5), got {called(loss)}")
 
 
 def slope_and_bend(loss: Loss | None, squared: Tensor) -> tuple[Tensor, Tensor]:

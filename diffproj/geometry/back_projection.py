@@ -26,6 +26,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.linalg import vector_norm
 
+from diffproj._core.arguments import Array, tensor_of
 from diffproj._core.batched import register_pytree
 from diffproj._core.numerics import (
     broadcast_batches,
@@ -42,7 +43,7 @@ from diffproj._core.numerics import (
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.geometry.intrinsics import pixel_to_normalized
-from diffproj.geometry.plane import Plane
+from diffproj.geometry.plane import Plane, as_plane
 
 
 class Reason(enum.IntEnum):
@@ -94,9 +95,7 @@ class PlaneMap:
             TypeError: not a camera and a plane, or of different dtypes.
             ValueError: different devices, or batch shapes that do not broadcast.
         """
-        camera = as_camera(camera)
-        if not isinstance(plane, Plane):
-            raise TypeError(f"plane: want a dp.Plane, got {type(plane).__name__}")
+        camera, plane = as_camera(camera), as_plane(plane)
         plane = plane.like(camera.K)
         check_same_kind(camera=camera.K, plane=plane.normal)
         if plane.is_per_point:
@@ -113,7 +112,7 @@ class PlaneMap:
         return plane_map
 
     def __call__(
-        self, pixels: Float[Tensor, "*#batch n 2"]
+        self, pixels: Float[Tensor, "*#batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
         """Points `(*B, N, 3)` and `valid (*B, N)` of pixels `(*B, N, 2)`; see `back_project`."""
         rows = entries(self.matrix)
@@ -124,7 +123,7 @@ class PlaneMap:
         points, valid = in_blocks(to_plane, self._checked(pixels), self.matrix, *self.camera.tensors())
         return (points.squeeze(-2), valid.squeeze(-1)) if self.is_per_point else (points, valid)
 
-    def explain(self, pixels: Float[Tensor, "*#batch n 2"]) -> Int[Tensor, "*#batch n"]:
+    def explain(self, pixels: Float[Tensor, "*#batch n 2"] | Array) -> Int[Tensor, "*#batch n"]:
         """`Reason` codes `(*B, N)` of pixels `(*B, N, 2)`; see the function `explain`."""
         (reasons,) = in_blocks(self._explain, self._checked(pixels), self.matrix, *self.camera.tensors())
         return reasons.squeeze(-1) if self.is_per_point else reasons
@@ -161,15 +160,16 @@ class PlaneMap:
         return list(direction.unbind(-1)), seen
 
     def _checked(self, pixels: Tensor) -> Tensor:
-        if self.is_per_point and isinstance(pixels, Tensor) and pixels.ndim >= 2:
-            pixels = pixels.unsqueeze(-2)
+        if self.is_per_point:
+            pixels = tensor_of("pixels", pixels, self.camera.K)
+            pixels = pixels.unsqueeze(-2) if pixels.ndim >= 2 else pixels
         pixels = self.camera._checked("pixels", pixels, 2)
         batch = broadcast_batches(map=self.matrix.shape[:-2], pixels=pixels.shape[:-2])
         return pixels.expand(*batch, *pixels.shape[-2:])
 
 
 def back_project(
-    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane
+    pixels: Float[Tensor, "*#batch n 2"] | Array, camera: Camera | PinholeCamera, plane: Plane
 ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
     """Intersect the viewing rays of pixels with a plane.
 
@@ -188,7 +188,7 @@ def back_project(
         camera. Points are (0, 0, 0) there, and their gradient is zero.
 
     Raises:
-        TypeError: tensors of integers or of mixed dtypes.
+        TypeError: not pixels, a camera and a plane in this order, or tensors of integers or of mixed dtypes.
         ValueError: wrong shapes, mixed devices, or batch shapes that do not broadcast.
 
     Example:
@@ -206,7 +206,7 @@ def back_project(
 
 
 def explain(
-    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane
+    pixels: Float[Tensor, "*#batch n 2"] | Array, camera: Camera | PinholeCamera, plane: Plane
 ) -> Int[Tensor, "*#batch n"]:
     """Say for each pixel why it has no point on the plane, or that it has one.
 
@@ -234,7 +234,7 @@ def explain(
 
 
 def ground_resolution(
-    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane
+    pixels: Float[Tensor, "*#batch n 2"] | Array, camera: Camera | PinholeCamera, plane: Plane
 ) -> tuple[Float[Tensor, "*#batch n"], Bool[Tensor, "*#batch n"]]:
     """World units that a pixel covers on the plane along its worst direction.
 
@@ -252,7 +252,7 @@ def ground_resolution(
         (tensor([2.]), tensor([True]))
     """
     to_plane = PlaneMap(camera, plane)
-    pixels = check_tensor("pixels", pixels, "N", 2)
+    pixels = check_tensor("pixels", pixels, "N", 2, like=to_plane.matrix)
     right, down = torch.zeros_like(pixels), torch.zeros_like(pixels)
     right[..., 0], down[..., 1] = 1.0, 1.0
     (_, valid), (by_u, _) = torch.func.jvp(to_plane, (pixels,), (right,))[:2]

@@ -19,6 +19,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
+from diffproj._core.arguments import flag
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.cayley import turned
 from diffproj.lens.models import coefficients_of, model_of
@@ -76,6 +77,7 @@ class LearnableCamera(GeometryModule):
     ) -> None:
         super().__init__()
         camera = as_camera(camera).detach()
+        check_tied(tied_intrinsics)
         self._model = model_of(camera.distortion)
         available = [part for part in PARTS if self._model.count or part != "distortion"]
         chosen = learned_parts(available if learn is None else learn, available)
@@ -123,6 +125,16 @@ class LearnableCamera(GeometryModule):
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""
         return f"batch_shape={tuple(self.batch_shape)}, lens={self._model.name}, learn={self.learn}"
+
+
+def check_tied(tied: bool | None) -> None:
+    """Check the argument `tied_intrinsics`.
+
+    Raises:
+        TypeError: it is neither True nor False nor `None`.
+    """
+    if tied is not None:
+        flag("tied_intrinsics", tied)
 
 
 def tied_axes(camera: Camera, tied: bool | None) -> list[int]:

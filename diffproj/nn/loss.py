@@ -4,8 +4,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from diffproj._core.arguments import Array, booleans
 from diffproj._core.numerics import check_tensor
-from diffproj.calibration.losses import Loss
+from diffproj.calibration.losses import Loss, check_loss
 
 
 class PlaneLoss(nn.Module):
@@ -29,17 +30,16 @@ class PlaneLoss(nn.Module):
 
     def __init__(self, loss: Loss | None = None) -> None:
         super().__init__()
-        if loss is not None and not isinstance(loss, Loss):
-            raise TypeError(f"loss: want one such as dp.Huber(5.0), got {type(loss).__name__}")
+        check_loss(loss)
         self.loss = loss
 
     def forward(
         self,
-        points: Float[Tensor, "*batch n 3"],
-        target: Float[Tensor, "*#batch n 3"],
-        valid: Bool[Tensor, "*#batch n"] | None = None,
-        weights: Float[Tensor, "*#batch n"] | None = None,
-        resolution: Float[Tensor, "*#batch n"] | None = None,
+        points: Float[Tensor, "*batch n 3"] | Array,
+        target: Float[Tensor, "*#batch n 3"] | Array,
+        valid: Bool[Tensor, "*#batch n"] | Array | None = None,
+        weights: Float[Tensor, "*#batch n"] | Array | None = None,
+        resolution: Float[Tensor, "*#batch n"] | Array | None = None,
     ) -> Float[Tensor, ""]:
         """The loss, a tensor without axes, in squared world units (in squared pixels with `resolution`).
 
@@ -53,14 +53,33 @@ class PlaneLoss(nn.Module):
                 gradient flows through it.
 
         Raises:
-            TypeError: points or target that are no floating-point tensors.
-            ValueError: points or target without three coordinates.
+            TypeError: points, target, weights or resolution that are no floating-point tensors, or `valid` no booleans.
+            ValueError: points or target without three coordinates, or shapes that do not broadcast to the points'.
         """
-        points, target = check_tensor("points", points, "N", 3), check_tensor("target", target, "N", 3)
-        counts = torch.ones_like(points[..., 0], dtype=torch.bool) if valid is None else valid
+        points = check_tensor("points", points, "N", 3, like=target if isinstance(target, Tensor) else None)
+        target = _fitting("target", check_tensor("target", target, "N", 3, like=points), points)
+        counts = torch.ones_like(points[..., 0], dtype=torch.bool)
+        if valid is not None:
+            counts = _fitting("valid", booleans("valid", valid, points.device), counts)
         off = torch.where(counts.unsqueeze(-1), points - target.to(points), 0.0)
         if resolution is not None:
+            resolution = _fitting("resolution", check_tensor("resolution", resolution, like=points), counts)
             off = off / torch.where(counts, resolution, 1.0).detach().unsqueeze(-1).to(off)
         value = off.square().sum(-1)
         value = value if self.loss is None else self.loss.value(value)
-        return (value if weights is None else value * weights.to(value)).mean()
+        if weights is not None:
+            weights = _fitting("weights", check_tensor("weights", weights, like=points), counts)
+            value = value * weights.to(value)
+        return value.mean()
+
+
+def _fitting(name: str, tensor: Tensor, points: Tensor) -> Tensor:
+    """A tensor known to broadcast to the shape of the points, on their device."""
+    if tensor.shape != points.shape:
+        shape, want = tuple(tensor.shape), tuple(points.shape)
+        padded = (*(1 for _ in want[len(shape) :]), *shape)
+        if len(shape) > len(want) or any(mine not in (1, theirs) for mine, theirs in zip(padded, want, strict=True)):
+            raise ValueError(f"{name}: want a shape that broadcasts to {want} as points has, got {shape}")
+    if tensor.device != points.device:
+        raise ValueError(f"{name}: want device {points.device} as points has, got {tensor.device}")
+    return tensor

@@ -6,6 +6,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from diffproj._core.arguments import booleans, words
+
 PARTS = ("focal", "principal_point", "distortion", "pose")
 """The parts of a camera that can be learned."""
 
@@ -53,14 +55,16 @@ def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
         available: the parts that there are.
 
     Raises:
+        TypeError: no names, or no booleans for one.
         ValueError: a part that is not available.
     """
-    names = (learn,) if isinstance(learn, str) else tuple(learn)
+    given = tuple(learn) if isinstance(learn, Mapping) else learn
+    names = (given,) if isinstance(given, str) else words("learn", given, "names of parts")
     unknown = [part for part in names if part not in available]
     if unknown:
         raise ValueError(f"learn: want parts of {', '.join(available)}, got {unknown[0]!r}")
     wanted = {part: learn[part] for part in names} if isinstance(learn, Mapping) else dict.fromkeys(names, True)
-    return {part: where for part, where in wanted.items() if bool(torch.as_tensor(where).any())}
+    return {part: where for part, where in wanted.items() if bool(booleans("learn", where).any())}
 
 
 def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, batch: torch.Size) -> None:
@@ -80,9 +84,9 @@ def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, b
         ValueError: `where` does not broadcast to the batch shape, or differs along an axis with one shared value.
     """
     zero = torch.zeros_like(like, memory_format=torch.contiguous_format)
-    mask = torch.as_tensor(where, device=like.device)
+    mask = booleans("learn", where).to(like.device)
     try:
-        mask = mask.bool().expand(batch)
+        mask = mask.expand(batch)
     except RuntimeError:
         raise ValueError(
             f"learn: want booleans that broadcast to the batch shape {tuple(batch)}, got shape {tuple(mask.shape)}"

@@ -1,0 +1,365 @@
+"""Arguments that are wrong in some way, and a look at what a call makes of them."""
+
+import dataclasses
+import decimal
+import math
+import random
+import re
+import signal
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+import diffproj as dp
+
+from .catalogue import Call, Things, calls, things
+
+SECONDS = 20
+"""After which a call counts as hanging."""
+
+D = torch.float64
+
+
+# ------------------------------------------------------------------------------------------------- wrong arguments
+
+
+def _strangers(t: Things) -> list[Any]:
+    """Things of any type."""
+    numbers = [0, 1, -1, 5, 2.5, -0.5, 1e-12, 1e300, math.nan, math.inf, -math.inf, 10**30, True, False, 3j]
+    arrays = [
+        np.zeros(3),
+        np.zeros((0, 2)),
+        np.array("x"),
+        np.array([1, "a"], dtype=object),
+        np.float64(0.3),
+        np.int64(2),
+    ]
+    tensors = [
+        torch.zeros(0), torch.zeros(3), torch.zeros(2, 2), torch.zeros(0, 2, dtype=D), torch.tensor(1.5), torch.eye(3),
+        torch.tensor(math.nan), torch.tensor([1, 2]), torch.tensor([True, False]), torch.zeros(3, 2, dtype=torch.complex64),
+        torch.zeros(3, 2, dtype=torch.half), torch.zeros(3, 2, device="meta", dtype=D), torch.zeros(2, 3, 3, dtype=D),
+    ]  # fmt: skip
+    plain = [
+        None,
+        "",
+        "x",
+        "left",
+        b"x",
+        [],
+        (),
+        {},
+        [1, 2],
+        (1, 2, 3),
+        [[1, 2], [3]],
+        ["a"],
+        [None],
+        {"a": 1},
+        {1, 2},
+        range(3),
+    ]
+    odd = [
+        object(),
+        int,
+        len,
+        decimal.Decimal("0.5"),
+        Path("nowhere"),
+        slice(1),
+        ...,
+        iter([1, 2]),
+        torch.float32,
+        torch.int64,
+    ]
+    own = [
+        t.camera, t.cameras, t.lens, t.fisheye, t.plane, t.planes, dp.Plane.per_point([0, 0, 1.0], torch.zeros(3, dtype=D)),
+        t.board, t.views, t.views[:0], t.views[:1], t.calibration, t.many, t.located, t.measured, t.accuracy, t.experiment,
+        t.calibration.covariance, t.measured.lengths(), dp.Huber(1.0), dp.Camera, dp.Camera(t.K), dp.PlaneMap(t.camera, t.plane),
+        dp.Camera(t.K, size=(128, 96)).to_kornia(), dp.Camera(torch.eye(3)), dp.Chessboard(5, 4), dp.Status.CONVERGED,
+    ]  # fmt: skip
+    return [*numbers, *arrays, *tensors, *plain, *odd, *own]
+
+
+def spoilt(value: Any, draw: random.Random, strangers: Sequence[Any]) -> Any:
+    """A value in the place of a right one: like it with something wrong, or anything at all."""
+    if draw.random() < 0.35:
+        return draw.choice(strangers)
+    if isinstance(value, Tensor | np.ndarray):
+        return _spoilt_tensor(torch.as_tensor(value), draw)
+    if isinstance(value, bool):
+        return draw.choice([not value, 2, -1, 0.5, "x", "False", None, np.bool_(value), torch.tensor(value), math.nan])
+    if isinstance(value, int | float):
+        close = [
+            -value,
+            0,
+            value + 0.5,
+            1000 * value,
+            1e-9,
+            1e300,
+            math.nan,
+            math.inf,
+            str(value),
+            None,
+            [value],
+            (value, value),
+        ]
+        return draw.choice(
+            [*close, np.float32(value), np.int64(1), torch.tensor(float(value)), torch.tensor([value]), value * 1j]
+        )
+    if isinstance(value, str):
+        return draw.choice(
+            [value.upper(), value + "x", "", value.encode(), [value], None, 0, "auto", "brown5", (value, value)]
+        )
+    if isinstance(value, tuple | list):
+        return _spoilt_sequence(value, draw, strangers)
+    if isinstance(value, dict):
+        name = draw.choice(list(value))
+        changed = spoilt(value[name], draw, strangers)
+        return draw.choice(
+            [{**value, name: changed}, {name + "x": value[name]}, {3: 4}, list(value), {**value, "f_y": changed}]
+        )
+    if isinstance(value, dp.Camera | dp.Plane | dp.Views):
+        return _spoilt_object(value, draw)
+    return draw.choice(strangers)
+
+
+def _spoilt_tensor(tensor: Tensor, draw: random.Random) -> Any:
+    def at_one_place(number: float) -> Tensor:
+        if tensor.numel() == 0 or not tensor.is_floating_point():
+            return tensor
+        copy = tensor.clone()
+        copy.view(-1)[draw.randrange(tensor.numel())] = number
+        return copy
+
+    def array(kind: Any = None) -> np.ndarray:
+        return tensor.numpy(force=True).astype(kind) if kind else tensor.numpy(force=True).copy()
+
+    axis = draw.randrange(tensor.ndim) if tensor.ndim else 0
+    last = tensor.ndim - 1
+    ways: list[Callable[[], Any]] = [
+        lambda: tensor.to(
+            draw.choice([torch.float32, torch.half, torch.bfloat16, torch.int64, torch.bool, torch.complex128])
+        ),
+        lambda: array(),
+        lambda: array(draw.choice([np.float32, np.int32, np.uint8, bool, complex, object, str])),
+        lambda: np.flip(array()),
+        lambda: array()[..., ::-1],
+        lambda: np.asfortranarray(array()),
+        lambda: tensor.tolist(),
+        lambda: tuple(tensor.tolist()) if tensor.ndim else tensor.tolist(),
+        lambda: [array()],
+        lambda: list(tensor) if tensor.ndim else [tensor],
+        lambda: at_one_place(draw.choice([math.nan, math.inf, -math.inf, 1e300, 1e20, -1e20, 1e-30, 0.0])),
+        lambda: tensor * draw.choice([0, -1, 1e30, 1e300, 1e-30, 1e-300, math.nan, 1e5]),
+        lambda: tensor.detach().clone().requires_grad_() if tensor.is_floating_point() else tensor,
+        lambda: tensor.unsqueeze(0),
+        lambda: tensor.unsqueeze(-1),
+        lambda: tensor.expand(3, *tensor.shape),
+        lambda: tensor.expand(0, *tensor.shape),
+        lambda: tensor.transpose(axis, last) if tensor.ndim else tensor,
+        lambda: tensor.narrow(axis, 0, 0) if tensor.ndim else tensor,
+        lambda: tensor.narrow(axis, 0, max(0, tensor.shape[axis] - 1)) if tensor.ndim else tensor,
+        lambda: tensor.narrow(axis, 0, 1) if tensor.ndim and tensor.shape[axis] else tensor,
+        lambda: torch.cat([tensor, tensor], axis) if tensor.ndim else tensor,
+        lambda: tensor[0] if tensor.ndim and len(tensor) else tensor,
+        lambda: tensor.to("meta"),
+        lambda: tensor.flatten(),
+        lambda: str(tensor),
+    ]
+    return draw.choice(ways)()
+
+
+def _spoilt_sequence(value: Any, draw: random.Random, strangers: Sequence[Any]) -> Any:
+    kind, items = type(value), list(value)
+    ways: list[Callable[[], Any]] = [
+        lambda: kind(items[:-1]),
+        lambda: kind([*items, *items[:1]]),
+        lambda: kind(reversed(items)),
+        lambda: [items],
+        lambda: None,
+        lambda: iter(items),
+        lambda: np.array(items, dtype=object),
+        lambda: kind(),
+    ]
+    if items and all(isinstance(item, int | float) and not isinstance(item, bool) for item in items):
+        ways += [
+            lambda: np.array(items),
+            lambda: torch.tensor(items),
+            lambda: [-item for item in items],
+            lambda: items[0],
+        ]
+    if items:
+        place = draw.randrange(len(items))
+        changed = [spoilt(items[place], draw, strangers) if i == place else item for i, item in enumerate(items)]
+        ways += [lambda: kind(changed)] * 4
+    return draw.choice(ways)()
+
+
+def _spoilt_object(value: Any, draw: random.Random) -> Any:
+    batched = len(value.batch_shape) > 0 or isinstance(value, dp.Views)
+    ways: list[Callable[[], Any]] = [
+        lambda: value.to(torch.float32),
+        lambda: value.to("meta"),
+        lambda: [value],
+        lambda: type(value),
+        lambda: type(value).stack([value, value]),
+        lambda: type(value).stack([value, value, value]),
+        lambda: value[:0] if batched else value.expand(0),
+        lambda: value[0] if batched else value.expand(2, 2),
+        lambda: value.detach(),
+        lambda: None,
+    ]
+    return draw.choice(ways)()
+
+
+# -------------------------------------------------------------------------------------------------------- the look
+
+OWN_WORDS = re.compile(r"\bwant\b|do not broadcast|no such file|found no board|determine|converge|views|explains")
+"""What the package's own messages say."""
+
+
+class HangError(Exception):
+    """A call that took too long."""
+
+
+def tried(name: str, call: Call, spoilt_ones: dict[str, Any]) -> str | None:
+    """Call with some arguments replaced; `None`, or what is wrong about the answer, in a line."""
+    given = {**call.given, **spoilt_ones}
+    versions = {id(x): x._version for x in given.values() if isinstance(x, Tensor) and not x.is_inference()}
+
+    def stop(_: int, __: FrameType | None) -> None:
+        raise HangError
+
+    previous = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(SECONDS)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            answer = call.function(**given)
+    except HangError:
+        return "hangs"
+    except Exception as error:  # noqa: BLE001
+        return _about(error, name, spoilt_ones)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, previous)
+    if any(x._version != versions[id(x)] for x in given.values() if id(x) in versions):
+        return "writes to its argument"
+    return unsound(answer)
+
+
+def _about(error: Exception, name: str, spoilt_ones: dict[str, Any]) -> str | None:
+    text, kind = str(error), type(error)
+    if kind is dp.CalibrationError or issubclass(kind, OSError):
+        return None
+    line = text.splitlines()[0][:150] if text else ""
+    if not (kind in (TypeError, ValueError, dp.BoardNotFoundError) or (kind is IndexError and "index" in text)):
+        return f"{kind.__name__}: {line}"
+    if not OWN_WORDS.search(text):
+        return f"a message from the inside, {kind.__name__}: {line}"
+    if not any(re.search(rf"\b{argument}\b", text) for argument in spoilt_ones):
+        return f"a message that does not name {', '.join(spoilt_ones)}: {line}"
+    return None
+
+
+def unsound(answer: Any) -> str | None:
+    """What is wrong with an answer: values that are not finite where `valid` says that they hold, or shapes."""
+    if (
+        isinstance(answer, tuple)
+        and len(answer) > 1
+        and isinstance(answer[-1], Tensor)
+        and answer[-1].dtype == torch.bool
+    ):
+        *parts, valid = answer
+        return next((wrong for part in parts if (wrong := _unsound_where(part, valid))), None)
+    if isinstance(answer, dp.Camera):
+        return _not_finite(K=answer.K, R=answer.R, t=answer.t) or (_singular(answer.K))
+    if isinstance(answer, dp.Plane):
+        zero = (
+            answer.normal.numel()
+            and not answer.normal.is_meta
+            and bool((answer.unit_normal.norm(dim=-1) - 1).abs().amax() > 1e-3)
+        )
+        return _not_finite(normal=answer.normal, offset=answer.offset) or (
+            "a normal without direction" if zero else None
+        )
+    if isinstance(answer, dp.Views):
+        return _not_finite(pixels=answer.pixels)
+    if isinstance(answer, dp.PlaneMap):
+        return _not_finite(matrix=answer.matrix)
+    if isinstance(answer, dp.Measurement):
+        return _unsound_where(answer.points, answer.valid) or _unsound_deviation(answer)
+    if isinstance(answer, dp.Calibration):
+        sound = answer.converged
+        return _unsound_where(answer.camera.K.flatten(-2), sound) or _unsound_where(
+            answer.cameras.t, sound.unsqueeze(-1)
+        )
+    if isinstance(answer, nn.Module):
+        return _not_finite(**dict(answer.named_parameters()), **dict(answer.named_buffers()))
+    if dataclasses.is_dataclass(answer) and isinstance(answer, dp.AccuracyMap):
+        return None
+    return None
+
+
+def _unsound_where(values: Tensor, valid: Tensor) -> str | None:
+    if not isinstance(values, Tensor) or values.is_meta or valid.is_meta:
+        return None
+    if values.shape[: valid.ndim] != valid.shape and values.shape[-2:] != valid.shape[-2:]:
+        return f"shape {tuple(values.shape)} beside valid {tuple(valid.shape)}"
+    if values.shape[: valid.ndim] == valid.shape and not bool(values[valid].isfinite().all()):
+        return "values that are not finite where valid"
+    return None
+
+
+def _unsound_deviation(answer: dp.Measurement) -> str | None:
+    spread = answer.deviations
+    if bool((spread[answer.valid].isnan() | (spread[answer.valid] < 0)).any()):
+        return "deviations that are NaN where valid"
+    return None
+
+
+def _not_finite(**tensors: Tensor) -> str | None:
+    for name, tensor in tensors.items():
+        if not tensor.is_meta and tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            return f"{name} that is not finite"
+    return None
+
+
+def _singular(K: Tensor) -> str | None:
+    if K.is_meta or not K.numel():
+        return None
+    F = K[..., :2, :2]
+    return "K without inverse" if bool((torch.linalg.det(F.double()) == 0).any()) else None
+
+
+# ------------------------------------------------------------------------------------------------------- many calls
+
+
+def attempts(seed: int, numbers: Iterable[int]) -> Iterator[tuple[int, str, str, str]]:
+    """Make calls, and give those with a wrong answer: the number of the attempt, the call, what was spoilt, the fault."""
+    t, every = things(), calls()
+    strangers, names = _strangers(t), list(every)
+    weights = [every[name].weight for name in names]
+    for number in numbers:
+        draw = random.Random(f"{seed} {number}")
+        name = draw.choices(names, weights)[0]
+        call = every[name]
+        arguments = draw.sample(list(call.given), min(len(call.given), 1 if draw.random() < 0.85 else 2))
+        wrong = {argument: spoilt(call.given[argument], draw, strangers) for argument in arguments}
+        fault = tried(name, call, wrong)
+        if fault:
+            yield number, name, ", ".join(f"{key}={_short(value)}" for key, value in wrong.items()), fault
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"tensor{tuple(value.shape)} {value.dtype} {value.device.type}" + (
+            f" {value.flatten()[:4].tolist()}" if not value.is_meta else ""
+        )
+    if isinstance(value, np.ndarray):
+        return f"array{value.shape} {value.dtype} {value.flatten()[:4]}"
+    return repr(value)[:80]
