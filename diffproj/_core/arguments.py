@@ -290,6 +290,8 @@ def booleans(name: str, value: object, device: torch.device | None = None) -> Te
         found = torch.from_numpy(np.array(array, order="C", copy=True)).to(device)
     if found.dtype != torch.bool:
         raise TypeError(f"{name}: want booleans, got {found.dtype}")
+    if found.is_meta and device is not None and device.type != "meta":
+        raise ValueError(f"{name}: want values, got a tensor on the device meta")
     return found
 
 

@@ -84,9 +84,11 @@ class Batched:
             wanted = torch.empty(0, dtype=self.dtype, device=self.device).to(*args, **kwargs)
         except TypeError:
             given = ", ".join(called(value) for value in (*args, *kwargs.values()))
-            raise TypeError(f"dtype: want a torch.dtype, a device, a tensor or two of them, got {given}") from None
-        except (RuntimeError, AssertionError, NotImplementedError) as error:
-            raise ValueError(f"device: want one that is here, got {(*args, *kwargs.values())} ({error})") from None
+            raise TypeError(f"dtype, device: want a torch.dtype, a device or a tensor, got {given}") from None
+        except (RuntimeError, AssertionError, NotImplementedError, ValueError, OverflowError) as error:
+            raise ValueError(
+                f"dtype, device: want ones that are here, got {(*args, *kwargs.values())} ({error})"
+            ) from None
         wanted = at_least_float32(wanted)
         if not wanted.is_floating_point():
             raise TypeError(f"dtype: want a floating-point one, got {wanted.dtype}")
@@ -140,7 +142,8 @@ class Batched:
 
         Raises:
             TypeError: others than this class among them, or different dtypes or kinds of parts.
-            ValueError: none, different constants, or batch shapes that do not broadcast, or no such axis.
+            ValueError: none, different constants, shapes or devices, or batch shapes that do not broadcast, or no such
+                axis.
         """
         items = listing("items", items, f"several {cls.__name__}")
         if not items or not all(isinstance(item, cls) for item in items):
@@ -153,7 +156,13 @@ class Batched:
         except RuntimeError:
             got = ", ".join(str(tuple(item.batch_shape)) for item in items)
             raise ValueError(f"items: batch shapes do not broadcast: {got}") from None
+        if len({item.device for item in items}) > 1:
+            raise ValueError(f"items: want one device, got {sorted({str(item.device) for item in items})}; .to() moves")
         items = [item.expand(*batch) for item in items]
+        for name in cls._tensors:
+            shapes = {tuple(getattr(item, name).shape) for item in items}
+            if len(shapes) > 1:
+                raise ValueError(f"items: want {name} of one shape, got {sorted(shapes)}")
         axes = len(batch) + 1
         dim = whole_number("dim", dim, f"an axis from {-axes} to {axes - 1}", least=-axes, most=axes - 1) % axes
         fields = {name: torch.stack([getattr(item, name) for item in items], dim) for name in cls._tensors}

@@ -61,11 +61,11 @@ class Data:
         visible = views.visible
         self.given_weights, self.weights = None, None
         if weights is not None:
-            given = tensor_of("weights", weights).to(views.device)
+            given = tensor_of("weights", weights)
             if given.is_complex() or given.is_meta:
                 raise TypeError(f"weights: want real numbers, got {given.dtype} on {given.device}")
             try:
-                given = in_float64(given).expand(visible.shape)
+                given = in_float64(given.to(views.device)).expand(visible.shape)
             except RuntimeError:
                 want, got = tuple(visible.shape), tuple(given.shape)
                 raise ValueError(f"weights: want a shape that broadcasts to {want}, got {got}") from None

@@ -8,7 +8,6 @@ import numpy as np
 from torch import Tensor
 
 from diffproj._core.arguments import Array, called, choice, flag, function, number, whole_number, words
-
 from diffproj.calibration.constraints import Priors
 from diffproj.calibration.losses import Loss, check_loss
 from diffproj.calibration.result import Objective

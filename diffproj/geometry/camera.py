@@ -232,11 +232,17 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             >>> pixels.tolist()  # 639 - 370
             [[[269.0, 240.0]]]
         """
-        matrix = check_tensor("matrix", matrix, 3, 3, like=self.K)
-        check_same_kind(camera=self.K, matrix=matrix)
-        broadcast_batches(camera=self.batch_shape, matrix=matrix.shape[:-2])
+        return self.warped_by("matrix", matrix, size)
+
+    def warped_by(
+        self, name: str, matrix: Float[Tensor, "*#batch 3 3"] | Array, size: tuple[int, int] | None = None
+    ) -> "Camera":
+        """The same, for an argument of that name."""
+        matrix = check_tensor(name, matrix, 3, 3, like=self.K)
+        check_same_kind(**{"camera": self.K, name: matrix})
+        broadcast_batches(**{"camera": self.batch_shape, name: matrix.shape[:-2]})
         if has_values(matrix):
-            check_warp(matrix, self.K, behind_lens=self.distortion is not None)
+            check_warp(name, matrix, self.K, behind_lens=self.distortion is not None)
         ahead = self.K[..., :2, 2]
         if self.size is not None:
             ahead = self.K.new_tensor([(side - 1) / 2 for side in self.size])

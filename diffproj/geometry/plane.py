@@ -7,13 +7,14 @@ A plane made of Python numbers alone, such as `Plane.z(0.0)`, has no dtype of it
 in PyTorch's arithmetic it takes on the dtype and device of the camera or points that it meets.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.arguments import Array, instance, meeting, tensor_of
+from diffproj._core.arguments import Array, called, instance, listing, meeting, tensor_of
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
     broadcast_batches,
@@ -156,6 +157,15 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         normal = normal * sign
         return cls.unchecked(normal, dot(normal, centroid))
 
+    @classmethod
+    def stack(cls, items: Sequence["Plane"], dim: int = 0) -> "Plane":
+        """Join several along a new batch axis, as `Batched.stack`; those made of numbers take on the others' dtype."""
+        items = listing("items", items, "several planes")
+        firm = [item.normal for item in items if isinstance(item, cls) and not item.adopts]
+        if firm:
+            items = [item.like(firm[0]) if isinstance(item, cls) else item for item in items]
+        return super().stack(items, dim)
+
     # ------------------------------------------------------------------------------------------------- as a tensor
 
     def to(self, *args: Any, **kwargs: Any) -> "Plane":
@@ -165,7 +175,8 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
 
     def like(self, tensor: Tensor) -> "Plane":
         """The plane ready to meet `tensor`: one made of Python numbers takes on its dtype and device."""
-        instance("tensor", tensor, Tensor, "a tensor")
+        if not (isinstance(tensor, Tensor) and tensor.is_floating_point()):
+            raise TypeError(f"tensor: want one of floating-point type, got {getattr(tensor, 'dtype', called(tensor))}")
         if not self.adopts:
             return self
         return self.unchecked(self.normal.to(tensor), self.offset.to(tensor), self.is_per_point)

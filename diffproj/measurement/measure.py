@@ -110,7 +110,11 @@ def measure(
         blocks, by_theta = [factor * blocks[0]], factor * by_theta
     if plane_covariance is not None:
         plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
-        broadcast_batches(points=batch, plane_covariance=plane_covariance.shape[:-2])
+        if broadcast_batches(points=batch, plane_covariance=plane_covariance.shape[:-2]) != batch:
+            got = tuple(plane_covariance.shape)
+            raise ValueError(
+                f"plane_covariance: want shape (4, 4), or one that broadcasts to {(*batch, 4, 4)}, got {got}"
+            )
         _check_covariance(plane_covariance.detach())
         if plane.is_per_point:
             raise ValueError("plane_covariance: want one plane for all points, got one for each (Plane.per_point)")

@@ -23,7 +23,7 @@ from diffproj._core.arguments import flag
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.cayley import turned
 from diffproj.lens.models import coefficients_of, model_of
-from diffproj.nn.partial import PARTS, GeometryModule, Learn, add_parameter, learned, learned_parts
+from diffproj.nn.partial import PARTS, GeometryModule, Learn, add_parameter, check_has_values, learned, learned_parts
 
 _PARAMETERS = {
     "focal": ("log_focal",),
@@ -78,6 +78,7 @@ class LearnableCamera(GeometryModule):
         super().__init__()
         camera = as_camera(camera).detach()
         check_tied(tied_intrinsics)
+        check_has_values("camera", camera.K)
         self._model = model_of(camera.distortion)
         available = [part for part in PARTS if self._model.count or part != "distortion"]
         chosen = learned_parts(available if learn is None else learn, available)
@@ -149,7 +150,7 @@ def tied_axes(camera: Camera, tied: bool | None) -> list[int]:
         return []
     batch = camera.batch_shape
     axes = [axis for axis in range(len(batch)) if batch[axis] and all(_is_constant(part, axis) for part in parts)]
-    if tied and batch and len(batch) - 1 not in axes:
+    if tied and batch and batch[-1] and len(batch) - 1 not in axes:
         raise ValueError("tied_intrinsics: want one K and one lens for all poses, got different ones")
     return axes
 

@@ -58,17 +58,18 @@ class PlaneLoss(nn.Module):
         """
         points = check_tensor("points", points, "N", 3, like=target if isinstance(target, Tensor) else None)
         target = _fitting("target", check_tensor("target", target, "N", 3, like=points), points)
-        counts = torch.ones_like(points[..., 0], dtype=torch.bool)
+        each = points[..., 0]
+        counts = torch.ones_like(each, dtype=torch.bool)
         if valid is not None:
-            counts = _fitting("valid", booleans("valid", valid, points.device), counts)
+            counts = _fitting("valid", booleans("valid", valid, points.device), each)
         off = torch.where(counts.unsqueeze(-1), points - target.to(points), 0.0)
         if resolution is not None:
-            resolution = _fitting("resolution", check_tensor("resolution", resolution, like=points), counts)
+            resolution = _fitting("resolution", check_tensor("resolution", resolution, like=points), each)
             off = off / torch.where(counts, resolution, 1.0).detach().unsqueeze(-1).to(off)
         value = off.square().sum(-1)
         value = value if self.loss is None else self.loss.value(value)
         if weights is not None:
-            weights = _fitting("weights", check_tensor("weights", weights, like=points), counts)
+            weights = _fitting("weights", check_tensor("weights", weights, like=points), each)
             value = value * weights.to(value)
         return value.mean()
 

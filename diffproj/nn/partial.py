@@ -47,6 +47,16 @@ class GeometryModule(nn.Module):
             return super()._apply(convert, recurse)
 
 
+def check_has_values(name: str, tensor: Tensor) -> None:
+    """Check that what is to be learned starts somewhere.
+
+    Raises:
+        ValueError: it is on the meta device.
+    """
+    if tensor.is_meta:
+        raise ValueError(f"{name}: want values to start from, got one on the device meta")
+
+
 def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
     """From each part that is learned to True, or to the booleans that say for which elements of the batch.
 
@@ -84,7 +94,7 @@ def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, b
         ValueError: `where` does not broadcast to the batch shape, or differs along an axis with one shared value.
     """
     zero = torch.zeros_like(like, memory_format=torch.contiguous_format)
-    mask = booleans("learn", where).to(like.device)
+    mask = booleans("learn", where).cpu()
     try:
         mask = mask.expand(batch)
     except RuntimeError:
@@ -107,7 +117,7 @@ def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, b
                 )
             mask = first
     module.masked.add(name)
-    module.register_buffer(f"{name}_learned", mask.unsqueeze(-1).to(like.dtype))
+    module.register_buffer(f"{name}_learned", mask.unsqueeze(-1).to(like))
 
 
 def learned(module: GeometryModule, name: str) -> Tensor:

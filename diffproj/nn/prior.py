@@ -92,6 +92,8 @@ class CalibrationPrior(GeometryModule):
         lens, wanted = model_of(camera.distortion).name, self.parametrisation.lens
         if lens != wanted:
             raise ValueError(f"camera: want the calibration's lens model {wanted!r}, got {lens!r}")
+        if camera.device != self.center.device:
+            raise ValueError(f"camera: want device {self.center.device} as the prior has, got {camera.device}")
         off = self._vector(camera) - self.center
         return (off * (self.precision * off.unsqueeze(-2)).sum(-1)).sum(-1) / 2
 

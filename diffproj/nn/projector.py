@@ -102,7 +102,7 @@ class PlaneProjector(nn.Module):
         with torch.autocast(self.geometry.device.type, enabled=False):
             if warp is None and plane is None:
                 return self.geometry()(pixels)
-            camera = self.camera if warp is None else self.camera.warped(warp)
+            camera = self.camera if warp is None else self.camera.warped_by("warp", warp)
             return PlaneMap(camera, self.plane if plane is None else plane)(pixels)
 
     def extra_repr(self) -> str:

@@ -123,8 +123,9 @@ def run_experiment(
     if as_views(test, "test").batch_shape or fit.batch_shape:
         batch = tuple(fit.batch_shape), tuple(test.batch_shape)
         raise ValueError(f"fit, test: want views of one camera, got batch shapes {batch[0]} and {batch[1]}")
-    if len(test) == 0:
-        raise ValueError("test: want at least one view, got none")
+    for name, views in (("fit", fit), ("test", test)):
+        if len(views) == 0:
+            raise ValueError(f"{name}: want at least one view, got none")
     as_board(board)
     strict = flag("strict", strict)
     calibration = calibrate(fit, board, distortion)

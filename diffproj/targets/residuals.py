@@ -120,4 +120,6 @@ def _posed(camera: Camera | PinholeCamera, views: Views, target: Target) -> tupl
     if len(points) != views.pixels.shape[-2]:
         raise ValueError(f"views: want {len(points)} corners in each as the target has, got {views.pixels.shape[-2]}")
     broadcast_batches(camera=camera.batch_shape[:-1], views=views.batch_shape)
+    if camera.K.is_meta != views.pixels.is_meta:
+        raise ValueError(f"camera, views: want both with values, got devices {camera.device} and {views.device}")
     return camera, points

@@ -146,7 +146,7 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
             >>> fit
             Views(5 views of 54 corners (135 hidden), torch.float32)
         """
-        hidden = booleans("mask", mask).to(self.device)
+        hidden = booleans("mask", mask, self.device).to(self.device)
         try:
             visible = self.visible & ~hidden.expand(self.visible.shape)
         except RuntimeError:

@@ -145,7 +145,10 @@ def _geometry(t: Things) -> dict[str, Call]:
         "Camera.rays": Call(c.rays, {"pixels": p}),
         "Camera[]": Call(t.cameras.__getitem__, {"index": 2}),
         "Camera.to": Call(lambda dtype: c.to(dtype), {"dtype": torch.float32}),
-        "Camera.expand": Call(lambda batch_shape: c.expand(*batch_shape), {"batch_shape": (2, 3)}),
+        "Camera.expand": Call(
+            lambda batch_shape: c.expand(*(batch_shape if isinstance(batch_shape, tuple) else (batch_shape,))),
+            {"batch_shape": (2, 3)},
+        ),
         "Camera.stack": Call(dp.Camera.stack, {"items": [c, c], "dim": 0}),
         "Plane": Call(dp.Plane, {"normal": [0.0, 0.1, 1], "offset": 2.0}, 20),
         "Plane.z": Call(dp.Plane.z, {"offset": 1.0}),

@@ -220,6 +220,15 @@ def _spoilt_object(value: Any, draw: random.Random) -> Any:
 
 OWN_WORDS = re.compile(r"\bwant\b|do not broadcast|no such file|found no board|determine|converge|views|explains")
 """What the package's own messages say."""
+RELATION = re.compile(r"broadcast|\bas \w+ has\b|device|batch shape|corners in each|fit\b")
+"""What they say of two arguments that do not fit together."""
+ALIASES = {
+    "photographs": r"photographs|image \d+",
+    "test": r"test|views",
+    "fit": r"fit|views",
+    "board": r"board|target",
+}
+"""Other names that a message may give to an argument, where one function hands it to another."""
 
 
 class HangError(Exception):
@@ -243,7 +252,7 @@ def tried(name: str, call: Call, spoilt_ones: dict[str, Any]) -> str | None:
     except HangError:
         return "hangs"
     except Exception as error:  # noqa: BLE001
-        return _about(error, name, spoilt_ones)
+        return _about(error, call, spoilt_ones)
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, previous)
@@ -252,16 +261,20 @@ def tried(name: str, call: Call, spoilt_ones: dict[str, Any]) -> str | None:
     return unsound(answer)
 
 
-def _about(error: Exception, name: str, spoilt_ones: dict[str, Any]) -> str | None:
+def _about(error: Exception, call: Call, spoilt_ones: dict[str, Any]) -> str | None:
     text, kind = str(error), type(error)
     if kind is dp.CalibrationError or issubclass(kind, OSError):
         return None
+    if any(callable(value) and argument in ("progress", "function") for argument, value in spoilt_ones.items()):
+        return None  # what a user's own function raises is the user's
     line = text.splitlines()[0][:150] if text else ""
-    if not (kind in (TypeError, ValueError, dp.BoardNotFoundError) or (kind is IndexError and "index" in text)):
+    if not (kind in (TypeError, ValueError, dp.BoardNotFoundError) or (kind is IndexError and "want" in text)):
         return f"{kind.__name__}: {line}"
     if not OWN_WORDS.search(text):
         return f"a message from the inside, {kind.__name__}: {line}"
-    if not any(re.search(rf"\b{argument}\b", text) for argument in spoilt_ones):
+    named = [argument for argument in call.given if re.search(rf"\b{ALIASES.get(argument, argument)}\b", text)]
+    # A message about two arguments that do not fit together may begin with either.
+    if not named or (not set(named) & set(spoilt_ones) and not RELATION.search(text)):
         return f"a message that does not name {', '.join(spoilt_ones)}: {line}"
     return None
 
@@ -295,9 +308,7 @@ def unsound(answer: Any) -> str | None:
         return _unsound_where(answer.points, answer.valid) or _unsound_deviation(answer)
     if isinstance(answer, dp.Calibration):
         sound = answer.converged
-        return _unsound_where(answer.camera.K.flatten(-2), sound) or _unsound_where(
-            answer.cameras.t, sound.unsqueeze(-1)
-        )
+        return _unsound_where(answer.camera.K, sound) or _unsound_where(answer.cameras.t, sound)
     if isinstance(answer, nn.Module):
         return _not_finite(**dict(answer.named_parameters()), **dict(answer.named_buffers()))
     if dataclasses.is_dataclass(answer) and isinstance(answer, dp.AccuracyMap):
