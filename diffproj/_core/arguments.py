@@ -39,7 +39,7 @@ class Kind(Protocol):
 def called(value: object) -> str:
     """What a message calls something: numbers and short strings by value, the rest by type, and shape if it has one."""
     if value is None or isinstance(value, str | bytes | int | float | complex | np.generic):
-        text = repr(value)
+        text = repr(value.item() if isinstance(value, np.generic) else value)
         return text if len(text) <= 60 else f"a long {type(value).__name__}"
     if isinstance(value, type):
         return f"the class {value.__name__}"
@@ -296,7 +296,7 @@ def booleans(name: str, value: object, device: torch.device | None = None) -> Te
 
 
 def meeting(*values: object) -> Kind | None:
-    """The first of these that has a dtype of floating-point type and a device: what arrays among them are to be like."""
+    """The first of these that has a floating-point dtype and a device: what arrays among them are to be like."""
     for value in values:
         if isinstance(value, Tensor):
             if value.is_floating_point():

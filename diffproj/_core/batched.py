@@ -149,6 +149,7 @@ class Batched:
         if not items or not all(isinstance(item, cls) for item in items):
             got = ", ".join(sorted({type(item).__name__ for item in items})) or "none"
             raise (TypeError if items else ValueError)(f"items: want at least one {cls.__name__}, got {got}")
+        items = cls._alike(items)
         if len({item.dtype for item in items}) > 1:
             raise TypeError(f"items: want one dtype, got {sorted({str(item.dtype) for item in items})}; .to() converts")
         try:
@@ -168,6 +169,11 @@ class Batched:
         fields = {name: torch.stack([getattr(item, name) for item in items], dim) for name in cls._tensors}
         fields |= {name: _stacked(name, [getattr(item, name) for item in items], dim) for name in cls._parts}
         return cls.unchecked(**fields, **{name: cls._agreed(name, items) for name in cls._constants})
+
+    @classmethod
+    def _alike(cls, items: list[Any]) -> list[Any]:
+        """The items that are to be stacked, those that adapt to others adapted."""
+        return items
 
     @classmethod
     def _agreed(cls: type[B], name: str, items: Sequence[B]) -> Any:

@@ -77,9 +77,8 @@ def check_same_kind(**tensors: Kind | None) -> None:
     (first, reference), *others = present
     for name, tensor in others:
         if tensor.dtype != reference.dtype:
-            raise TypeError(
-                f"{name}: want {reference.dtype} as {first} has, got {tensor.dtype}; {name}.to({reference.dtype}) converts"
-            )
+            want = reference.dtype
+            raise TypeError(f"{name}: want {want} as {first} has, got {tensor.dtype}; {name}.to({want}) converts")
         if tensor.device != reference.device:
             raise ValueError(f"{name}: want device {reference.device} as {first} has, got {tensor.device}")
 

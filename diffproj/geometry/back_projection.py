@@ -159,7 +159,7 @@ class PlaneMap:
         direction, seen = self.camera.directions(pixels)
         return list(direction.unbind(-1)), seen
 
-    def _checked(self, pixels: Tensor) -> Tensor:
+    def _checked(self, pixels: Tensor | Array) -> Tensor:
         if self.is_per_point:
             pixels = tensor_of("pixels", pixels, self.camera.K)
             pixels = pixels.unsqueeze(-2) if pixels.ndim >= 2 else pixels

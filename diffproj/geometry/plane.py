@@ -7,14 +7,13 @@ A plane made of Python numbers alone, such as `Plane.z(0.0)`, has no dtype of it
 in PyTorch's arithmetic it takes on the dtype and device of the camera or points that it meets.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.arguments import Array, called, instance, listing, meeting, tensor_of
+from diffproj._core.arguments import Array, called, instance, meeting, tensor_of
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
     broadcast_batches,
@@ -158,13 +157,10 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         return cls.unchecked(normal, dot(normal, centroid))
 
     @classmethod
-    def stack(cls, items: Sequence["Plane"], dim: int = 0) -> "Plane":
-        """Join several along a new batch axis, as `Batched.stack`; those made of numbers take on the others' dtype."""
-        items = listing("items", items, "several planes")
-        firm = [item.normal for item in items if isinstance(item, cls) and not item.adopts]
-        if firm:
-            items = [item.like(firm[0]) if isinstance(item, cls) else item for item in items]
-        return super().stack(items, dim)
+    def _alike(cls, items: list[Any]) -> list[Any]:
+        """Those made of Python numbers take on the dtype and device of the others."""
+        firm = [item.normal for item in items if not item.adopts]
+        return [item.like(firm[0]) for item in items] if firm else items
 
     # ------------------------------------------------------------------------------------------------- as a tensor
 

@@ -169,7 +169,7 @@ def _at_view(calibration: Calibration, view: int | str) -> tuple[Camera, Tensor 
     return calibration.cameras[..., number], known, level, middle
 
 
-def _expanded(pixel_sigma: float | Tensor | None, like: Tensor) -> Tensor:
+def _expanded(pixel_sigma: float | Tensor | Array | None, like: Tensor) -> Tensor:
     """The standard deviation of each pixel `(*B, N)`, for points `(*B, N, 3)`."""
     sigma = check_tensor("pixel_sigma", pixel_sigma, like=like).to(like)
     try:

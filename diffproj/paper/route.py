@@ -12,7 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.arguments import Array, number
-from diffproj._core.numerics import check_same_kind, transform
+from diffproj._core.numerics import broadcast_batches, check_same_kind, transform
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane, as_plane
 
@@ -51,6 +51,7 @@ def paper_route(
     plane = as_plane(plane).like(camera.K)
     check_same_kind(camera=camera.K, plane=plane.normal)
     pixels = camera._checked("pixels", pixels, 2)
+    broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape, pixels=pixels.shape[:-2])
     focal_length = number("focal_length", focal_length, "a length in world units, above 0", above=0)
     n, d = plane.normal.unsqueeze(-2), plane.offset.unsqueeze(-1)
     R, T = camera.R, camera.t.unsqueeze(-2)

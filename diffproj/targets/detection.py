@@ -22,6 +22,9 @@ SMALLEST_WINDOW = 2
 LARGE = 1600
 """Longer side in px above which detection that fails is repeated at half the size."""
 
+SMALLEST = 16
+"""Shorter side in px of an image that is searched: less has no room for four squares, and OpenCV refuses it."""
+
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
 
@@ -131,6 +134,8 @@ def find_corners(image: Shaped[np.ndarray, "h w"], board: Chessboard) -> Float[n
 
 def _rough_corners(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Float32[np.ndarray, "n 2"] | None:
     """OpenCV's detector; where it fails on a large photograph, again at half the size, and so on."""
+    if min(image.shape) < SMALLEST:
+        return None
     found, corners = cv2.findChessboardCorners(image, board.size)
     if found:
         return corners.reshape(-1, 2)  # OpenCV 4 gives (N, 1, 2), OpenCV 5 (N, 2)

@@ -245,6 +245,8 @@ def _sized(camera: Camera | PinholeCamera) -> Camera:
     camera = as_camera(camera)
     if camera.size is None:
         raise ValueError("camera: want a size, got None; give Camera(..., size=(width, height))")
+    if camera.K.is_meta:
+        raise ValueError("camera: want one with values, got one on the device meta")
     return camera
 
 

@@ -818,7 +818,7 @@ def test_bad_input_is_refused_by_name() -> None:
             "weights: want finite numbers of at least 0",
             lambda: dp.calibrate(views, board, weights=-torch.ones(54)),
         ),
-        (ValueError, "objective: want one of image, plane", lambda: dp.calibrate(views, board, objective="both")),
+        (ValueError, "objective: want one of 'image', 'plane'", lambda: dp.calibrate(views, board, objective="both")),
         (
             ValueError,
             "bow: want False with objective='plane'",

@@ -301,7 +301,7 @@ def test_bad_input_is_refused_by_name(calibration: dp.Calibration) -> None:
     pixels = calibration.views.pixels[0, :2]
     with pytest.raises(ValueError, match="view: want one of left01.jpg, .* got 'left99.jpg'"):
         dp.measure(pixels, calibration, Z, view="left99.jpg")
-    with pytest.raises(ValueError, match="view: want a number below 13, got 13"):
+    with pytest.raises(ValueError, match="view: want a number from -13 to 12, of the views, got 13"):
         dp.measure(pixels, calibration, Z, view=13)
     with pytest.raises(ValueError, match="pixel_sigma: want the noise of the pixels"):
         dp.measure(pixels, calibration.cameras[0], Z)

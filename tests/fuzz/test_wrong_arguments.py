@@ -1,6 +1,13 @@
-"""Every public call with arguments that are right, so that each can be spoilt: small problems, which take milliseconds."""
+"""Whatever the public calls are given: the right answer, or an error that names the argument and says what it wants.
 
+Every call is listed here with arguments that are right, small problems that take milliseconds. One or two of them are
+spoilt by chance, and `conftest.py` looks at what comes of it.
+"""
+
+import decimal
 import functools
+import inspect
+import math
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -8,10 +15,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 import torch
 
 import diffproj as dp
 from diffproj.nn.fixed_map import FixedMap
+
+pytestmark = pytest.mark.plain  # checks of types at run time would answer first
 
 D = torch.float64
 
@@ -90,6 +100,61 @@ def things() -> Things:
         dp.run_experiment(views[:3], views[3:], board, "none"),
         torch.tensor(np.kron(np.indices((6, 7)).sum(0) % 2, np.ones((12, 12))) * 200, dtype=torch.uint8),
     )
+
+
+def strangers(t: Things) -> list[Any]:
+    """Things of any type."""
+    numbers = [0, 1, -1, 5, 2.5, -0.5, 1e-12, 1e300, math.nan, math.inf, -math.inf, 10**30, True, False, 3j]
+    arrays = [
+        np.zeros(3),
+        np.zeros((0, 2)),
+        np.array("x"),
+        np.array([1, "a"], dtype=object),
+        np.float64(0.3),
+        np.int64(2),
+    ]
+    tensors = [
+        torch.zeros(0), torch.zeros(3), torch.zeros(2, 2), torch.zeros(0, 2, dtype=D), torch.tensor(1.5), torch.eye(3),
+        torch.tensor(math.nan), torch.tensor([1, 2]), torch.tensor([True, False]), torch.zeros(3, 2, dtype=torch.complex64),
+        torch.zeros(3, 2, dtype=torch.half), torch.zeros(3, 2, device="meta", dtype=D), torch.zeros(2, 3, 3, dtype=D),
+    ]  # fmt: skip
+    plain = [
+        None,
+        "",
+        "x",
+        "left",
+        b"x",
+        [],
+        (),
+        {},
+        [1, 2],
+        (1, 2, 3),
+        [[1, 2], [3]],
+        ["a"],
+        [None],
+        {"a": 1},
+        {1, 2},
+        range(3),
+    ]
+    odd = [
+        object(),
+        int,
+        len,
+        decimal.Decimal("0.5"),
+        Path("nowhere"),
+        slice(1),
+        ...,
+        iter([1, 2]),
+        torch.float32,
+        torch.int64,
+    ]
+    own = [
+        t.camera, t.cameras, t.lens, t.fisheye, t.plane, t.planes, dp.Plane.per_point([0, 0, 1.0], torch.zeros(3, dtype=D)),
+        t.board, t.views, t.views[:0], t.views[:1], t.calibration, t.many, t.located, t.measured, t.accuracy, t.experiment,
+        t.calibration.covariance, t.measured.lengths(), dp.Huber(1.0), dp.Camera, dp.Camera(t.K), dp.PlaneMap(t.camera, t.plane),
+        dp.Camera(t.K, size=(128, 96)).to_kornia(), dp.Camera(torch.eye(3)), dp.Chessboard(5, 4), dp.Status.CONVERGED,
+    ]  # fmt: skip
+    return [*numbers, *arrays, *tensors, *plain, *odd, *own]
 
 
 @functools.cache
@@ -328,3 +393,97 @@ def _uses(t: Things) -> dict[str, Call]:
 
 def print_nothing(*_: object) -> None:
     """A function for progress."""
+
+
+# ------------------------------------------------------------------------------------------------------- the tests
+
+OTHER = {
+    "Lens",  # protocols, and what they ask of users' own classes
+    "Loss",
+    "LensComparison",  # results that are made inside
+    "Calibration",
+    "Covariance",
+    "CrossValidation",
+    "Experiment",
+    "AccuracyMap",
+    "Measurement",
+    "PaperSetup",
+    "Quantity",
+    "Reason",
+    "Status",
+}
+"""Classes that users do not build by hand."""
+
+
+def test_the_list_is_whole() -> None:
+    """No public function, class or method with an argument is missing."""
+    wanted = set()
+    for name in dp.__all__:
+        thing = getattr(dp, name)
+        if not inspect.isclass(thing):
+            wanted.add(name)
+        elif not issubclass(thing, BaseException | dict) and not inspect.isabstract(thing):
+            wanted |= {name} - OTHER
+            wanted |= {f"{name}.{method}" for method in vars(thing) if _has_arguments(thing, method)}
+    for module in (dp.synthetic, dp.figures):
+        wanted |= {f"{module.__name__.rsplit('.', 1)[1]}.{name}" for name in vars(module) if _is_own(module, name)}
+    listed = {name.split()[0].replace("()", ".forward") for name in calls()}
+    listed |= {name.removesuffix(".forward") for name in listed}
+    assert sorted(wanted - listed - NOT_CALLED) == []
+
+
+NOT_CALLED = {
+    "Camera.unchecked",  # which look at nothing, for parts that were looked at
+    "Plane.unchecked",
+    "Views.unchecked",
+    "PlaneMap.unchecked",
+    "Camera.warped_by",
+    "Covariance.from_fields",  # of files
+    "SoftL1.value",  # as Huber's and Cauchy's
+    "SoftL1.weight",
+    "Cauchy.value",
+    "Huber.weight",
+    "Lens.project_direction",
+    "Lens.unproject",
+    "Lens.to",
+    "Lens.expand",
+    "Loss.value",
+    "Loss.weight",
+    "BrownConrady.turned",
+    "KannalaBrandt.turned",
+    "Plane.to",  # as Camera's
+    "figures.png",
+}
+
+
+def _has_arguments(kind: type, method: str) -> bool:
+    function = inspect.getattr_static(kind, method)
+    function = getattr(function, "__func__", function)
+    if method.startswith("_") or not inspect.isfunction(function):
+        return False
+    return len(inspect.signature(function).parameters) > 1
+
+
+def _is_own(module: Any, name: str) -> bool:
+    thing = getattr(module, name)
+    return inspect.isfunction(thing) and thing.__module__ == module.__name__ and not name.startswith("_")
+
+
+def test_calls_are_right_as_they_are_listed(hostile: Any) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name, call in calls().items():
+            if name != "register_lens":
+                assert call.function(**call.given) is not NotImplemented, name
+
+
+def test_wrong_arguments(hostile: Any) -> None:
+    each = hostile(calls(), strangers(things()))
+    assert [fault for number in range(600) if (fault := each.attempt(0, number))] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 11))
+def test_many_wrong_arguments(hostile: Any, seed: int) -> None:
+    each = hostile(calls(), strangers(things()))
+    assert [fault for number in range(5000) if (fault := each.attempt(seed, number))] == []

@@ -1,24 +1,20 @@
 """Arguments that are wrong in some way, and a look at what a call makes of them."""
 
-import dataclasses
-import decimal
 import math
 import random
 import re
 import signal
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from types import FrameType
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor, nn
 
 import diffproj as dp
-
-from .catalogue import Call, Things, calls, things
 
 SECONDS = 20
 """After which a call counts as hanging."""
@@ -27,61 +23,6 @@ D = torch.float64
 
 
 # ------------------------------------------------------------------------------------------------- wrong arguments
-
-
-def _strangers(t: Things) -> list[Any]:
-    """Things of any type."""
-    numbers = [0, 1, -1, 5, 2.5, -0.5, 1e-12, 1e300, math.nan, math.inf, -math.inf, 10**30, True, False, 3j]
-    arrays = [
-        np.zeros(3),
-        np.zeros((0, 2)),
-        np.array("x"),
-        np.array([1, "a"], dtype=object),
-        np.float64(0.3),
-        np.int64(2),
-    ]
-    tensors = [
-        torch.zeros(0), torch.zeros(3), torch.zeros(2, 2), torch.zeros(0, 2, dtype=D), torch.tensor(1.5), torch.eye(3),
-        torch.tensor(math.nan), torch.tensor([1, 2]), torch.tensor([True, False]), torch.zeros(3, 2, dtype=torch.complex64),
-        torch.zeros(3, 2, dtype=torch.half), torch.zeros(3, 2, device="meta", dtype=D), torch.zeros(2, 3, 3, dtype=D),
-    ]  # fmt: skip
-    plain = [
-        None,
-        "",
-        "x",
-        "left",
-        b"x",
-        [],
-        (),
-        {},
-        [1, 2],
-        (1, 2, 3),
-        [[1, 2], [3]],
-        ["a"],
-        [None],
-        {"a": 1},
-        {1, 2},
-        range(3),
-    ]
-    odd = [
-        object(),
-        int,
-        len,
-        decimal.Decimal("0.5"),
-        Path("nowhere"),
-        slice(1),
-        ...,
-        iter([1, 2]),
-        torch.float32,
-        torch.int64,
-    ]
-    own = [
-        t.camera, t.cameras, t.lens, t.fisheye, t.plane, t.planes, dp.Plane.per_point([0, 0, 1.0], torch.zeros(3, dtype=D)),
-        t.board, t.views, t.views[:0], t.views[:1], t.calibration, t.many, t.located, t.measured, t.accuracy, t.experiment,
-        t.calibration.covariance, t.measured.lengths(), dp.Huber(1.0), dp.Camera, dp.Camera(t.K), dp.PlaneMap(t.camera, t.plane),
-        dp.Camera(t.K, size=(128, 96)).to_kornia(), dp.Camera(torch.eye(3)), dp.Chessboard(5, 4), dp.Status.CONVERGED,
-    ]  # fmt: skip
-    return [*numbers, *arrays, *tensors, *plain, *odd, *own]
 
 
 def spoilt(value: Any, draw: random.Random, strangers: Sequence[Any]) -> Any:
@@ -220,7 +161,7 @@ def _spoilt_object(value: Any, draw: random.Random) -> Any:
 
 OWN_WORDS = re.compile(r"\bwant\b|do not broadcast|no such file|found no board|determine|converge|views|explains")
 """What the package's own messages say."""
-RELATION = re.compile(r"broadcast|\bas \w+ has\b|device|batch shape|corners in each|fit\b")
+RELATION = re.compile(r"broadcast|\bas \w+ has\b|device|batch shape|corners in each|fit\b|an axis from")
 """What they say of two arguments that do not fit together."""
 ALIASES = {
     "photographs": r"photographs|image \d+",
@@ -235,7 +176,7 @@ class HangError(Exception):
     """A call that took too long."""
 
 
-def tried(name: str, call: Call, spoilt_ones: dict[str, Any]) -> str | None:
+def tried(call: Any, spoilt_ones: dict[str, Any]) -> str | None:
     """Call with some arguments replaced; `None`, or what is wrong about the answer, in a line."""
     given = {**call.given, **spoilt_ones}
     versions = {id(x): x._version for x in given.values() if isinstance(x, Tensor) and not x.is_inference()}
@@ -251,7 +192,7 @@ def tried(name: str, call: Call, spoilt_ones: dict[str, Any]) -> str | None:
             answer = call.function(**given)
     except HangError:
         return "hangs"
-    except Exception as error:  # noqa: BLE001
+    except Exception as error:
         return _about(error, call, spoilt_ones)
     finally:
         signal.alarm(0)
@@ -261,7 +202,7 @@ def tried(name: str, call: Call, spoilt_ones: dict[str, Any]) -> str | None:
     return unsound(answer)
 
 
-def _about(error: Exception, call: Call, spoilt_ones: dict[str, Any]) -> str | None:
+def _about(error: Exception, call: Any, spoilt_ones: dict[str, Any]) -> str | None:
     text, kind = str(error), type(error)
     if kind is dp.CalibrationError or issubclass(kind, OSError):
         return None
@@ -311,8 +252,6 @@ def unsound(answer: Any) -> str | None:
         return _unsound_where(answer.camera.K, sound) or _unsound_where(answer.cameras.t, sound)
     if isinstance(answer, nn.Module):
         return _not_finite(**dict(answer.named_parameters()), **dict(answer.named_buffers()))
-    if dataclasses.is_dataclass(answer) and isinstance(answer, dp.AccuracyMap):
-        return None
     return None
 
 
@@ -350,20 +289,32 @@ def _singular(K: Tensor) -> str | None:
 # ------------------------------------------------------------------------------------------------------- many calls
 
 
-def attempts(seed: int, numbers: Iterable[int]) -> Iterator[tuple[int, str, str, str]]:
-    """Make calls, and give those with a wrong answer: the number of the attempt, the call, what was spoilt, the fault."""
-    t, every = things(), calls()
-    strangers, names = _strangers(t), list(every)
-    weights = [every[name].weight for name in names]
-    for number in numbers:
-        draw = random.Random(f"{seed} {number}")
-        name = draw.choices(names, weights)[0]
-        call = every[name]
+class Hostile:
+    """Calls with spoilt arguments.
+
+    Args:
+        calls: by name, each with `function`, its arguments by name as `given`, and `weight`: how often it is tried.
+        strangers: things of any type that may stand for an argument.
+    """
+
+    def __init__(self, calls: Mapping[str, Any], strangers: Sequence[Any]) -> None:
+        self.calls, self.strangers = calls, strangers
+
+    def attempt(self, seed: int, number: int) -> str | None:
+        """One call, drawn by chance; `None`, or what is wrong about its answer, in a line."""
+        draw = random.Random(f"{seed} {number}")  # noqa: S311
+        (name,) = draw.choices(list(self.calls), [call.weight for call in self.calls.values()])
+        call = self.calls[name]
         arguments = draw.sample(list(call.given), min(len(call.given), 1 if draw.random() < 0.85 else 2))
-        wrong = {argument: spoilt(call.given[argument], draw, strangers) for argument in arguments}
-        fault = tried(name, call, wrong)
-        if fault:
-            yield number, name, ", ".join(f"{key}={_short(value)}" for key, value in wrong.items()), fault
+        wrong = {argument: spoilt(call.given[argument], draw, self.strangers) for argument in arguments}
+        fault = tried(call, wrong)
+        return fault and f"{number}: {name}({', '.join(f'{key}={_short(x)}' for key, x in wrong.items())}): {fault}"
+
+
+@pytest.fixture(scope="session")
+def hostile() -> type[Hostile]:
+    """What makes calls with wrong arguments."""
+    return Hostile
 
 
 def _short(value: Any) -> str:
