@@ -259,9 +259,8 @@ def as_plane(plane: Plane) -> Plane:
     """
     if isinstance(plane, Plane):
         return plane
-    return instance(
-        "plane", plane, Plane, "a dp.Plane", "dp.Plane(normal, offset) makes one, dp.Plane.z(0.0) the board"
-    )
+    remedy = "dp.Plane(normal, offset) makes one, dp.Plane.z(0.0) the board's"
+    return instance("plane", plane, Plane, "a dp.Plane", remedy)
 
 
 def _as_tensors(normal: Any, offset: Any) -> tuple[Tensor, Tensor]:
