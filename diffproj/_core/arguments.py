@@ -22,6 +22,8 @@ from torch import Tensor
 Array = np.ndarray | Sequence[Any]
 """What is taken in the place of a tensor: an array, or (nested) lists of numbers."""
 
+_ARRAYS = (list, tuple, float, int, np.ndarray, np.generic)
+
 T = TypeVar("T")
 
 
@@ -254,7 +256,7 @@ def tensor_of(name: str, value: object, like: Kind | None = None) -> Tensor:
     """
     if isinstance(value, Tensor):
         return value
-    taken = isinstance(value, np.ndarray | np.generic | int | float | list | tuple) or hasattr(value, "__array__")
+    taken = isinstance(value, _ARRAYS) or hasattr(value, "__array__")
     try:
         array = np.asarray(value) if taken and not isinstance(value, type | bool) else np.asarray(None)
     except (TypeError, ValueError, RuntimeError):  # lists of several lengths, tensors with a graph
@@ -265,9 +267,11 @@ def tensor_of(name: str, value: object, like: Kind | None = None) -> Tensor:
     if array.dtype.kind not in "fiu":
         what = f"{called(value)} with {array.dtype}" if taken and array.dtype.kind != "O" else called(value)
         raise TypeError(f"{name}: want a tensor, an array or numbers, got {what}")
-    keeps = isinstance(value, np.ndarray | np.generic) and array.dtype in (np.float16, np.float32)
+    keeps = array.dtype.kind == "f" and array.dtype.itemsize <= 4  # lists have given float64
     tensor = torch.from_numpy(np.array(array, np.float32 if keeps else np.float64, order="C", copy=True))
-    return tensor if like is None else tensor.to(like.device, like.dtype)
+    if like is None or (tensor.dtype == like.dtype and tensor.device == like.device):
+        return tensor
+    return tensor.to(like.device, like.dtype)
 
 
 def booleans(name: str, value: object, device: torch.device | None = None) -> Tensor:

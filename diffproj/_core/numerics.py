@@ -56,13 +56,14 @@ def check_tensor(name: str, value: object, *shape: int | str, like: Kind | None 
         value = tensor_of(name, value, like)
     if not value.is_floating_point():
         raise TypeError(f"{name}: want a floating-point tensor, got {value.dtype}; .double() or .float() makes one")
-    fits = value.ndim >= len(shape) and all(
-        isinstance(want, str) or want == got
-        for want, got in zip(shape, value.shape[value.ndim - len(shape) :], strict=True)
-    )
-    if not fits:
-        want = ", ".join(["*B", *map(str, shape)])
-        raise ValueError(f"{name}: want shape ({want}), got {tuple(value.shape)}")
+    if shape:
+        fits = value.ndim >= len(shape) and all(
+            isinstance(want, str) or want == got
+            for want, got in zip(shape, value.shape[value.ndim - len(shape) :], strict=True)
+        )
+        if not fits:
+            want = ", ".join(["*B", *map(str, shape)])
+            raise ValueError(f"{name}: want shape ({want}), got {tuple(value.shape)}")
     return at_least_float32(value)
 
 

@@ -40,6 +40,13 @@ class _Scaled:
         object.__setattr__(self, "scale", scale)
 
 
+def _checked(squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Squared residuals; one look where they are a tensor, for the solver asks often."""
+    if isinstance(squared, Tensor) and squared.is_floating_point():
+        return squared
+    return check_tensor("squared", squared)
+
+
 class Huber(_Scaled):
     """Quadratic up to `scale`, linear beyond: the influence of an outlier is bounded by that of a residual of `scale`.
 
@@ -50,13 +57,13 @@ class Huber(_Scaled):
 
     def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`e2`, and `2 scale |e| - scale^2` beyond `scale`."""
-        squared = check_tensor("squared", squared)
+        squared = _checked(squared)
         far = squared > self.scale**2
         return torch.where(far, 2 * self.scale * torch.where(far, squared, 1).sqrt() - self.scale**2, squared)
 
     def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """1, and `scale / |e|` beyond `scale`."""
-        squared = check_tensor("squared", squared)
+        squared = _checked(squared)
         far = squared > self.scale**2
         return torch.where(far, self.scale / torch.where(far, squared, 1).sqrt(), torch.ones_like(squared))
 
@@ -71,12 +78,12 @@ class SoftL1(_Scaled):
 
     def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`2 scale^2 (sqrt(1 + e2 / scale^2) - 1)`, without cancellation."""
-        squared = check_tensor("squared", squared)
+        squared = _checked(squared)
         return 2 * squared / (1 + (1 + squared / self.scale**2).sqrt())
 
     def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`1 / sqrt(1 + e2 / scale^2)`."""
-        return (1 + check_tensor("squared", squared) / self.scale**2).rsqrt()
+        return (1 + _checked(squared) / self.scale**2).rsqrt()
 
 
 class Cauchy(_Scaled):
@@ -89,11 +96,11 @@ class Cauchy(_Scaled):
 
     def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`scale^2 log(1 + e2 / scale^2)`."""
-        return self.scale**2 * (check_tensor("squared", squared) / self.scale**2).log1p()
+        return self.scale**2 * (_checked(squared) / self.scale**2).log1p()
 
     def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`1 / (1 + e2 / scale^2)`."""
-        return 1 / (1 + check_tensor("squared", squared) / self.scale**2)
+        return 1 / (1 + _checked(squared) / self.scale**2)
 
 
 def check_loss(loss: Loss | None) -> None:

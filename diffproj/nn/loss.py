@@ -1,5 +1,7 @@
 """`PlaneLoss`: a loss in world units over the points that are valid."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -57,27 +59,28 @@ class PlaneLoss(nn.Module):
             ValueError: points or target without three coordinates, or shapes that do not broadcast to the points'.
         """
         points = check_tensor("points", points, "N", 3, like=target if isinstance(target, Tensor) else None)
-        target = _fitting("target", check_tensor("target", target, "N", 3, like=points), points)
-        each = points[..., 0]
-        counts = torch.ones_like(each, dtype=torch.bool)
-        if valid is not None:
-            counts = _fitting("valid", booleans("valid", valid, points.device), each)
+        target = _fitting("target", check_tensor("target", target, "N", 3, like=points), points, points.shape)
+        each = points.shape[:-1]
+        if valid is None:
+            counts = torch.ones_like(points[..., 0], dtype=torch.bool)
+        else:
+            counts = _fitting("valid", booleans("valid", valid, points.device), points, each)
         off = torch.where(counts.unsqueeze(-1), points - target.to(points), 0.0)
         if resolution is not None:
-            resolution = _fitting("resolution", check_tensor("resolution", resolution, like=points), each)
+            resolution = _fitting("resolution", check_tensor("resolution", resolution, like=points), points, each)
             off = off / torch.where(counts, resolution, 1.0).detach().unsqueeze(-1).to(off)
         value = off.square().sum(-1)
         value = value if self.loss is None else self.loss.value(value)
         if weights is not None:
-            weights = _fitting("weights", check_tensor("weights", weights, like=points), each)
+            weights = _fitting("weights", check_tensor("weights", weights, like=points), points, each)
             value = value * weights.to(value)
         return value.mean()
 
 
-def _fitting(name: str, tensor: Tensor, points: Tensor) -> Tensor:
-    """A tensor known to broadcast to the shape of the points, on their device."""
-    if tensor.shape != points.shape:
-        shape, want = tuple(tensor.shape), tuple(points.shape)
+def _fitting(name: str, tensor: Tensor, points: Tensor, want: Sequence[int]) -> Tensor:
+    """A tensor known to broadcast to a shape, on the device of the points."""
+    if tensor.shape != want:
+        shape, want = tuple(tensor.shape), tuple(want)
         padded = (*(1 for _ in want[len(shape) :]), *shape)
         if len(shape) > len(want) or any(mine not in (1, theirs) for mine, theirs in zip(padded, want, strict=True)):
             raise ValueError(f"{name}: want a shape that broadcasts to {want} as points has, got {shape}")
