@@ -106,6 +106,8 @@ def _three(name: str, vector: Tensor) -> Tensor:
 def _vector(name: str, given: ArrayLike, K: Tensor) -> Tensor:
     """A vector `(*B, k)` from one that OpenCV may give as a row `(1, k)` or a column `(k, 1)`."""
     value, batch = check_tensor(name, given, like=K), K.shape[:-2]
+    if has_values(value) and not bool(value.isfinite().all()):
+        raise ValueError(f"{name}: want finite numbers, got NaN or infinity")
     if value.ndim >= 2 and value.shape[-1] == 1:
         return value.squeeze(-1)
     if value.ndim == len(batch) + 2 and value.shape[-2] == 1:

@@ -96,6 +96,7 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         """
         if not isinstance(offset, Tensor):
             return cls([0.0, 0.0, 1.0], offset)
+        offset = check_tensor("offset", offset)
         return cls(torch.tensor([0.0, 0.0, 1.0], dtype=offset.dtype, device=offset.device), offset)
 
     @classmethod

@@ -110,6 +110,8 @@ def measure(
         blocks, by_theta = [factor * blocks[0]], factor * by_theta
     if plane_covariance is not None:
         plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
+        if plane_covariance.device != points.device:
+            raise ValueError(f"plane_covariance: want device {points.device}, got {plane_covariance.device}")
         if broadcast_batches(points=batch, plane_covariance=plane_covariance.shape[:-2]) != batch:
             got = tuple(plane_covariance.shape)
             raise ValueError(

@@ -126,7 +126,10 @@ def photograph(
             image = gaussian_blur2d(image[None, None], (kernel, kernel), (blur_px, blur_px))[0, 0]
         image = image + noise * torch.randn(image.shape, generator=generator, dtype=image.dtype)
         images.append((image.clamp(0, 1) * 255).round().to(torch.uint8))
-    return torch.stack(images).reshape(*camera.batch_shape, *images[0].shape)
+    width, height = camera.size or (0, 0)
+    if not images:
+        return torch.zeros(*camera.batch_shape, height, width, dtype=torch.uint8)
+    return torch.stack(images).reshape(*camera.batch_shape, height, width)
 
 
 def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px: float = 0.2, seed: int = 0) -> Views:
@@ -235,8 +238,8 @@ def random_cameras(
             )
         rotations.append(R[:views])
         shifts.append(t[:views])
-    R = torch.stack(rotations).reshape(*camera.batch_shape, views, 3, 3)
-    t = torch.stack(shifts).reshape(*camera.batch_shape, views, 3)
+    R = torch.cat([upright.new_zeros(0, 3, 3), *rotations]).reshape(*camera.batch_shape, views, 3, 3)
+    t = torch.cat([upright.new_zeros(0, 3), *shifts]).reshape(*camera.batch_shape, views, 3)
     return (camera if not camera.batch_shape else camera[..., None]).at(R, t)
 
 
