@@ -11,6 +11,7 @@ Three rules live here because they are easy to break one call at a time:
 * **Work in blocks changes no result.** `in_blocks` cuts long inputs only when no derivative of any kind is asked.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -106,6 +107,11 @@ def has_values(*tensors: Tensor) -> bool:
     return not (tracing or any(tensor.is_meta for tensor in tensors))
 
 
+def spread_evenly(total: int, count: int, device: torch.device) -> Tensor:
+    """`count` of the numbers from 0 to `total - 1`, evenly apart, with the first and the last."""
+    return torch.arange(count, device=device) * (total - 1) // max(count - 1, 1)
+
+
 def converted(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
     """`tensor.to(...)`, with axes that are only expanded left so: a million poses go on sharing one K.
 
@@ -175,6 +181,11 @@ def in_float64(tensor: Tensor) -> Tensor:
 def rounding(dtype: torch.dtype) -> float:
     """The relative size below which a sum of a few products is rounding: 8 units in the last place."""
     return 8 * torch.finfo(dtype).eps
+
+
+def least_depth(dtype: torch.dtype) -> float:
+    """The depth from which on points are projected: what is divided by it, and its slope, are finite."""
+    return math.sqrt(torch.finfo(dtype).tiny)
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:

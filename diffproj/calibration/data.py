@@ -9,6 +9,7 @@ from torch import Tensor
 from diffproj._core.arguments import tensor_of
 from diffproj._core.numerics import in_float64
 from diffproj.calibration.distinct import shares
+from diffproj.calibration.losses import SMALLEST
 from diffproj.calibration.task import Task
 from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target, points_of
@@ -72,6 +73,8 @@ class Data:
             counted = given.detach()[visible]
             if not bool(((counted >= 0) & counted.isfinite()).all()):
                 raise ValueError("weights: want finite numbers of at least 0, got others at corners that were seen")
+            if not bool(((counted == 0) | ((counted >= SMALLEST) & (counted <= 1 / SMALLEST))).all()):
+                raise ValueError(f"weights: want 0 or numbers from {SMALLEST:g} to {1 / SMALLEST:g}, got others")
             self.given_weights = torch.where(visible, given, 0.0)
             self.weights = self.given_weights.detach().reshape(self.pixels.shape[:-1])
             visible = visible & (self.given_weights.detach() > 0)

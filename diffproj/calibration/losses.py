@@ -17,6 +17,9 @@ from torch import Tensor
 from diffproj._core.arguments import called, number
 from diffproj._core.numerics import check_tensor
 
+SMALLEST = 1e-100
+"""The smallest scale; its inverse is the largest. What is computed of their squares is still right."""
+
 
 @runtime_checkable
 class Loss(Protocol):
@@ -36,7 +39,8 @@ class _Scaled:
     scale: float
 
     def __post_init__(self) -> None:
-        scale = number("scale", self.scale, "a positive number in the residual's unit", above=0)
+        want = f"a positive number in the residual's unit, between {SMALLEST:g} and {1 / SMALLEST:g}"
+        scale = number("scale", self.scale, want, least=SMALLEST, most=1 / SMALLEST)
         object.__setattr__(self, "scale", scale)
 
 

@@ -158,7 +158,7 @@ def bootstrap(
     if number < 2:
         alone = "one" if len(views) == 1 else f"{len(views)} alike"
         raise ValueError(f"views: want some that show the board differently, got {alone}")
-    drawn = torch.randint(number, (draws, number), generator=generator).to(views.device)
+    drawn = torch.randint(number, (draws, number), generator=generator, device="cpu").to(views.device)
     counts = torch.nn.functional.one_hot(drawn, number).sum(1).to(torch.float64)[:, group]
     every = repeated(views, draws)
     hidden = (counts == 0).unsqueeze(-1).expand(every.visible.shape)

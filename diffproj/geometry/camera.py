@@ -28,6 +28,7 @@ from diffproj._core.numerics import (
     entries,
     has_values,
     in_blocks,
+    least_depth,
     linear,
     transform,
 )
@@ -38,6 +39,9 @@ from diffproj.lens.protocol import Lens
 
 ROTATION_TOLERANCE = 1e-5
 """How far `R^T R` may be from the identity, entry by entry, where a user hands a camera in."""
+
+SQUARED = 0.45
+"""The power of the largest number up to which a pixel counts as finite: its square, and what is left of it, are."""
 
 
 class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distortion",), constants=("size",)):
@@ -170,6 +174,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             stretched: whether the whole image was stretched to another aspect, as networks of a fixed input size do.
 
         Raises:
+            TypeError: the size is not two whole numbers.
             ValueError: the camera does not know its own size, or another aspect. A camera's video mode of another
                 aspect shows a part of the sensor: crop first.
 
@@ -184,6 +189,8 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             raise ValueError(
                 "resized: want a camera with a size, got size=None; give Camera(..., size=(width, height))"
             )
+        if size is None:
+            raise TypeError("size: want (width, height) of the resized image, got None")
         width, height = checked_size(size) or self.size
         scale = (width / self.size[0], height / self.size[1])
         # Rounding moves each side by a pixel at most: is there one scale that both may have been rounded from?
@@ -198,8 +205,13 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         return self._with(K=self.K * factors + shift, size=(width, height))
 
     def cropped(self, left: float, top: float, width: int, height: int) -> "Camera":
-        """The camera of the crop whose first pixel was pixel `(left, top)`: the principal point moves along."""
-        left, top = (number(name, side, "a place in px") for name, side in (("left", left), ("top", top)))
+        """The camera of the crop whose first pixel was pixel `(left, top)`: the principal point moves along.
+
+        Raises:
+            TypeError: `left` or `top` is no number, or width and height are not whole.
+            ValueError: `left` or `top` is not finite, or width or height is not positive.
+        """
+        left, top = (number(name, side, "a finite place in px") for name, side in (("left", left), ("top", top)))
         width, height = (whole_number(name, side, least=1) for name, side in (("width", width), ("height", height)))
         shift = self.K.new_tensor([[0, 0, left], [0, 0, top], [0, 0, 0]])
         return self._with(K=self.K - shift, size=checked_size((width, height)))
@@ -290,6 +302,8 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         points = self._checked("points", points, 3)
 
         def project(points: Tensor) -> tuple[Tensor, Tensor]:
+            finite = points.detach().sum(-1).isfinite()
+            points = points.nan_to_num(0.0, 0.0, 0.0)  # the slope by R is the point, and 0 times infinity is NaN
             rotated = linear(entries(self.R), points.unbind(-1))
             direction = [x + shift.unsqueeze(-1) for x, shift in zip(rotated, self.t.unbind(-1), strict=True)]
             if self.distortion is None:
@@ -297,6 +311,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             else:
                 xy_lens, valid = self.distortion.project_direction(torch.stack(direction, dim=-1))
                 xy = list(xy_lens.unbind(-1))
+            valid = valid & finite
             uv = linear(entries(self.K[..., :2, :]), [*xy, None])
             return torch.stack([torch.where(valid, x, 0.0) for x in uv], dim=-1), valid
 
@@ -320,7 +335,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             ValueError: wrong shape or device, or batch shapes that do not broadcast.
         """
         pixels = self._checked("pixels", pixels, 2)
-        finite = pixels.isfinite().all(dim=-1)
+        finite = (pixels.abs() < torch.finfo(pixels.dtype).max ** SQUARED).all(dim=-1)
         offset = torch.where(finite.unsqueeze(-1), pixels - self.K[..., None, :2, 2], 0.0)
         xy = transform(pixel_to_normalized(self.K), offset)
         if self.distortion is None:
@@ -391,10 +406,11 @@ def check_lens(distortion: object) -> None:
 def _pinhole(direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
     """Perspective division, valid where the point is finite and in front."""
     x, y, z = direction
-    reach = x.abs() + y.abs()
-    valid = (z > torch.finfo(z.dtype).eps * reach) & (reach + z).isfinite()
-    inverse_depth = torch.where(valid, z, 1.0).reciprocal()
-    return [torch.where(valid, component, 0.0) * inverse_depth for component in (x, y)], valid
+    reach, limits = x.abs() + y.abs(), torch.finfo(z.dtype)
+    # Derivatives hold 1 / z, which must not overflow; and x / z, not x times 1 / z, whose derivative would sooner.
+    valid = (z > limits.eps * reach + least_depth(z.dtype)) & (reach + z).isfinite()
+    depth = torch.where(valid, z, 1.0)
+    return [torch.where(valid, component, 0.0) / depth for component in (x, y)], valid
 
 
 def is_rotation(R: Float[Tensor, "*shape 3 3"]) -> Bool[Tensor, "*shape"]:

@@ -49,7 +49,7 @@ def rotation_from_euler(
                 [ 0,  0,  1]], dtype=torch.int32)
     """
     kind = meeting(*(angle for angle in (psi, phi, theta) if isinstance(angle, Tensor)))
-    kind = torch.empty(0, dtype=torch.float64) if kind is None else kind
+    kind = torch.empty(0, dtype=torch.float64, device="cpu") if kind is None else kind
     psi, phi = check_tensor("psi", psi, like=kind), check_tensor("phi", phi, like=kind)
     theta = check_tensor("theta", theta, like=kind)
     check_same_kind(psi=psi, phi=phi, theta=theta)

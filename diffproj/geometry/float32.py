@@ -48,6 +48,6 @@ def warn_if_rounded(camera: Camera, plane: Plane) -> None:
     if looks_at_rounding(camera.t):
         with torch.no_grad():
             plane = plane.like(camera.K)
-            length = vector_norm(plane.normal, dim=-1)
+            length = plane.length
             height = (dot(plane.normal, camera.center) - plane.offset).abs()
             warn_of_rounding(plane.offset.abs() + length * vector_norm(camera.t, dim=-1), height)

@@ -27,7 +27,7 @@ def tensors_from_opencv(
     Raises:
         ValueError: a vector is neither `(*B, k)` nor a row or column.
     """
-    K = check_tensor("K", K, 3, 3, like=torch.empty(0, dtype=torch.float64))
+    K = check_tensor("K", K, 3, 3, like=torch.empty(0, dtype=torch.float64, device="cpu"))
     coefficients = None if dist is None else _vector("dist", dist, K)
     if coefficients is not None and coefficients.shape[-1] == 0:
         coefficients = None

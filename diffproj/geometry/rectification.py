@@ -59,9 +59,8 @@ def plane_axes(plane: Plane) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "
         >>> origin.tolist(), s.tolist(), t.tolist()
         ([0.0, 0.0, 3.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     """
-    length = as_plane(plane).normal.norm(dim=-1, keepdim=True)
-    n = plane.normal / length
-    origin = n * (plane.offset.unsqueeze(-1) / length)
+    n, distance = as_plane(plane).normalised()
+    origin = n * distance.unsqueeze(-1)
     n = torch.where(n[..., 2:] < 0, -n, n)
     x, y = (torch.zeros_like(n).index_fill(-1, torch.tensor(i, device=n.device), 1.0) for i in range(2))
     near = torch.where(n[..., :1].abs() > 0.9, y, x)

@@ -302,7 +302,8 @@ class Measurement:
         N = self.points.shape[-2]
         if k > N:
             raise ValueError(f"points: want at least {k}, got {N}")
-        return torch.arange(N - k + 1).unsqueeze(-1) + torch.arange(k)
+        first, following = (torch.arange(count, device=self.points.device) for count in (N - k + 1, k))
+        return first.unsqueeze(-1) + following
 
 
 def _coordinate(axis: int, points: Tensor) -> Tensor:

@@ -54,9 +54,12 @@ class PlaneLoss(nn.Module):
                 divided by it, so that far points, which one pixel moves further, count as much as near ones. No
                 gradient flows through it.
 
+        Without points the loss is 0.
+
         Raises:
-            TypeError: points, target, weights or resolution that are no floating-point tensors, or `valid` no booleans.
-            ValueError: points or target without three coordinates, or shapes that do not broadcast to the points'.
+            TypeError: points, target, weights or resolution that are no floating-point tensors, or a mask that is not
+                boolean.
+            ValueError: points or target without three coordinates, or something that does not broadcast to the points.
         """
         points = check_tensor("points", points, "N", 3, like=target if isinstance(target, Tensor) else None)
         target = _fitting("target", check_tensor("target", target, "N", 3, like=points), points, points.shape)
@@ -73,17 +76,22 @@ class PlaneLoss(nn.Module):
         value = value if self.loss is None else self.loss.value(value)
         if weights is not None:
             weights = _fitting("weights", check_tensor("weights", weights, like=points), points, each)
-            value = value * weights.to(value)
-        return value.mean()
+            value = value * torch.where(counts, weights, 0.0).to(value)
+        return value.sum() / max(value.numel(), 1)
 
 
-def _fitting(name: str, tensor: Tensor, points: Tensor, want: Sequence[int]) -> Tensor:
-    """A tensor known to broadcast to a shape, on the device of the points."""
-    if tensor.shape != want:
-        shape, want = tuple(tensor.shape), tuple(want)
-        padded = (*(1 for _ in want[len(shape) :]), *shape)
-        if len(shape) > len(want) or any(mine not in (1, theirs) for mine, theirs in zip(padded, want, strict=True)):
-            raise ValueError(f"{name}: want a shape that broadcasts to {want} as points has, got {shape}")
+def _fitting(name: str, tensor: Tensor, points: Tensor, shape: Sequence[int]) -> Tensor:
+    """A tensor on the points' device that broadcasts to a shape, along its last axis only from one number for all.
+
+    Raises:
+        ValueError: it does not, or would stretch the points; or it is elsewhere.
+    """
+    if tensor.shape != shape:
+        whole = tensor.ndim < 1 or tensor.shape[-1] == shape[-1]
+        behind, want = tensor.shape[::-1], shape[::-1]
+        if not whole or len(behind) > len(want) or any(a not in (1, b) for a, b in zip(behind, want, strict=False)):
+            got = tuple(tensor.shape)
+            raise ValueError(f"{name}: want a shape that broadcasts to {tuple(shape)} as points has, got {got}")
     if tensor.device != points.device:
         raise ValueError(f"{name}: want device {points.device} as points has, got {tensor.device}")
     return tensor

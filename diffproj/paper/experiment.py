@@ -129,7 +129,7 @@ def run_experiment(
     as_board(board)
     strict = flag("strict", strict)
     calibration = calibrate(fit, board, distortion)
-    held_out = torch.zeros(test.pixels.shape[-2], dtype=torch.bool)
+    held_out = torch.zeros(test.pixels.shape[-2], dtype=torch.bool, device=test.device)
     if strict:
         held_out[1::2] = True
     located = locate(test.hiding(held_out), board, calibration)

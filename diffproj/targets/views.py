@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj._core.arguments import Array, booleans, called, instance, position
-from diffproj._core.batched import Batched
+from diffproj._core.batched import Batched, check_index
 from diffproj._core.numerics import broadcast_batches, check_tensor, has_values
 from diffproj.geometry.grid import checked_size
 
@@ -112,7 +112,8 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
                 numbers, or a mask of V booleans. Iterating gives one `Views` of length 1 after the other.
 
         Raises:
-            IndexError: out of range, a mask of another length, or something else than the above.
+            IndexError: out of range, or a mask of another length.
+            TypeError: something else than the above.
 
         Example:
             >>> views = Views(torch.rand(5, 54, 2))
@@ -222,6 +223,8 @@ def _check_finite(pixels: Tensor, visible: Tensor, names: tuple[str, ...]) -> No
 
 def _positions(index: Any, count: int) -> list[int]:
     """What `index` chooses among `count` views, as numbers from 0."""
+    index = list(index) if isinstance(index, tuple | range) else index
+    check_index(index)
     if isinstance(index, slice):
         try:
             return list(range(count))[index]
