@@ -268,8 +268,15 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         return dot(points, normal) - offset
 
     def rms(self, points: Float[Tensor, "*#batch n 3"] | Array) -> Float[Tensor, "*#batch"]:
-        """Root mean square of the points' distances, in world units: the fit error of `from_points`."""
+        """Root mean square of the points' distances, in world units: the fit error of `from_points`.
+
+        Raises:
+            TypeError: no floating-point tensor or array, or another dtype than the plane's.
+            ValueError: no points, or a wrong shape.
+        """
         distance = self.distance(points)
+        if distance.shape[-1] == 0:
+            raise ValueError("points: want at least one, got none")
         size = distance.detach().abs().amax(-1, keepdim=True)
         size = torch.where(size > 0, size, 1.0)
         squared = (distance / size).square().mean(dim=-1)

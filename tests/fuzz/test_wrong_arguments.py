@@ -178,6 +178,7 @@ def _geometry(t: Things) -> dict[str, Call]:
         "ground_resolution": Call(dp.ground_resolution, {"pixels": p, **onto}, 5),
         "PlaneMap": Call(dp.PlaneMap, onto),
         "PlaneMap()": Call(dp.PlaneMap(c, n), {"pixels": p}),
+        "PlaneMap.resolution": Call(dp.PlaneMap(c, n).resolution, {"pixels": p}),
         "PlaneMap.explain": Call(dp.PlaneMap(c, n).explain, {"pixels": p}),
         "paper_route": Call(
             dp.paper_route, {"pixels": p, "camera": dp.Camera(t.K), "plane": dp.Plane.z(9.0), "focal_length": 1.0}
@@ -449,8 +450,11 @@ NOT_CALLED = {
     "Lens.expand",
     "Loss.value",
     "Loss.weight",
-    "BrownConrady.turned",
-    "KannalaBrandt.turned",
+    *(
+        f"{lens}.{method}"
+        for lens in ("BrownConrady", "KannalaBrandt")
+        for method in ("turned", "by_direction", "by_coefficients")
+    ),
     "Plane.to",  # as Camera's
     "figures.png",
 }
@@ -475,6 +479,12 @@ def test_calls_are_right_as_they_are_listed(hostile: Any) -> None:
         for name, call in calls().items():
             if name != "register_lens":
                 assert call.function(**call.given) is not NotImplemented, name
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """For what is written by a name that stands for a path."""
+    monkeypatch.chdir(tmp_path)
 
 
 def test_wrong_arguments(hostile: Any) -> None:
