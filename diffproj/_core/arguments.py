@@ -236,7 +236,7 @@ def function(name: str, value: T, want: str) -> T:
     """Something that can be called.
 
     Raises:
-        TypeError: it cannot, or it is a class.
+        TypeError: it cannot.
     """
     if not callable(value):
         raise TypeError(f"{name}: want {want}, got {called(value)}")

@@ -7,6 +7,7 @@ and `torch.export` carry it. Inside such a transformation the tensors are tracer
 whose values nobody can read: this is why a PyTree is rebuilt by `unchecked`.
 """
 
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, TypeVar
 
@@ -124,7 +125,7 @@ class Batched:
             raise TypeError(f"batch_shape: want whole numbers, got {tuple(shape)}")
         new = len(shape) - len(own)
         wanted = [own[k - new] if length == -1 and k >= new else length for k, length in enumerate(shape)]
-        fits = new >= 0 and all(length >= 0 for length in wanted[:new])
+        fits = new >= 0 and all(0 <= length < sys.maxsize for length in wanted[:new])
         if not fits or any(length not in (1, want) for length, want in zip(own, wanted[new:], strict=True)):
             raise ValueError(f"batch_shape: want one that {tuple(own)} broadcasts to, got {tuple(shape)}")
         return torch.Size(wanted)

@@ -165,6 +165,8 @@ def _checked_shape(shape: Sequence[int]) -> tuple[int, int]:
 def _single(plane: Plane | None) -> Plane:
     """One plane in float64; the board's where none was given."""
     plane = (Plane.z(0.0) if plane is None else as_plane(plane)).to(torch.float64)
+    if plane.normal.is_meta:
+        raise ValueError("plane: want one with values, got one on the device meta")
     if plane.batch_shape:
         raise ValueError(f"plane: want one plane, got batch shape {tuple(plane.batch_shape)}")
     return plane
