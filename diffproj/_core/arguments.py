@@ -11,8 +11,10 @@ becomes float64. Tensors are never converted but from half precision: theirs has
 
 import math
 import operator
+import os
 from collections.abc import Iterable, Sequence
 from numbers import Real
+from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -126,7 +128,7 @@ def numbers(name: str, value: object, want: str, count: int) -> tuple[float, ...
         TypeError: no such thing.
         ValueError: another count, or one that is not finite.
     """
-    if not isinstance(value, Tensor | np.ndarray | list | tuple):
+    if not isinstance(value, Tensor | np.ndarray | list | tuple) or getattr(value, "is_meta", False):
         raise TypeError(f"{name}: want {want}, got {called(value)}")
     given = value.tolist() if isinstance(value, Tensor | np.ndarray) else list(value)
     if not isinstance(given, list) or len(given) != count:
@@ -241,6 +243,20 @@ def function(name: str, value: T, want: str) -> T:
     if not callable(value):
         raise TypeError(f"{name}: want {want}, got {called(value)}")
     return value
+
+
+def file_path(name: str, value: object) -> Path:
+    """The path of a file.
+
+    Raises:
+        TypeError: neither a string nor a path.
+        ValueError: no file can have it.
+    """
+    if not isinstance(value, str | os.PathLike) or not isinstance(os.fspath(value), str):
+        raise TypeError(f"{name}: want the path of a file, got {called(value)}")
+    if "\0" in os.fspath(value):
+        raise ValueError(f"{name}: want the path of a file, got {value!r}, which has a NUL character")
+    return Path(value)
 
 
 def tensor_of(name: str, value: object, like: Kind | None = None) -> Tensor:

@@ -268,7 +268,8 @@ def _is_index(part: Any) -> bool:
 def _described(part: Any) -> str:
     """The kind of a thing that is no index; of a list, that of what does not belong there."""
     if isinstance(part, list):
-        return f"a list with {_described(next(element for element in part if not _is_index(element)))}"
+        odd = (element for element in part if isinstance(element, slice) or not _is_index(element))
+        return f"a list with {_described(next(odd))}"
     if isinstance(part, Tensor | np.ndarray):
         return f"{type(part).__name__} of {part.dtype}"
     return type(part).__name__

@@ -174,7 +174,10 @@ def _at_view(calibration: Calibration, view: int | str) -> tuple[Camera, Tensor 
 
 def _expanded(pixel_sigma: float | Tensor | Array | None, like: Tensor) -> Tensor:
     """The standard deviation of each pixel `(*B, N)`, for points `(*B, N, 3)`."""
-    sigma = check_tensor("pixel_sigma", pixel_sigma, like=like).to(like)
+    sigma = check_tensor("pixel_sigma", pixel_sigma, like=like)
+    if sigma.is_meta:
+        raise ValueError("pixel_sigma: want values, got a tensor on the device meta")
+    sigma = sigma.to(like)
     try:
         sigma = sigma.expand(like.shape[:-1])
     except RuntimeError:

@@ -214,6 +214,7 @@ def _about(error: Exception, call: Any, spoilt_ones: dict[str, Any]) -> str | No
     if not OWN_WORDS.search(text):
         return f"a message from the inside, {kind.__name__}: {line}"
     named = [argument for argument in call.given if re.search(rf"\b{ALIASES.get(argument, argument)}\b", text)]
+    named += ["path"] * (str(spoilt_ones.get("path", call)) in text)
     # A message about two arguments that do not fit together may begin with either.
     if not named or (not set(named) & set(spoilt_ones) and not RELATION.search(text)):
         return f"a message that does not name {', '.join(spoilt_ones)}: {line}"
