@@ -17,6 +17,7 @@ import torch.utils._pytree as torch_pytree
 from torch import Tensor
 
 from diffproj._core.arguments import called, listing, whole_number
+from diffproj._core.copying import Copied
 from diffproj._core.numerics import at_least_float32, converted
 
 T = TypeVar("T")
@@ -25,7 +26,7 @@ Rearrange = Callable[[Tensor, int], Tensor]
 """Takes a tensor and how many axes it has behind those of the batch to the same in another arrangement."""
 
 
-class Batched:
+class Batched(Copied):
     """Tensors that share batch axes `*B`, parts with the same batch axes, and constants."""
 
     __slots__ = ()
@@ -103,22 +104,22 @@ class Batched:
         """The same cut off from the graph."""
         return self._rearranged(lambda tensor, _: tensor.detach(), lambda part: part.detach())
 
-    def expand(self: B, *batch_shape: int) -> B:
+    def expand(self: B, *batch_shape: int | Sequence[int]) -> B:
         """The same with its batch axes broadcast to `batch_shape`, as `torch.Tensor.expand`: nothing is copied.
 
         Raises:
             TypeError: the shape is not whole numbers.
             ValueError: the batch axes do not broadcast to it.
         """
-        shape = batch_shape[0] if len(batch_shape) == 1 and isinstance(batch_shape[0], tuple | list) else batch_shape
-        batch_shape = self._stretched(shape)
+        first = batch_shape[0] if len(batch_shape) == 1 else None
+        shape = self._stretched(first if isinstance(first, tuple | list) else batch_shape)
 
         def stretch(tensor: Tensor, behind: int) -> Tensor:
-            return tensor.expand((*batch_shape, *tensor.shape[tensor.ndim - behind :]))
+            return tensor.expand((*shape, *tensor.shape[tensor.ndim - behind :]))
 
-        return self._rearranged(stretch, lambda part: part.expand(*batch_shape))
+        return self._rearranged(stretch, lambda part: part.expand(*shape))
 
-    def _stretched(self, shape: Sequence[int]) -> torch.Size:
+    def _stretched(self, shape: Sequence[Any]) -> torch.Size:
         """The shape that the batch is asked to take on, with -1 for the length that an axis has already."""
         own = self.batch_shape
         if not all(isinstance(length, int | torch.SymInt) for length in shape):

@@ -29,6 +29,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj._core.arguments import instance, position
+from diffproj._core.copying import Copied
 from diffproj._core.numerics import broadcast_batches
 from diffproj.calibration.solver import Equations
 
@@ -37,7 +38,7 @@ SINGULAR = 2e-15
 
 
 @dataclass(frozen=True, eq=False)
-class Covariance:
+class Covariance(Copied):
     """Joint covariance of shared parameters and poses, for batch shape `*B`.
 
     A pose is perturbed by `R <- exp(omega) R`, `t <- t + tau`: its six coordinates are omega in radians (about the

@@ -28,6 +28,7 @@ from torch.linalg import vector_norm
 
 from diffproj._core.arguments import Array, tensor_of
 from diffproj._core.batched import register_pytree
+from diffproj._core.copying import Copied
 from diffproj._core.numerics import (
     broadcast_batches,
     check_same_kind,
@@ -63,7 +64,7 @@ class Reason(enum.IntEnum):
     """The ray meets the plane behind the camera."""
 
 
-class PlaneMap:
+class PlaneMap(Copied):
     """The map from pixels to points of a plane, built once for a camera and a plane and then applied at will.
 
     `back_project` builds one for each call; keep one where camera and plane stay as they are. It is a PyTree.
@@ -95,13 +96,23 @@ class PlaneMap:
             TypeError: not a camera and a plane, or of different dtypes.
             ValueError: different devices, or batch shapes that do not broadcast.
         """
+        self._build(camera, plane, warn=True)
+
+    @classmethod
+    def quietly(cls, camera: Camera, plane: Plane) -> "PlaneMap":
+        """The same without a warning of rounding: for who builds a map again and again, and has warned before."""
+        plane_map = cls.__new__(cls)
+        plane_map._build(camera, plane, warn=False)
+        return plane_map
+
+    def _build(self, camera: Camera | PinholeCamera, plane: Plane, warn: bool) -> None:
         camera, plane = as_camera(camera), as_plane(plane)
         plane = plane.like(camera.K)
         check_same_kind(camera=camera.K, plane=plane.normal)
         if plane.is_per_point:
             camera = camera[..., None]
         broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape)
-        self.matrix = _plane_matrix(camera, plane).to(camera.dtype)
+        self.matrix = _plane_matrix(camera, plane, warn).to(camera.dtype)
         self.camera, self.is_per_point = camera, plane.is_per_point
 
     @classmethod
@@ -307,6 +318,16 @@ def ground_resolution(
     return PlaneMap(camera, plane).resolution(pixels)
 
 
+def warn_if_rounded(camera: Camera, plane: Plane) -> None:
+    """Warn where float32 rounds the places that a camera sees on a plane visibly; see `warn_of_rounding`."""
+    if looks_at_rounding(camera.t):
+        with torch.no_grad():
+            plane = plane.like(camera.K)
+            length = plane.length
+            height = (dot(plane.normal, camera.center) - plane.offset).abs()
+            warn_of_rounding(plane.offset.abs() + length * vector_norm(camera.t, dim=-1), height)
+
+
 def _largest_singular_value(by_u: Tensor, by_v: Tensor) -> Tensor:
     """Of 3 x 2 matrices with these columns `(*B, n, 3)`, from their 2 x 2 Gram matrices; 0, with no slope, of zeros."""
     size = torch.maximum(by_u.detach().abs().amax(-1), by_v.detach().abs().amax(-1))
@@ -329,8 +350,8 @@ def _denominator(b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[T
     return linear([b], sight)[0], threshold[0]
 
 
-def _plane_matrix(camera: Camera, plane: Plane) -> Tensor:
-    """`M (*B, 4, 3)` in float64, scaled to `max |M| = 1`; zero where the camera's centre lies in the plane."""
+def _plane_matrix(camera: Camera, plane: Plane, warn: bool) -> Tensor:
+    """`M (*B, 4, 3)` in float64, scaled to `max |M| = 1/4`; zero where the camera's centre lies in the plane."""
     R, t = in_float64(camera.R), in_float64(camera.t)
     normal, offset = in_float64(plane.normal), in_float64(plane.offset)
     b = dot(R, normal.unsqueeze(-2))  # the normal in the camera frame: n . C = -b . t
@@ -343,9 +364,10 @@ def _plane_matrix(camera: Camera, plane: Plane) -> Tensor:
         M = torch.cat([(M[..., :2].unsqueeze(-1) * F_inverse.unsqueeze(-3)).sum(dim=-2), M[..., 2:]], dim=-1)
     with torch.no_grad():  # the factor changes no point, so no derivative has to pass through it
         reach, distance = offset.abs() + vector_norm(b, dim=-1) * vector_norm(t, dim=-1), height.abs()
-        factor = M.abs().amax(dim=(-2, -1)).reciprocal().copysign(height)
+        # A quarter, so that no pixel is large enough for a sum of three products to overflow.
+        factor = (0.25 / M.abs().amax(dim=(-2, -1))).copysign(height)
         factor = torch.where(distance > rounding(camera.dtype) * reach, factor, 0.0)
-        if looks_at_rounding(camera.t):
+        if warn and looks_at_rounding(camera.t):
             warn_of_rounding(reach, distance)
     return M * factor[..., None, None]
 

@@ -33,6 +33,7 @@ from diffproj._core.numerics import (
     transform,
 )
 from diffproj.geometry.exchange import Exchange
+from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounded_pixels
 from diffproj.geometry.grid import checked_size, inside
 from diffproj.geometry.intrinsics import check_intrinsics, check_warp, pixel_to_normalized, warped
 from diffproj.lens.protocol import Lens
@@ -300,6 +301,12 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             ValueError: wrong shape or device, or batch shapes that do not broadcast.
         """
         points = self._checked("points", points, 3)
+        if looks_at_rounding(self.t):
+            warn_of_rounded_pixels(self.K, self.R, self.t, points)
+        return self._project(points)
+
+    def _project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """`project` of points that were checked, without a warning of rounding."""
 
         def project(points: Tensor) -> tuple[Tensor, Tensor]:
             finite = points.detach().sum(-1).isfinite()

@@ -17,7 +17,7 @@ def by_direction(lens: Lens | None, direction: Float[Tensor, "*batch n 3"]) -> F
     if isinstance(lens, CoefficientLens):
         return lens.by_direction(direction)
     if lens is not None:
-        xy, pull = torch.func.vjp(lambda direction: lens.project_direction(direction)[0], direction)
+        xy, pull = torch.func.vjp(lambda direction: lens.project_direction(direction)[0], direction)[:2]
         x, y = torch.zeros_like(xy), torch.zeros_like(xy)
         x[..., 0], y[..., 1] = 1.0, 1.0
         return torch.stack([pull(x)[0], pull(y)[0]], dim=-2)

@@ -31,9 +31,8 @@ from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64,
 from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.region import in_region
 from diffproj.calibration.result import Calibration
-from diffproj.geometry.back_projection import back_project
+from diffproj.geometry.back_projection import back_project, warn_if_rounded
 from diffproj.geometry.camera import Camera, as_camera
-from diffproj.geometry.float32 import warn_if_rounded
 from diffproj.geometry.intrinsics import pixel_to_normalized
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.lens.coefficients import CoefficientLens

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj._core import arguments
+from diffproj._core.copying import Copied
 from diffproj.calibration.covariance import zero_where_infinite
 from diffproj.calibration.region import in_region
 from diffproj.measurement.folded import longest_first, norm_variance
@@ -27,7 +28,7 @@ NONLINEAR = "Nonlinear: close to the horizon or to zero, where the deviation mis
 
 
 @dataclass(frozen=True, eq=False)
-class Measurement:
+class Measurement(Copied):
     """Points measured on a plane, with their joint covariance.
 
     Attributes:

@@ -43,7 +43,7 @@ class LearnableMap(nn.Module):
         PlaneMap(camera, plane)  # checks that they fit together
         check_has_values("camera", camera.K)
         plane = plane.like(camera.K)
-        distance = ((plane.normal * camera.center).sum(-1) - plane.offset).abs() / plane.normal.norm(dim=-1)
+        distance = plane.distance(camera.center.unsqueeze(-2)).abs()
         of_camera = {part: where for part, where in learn.items() if part != "plane"}
         self.camera = LearnableCamera(camera, of_camera, tied_intrinsics)
         # Without a distance, as of a camera on the plane or of none at all, steps are in world units.
@@ -57,4 +57,4 @@ class LearnableMap(nn.Module):
 
     def forward(self) -> PlaneMap:
         """The map with the current values of the parameters."""
-        return PlaneMap(self.camera(), self.plane())
+        return PlaneMap.quietly(self.camera(), self.plane())

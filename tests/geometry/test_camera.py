@@ -323,3 +323,30 @@ def test_converting_keeps_one_camera_in_memory_once(lens_camera: dp.Camera) -> N
     assert torch.equal(single.K, poses.K.float())
     plane = dp.Plane(torch.tensor([0.0, 0, 1], dtype=D).expand(50, 3), torch.arange(50, dtype=D))
     assert plane.to(torch.float32).normal.untyped_storage().nbytes() == 3 * 4
+
+
+@pytest.mark.plain
+def test_sizes_and_crops_that_are_none() -> None:
+    camera = dp.Camera(torch.eye(3, dtype=torch.float64), size=(640, 480))
+    with pytest.raises(TypeError, match=r"size: want \(width, height\) of the resized image, got None"):
+        camera.resized(None)
+    for left, top, name in (
+        (float("nan"), 0, "left"),
+        (0, float("inf"), "top"),
+        (0, torch.tensor(float("nan")), "top"),
+    ):
+        with pytest.raises(ValueError, match=f"{name}: want a finite number"):
+            camera.cropped(left, top, 10, 10)
+    with pytest.raises(TypeError, match="left: want a number, got NoneType"):
+        camera.cropped(None, 0, 10, 10)
+
+
+def test_opencv_s_arrays_are_copied() -> None:
+    K, dist, vector = np.diag([500.0, 500, 1]), np.array([0.1, 0, 0, 0]), np.array([0.1, 0, 5])
+    camera = dp.Camera.from_opencv(K, dist, vector, vector)
+    t = camera.t.clone()
+    for array in (K, dist, vector):
+        array[:] = 7
+    assert camera.K[0, 0] == 500
+    assert camera.distortion.coefficients[0] == 0.1
+    assert torch.equal(camera.t, t)
