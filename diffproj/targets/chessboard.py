@@ -113,5 +113,5 @@ def as_board(board: Chessboard) -> Chessboard:
 
 
 def _count(name: str, value: object) -> int:
-    want = f"a whole number of at least 2 inner corners (one less than the squares) and at most {MOST:,}"
+    want = f"at least 2 inner corners (one less than the squares), a whole number up to {MOST:,}"
     return whole_number(name, value, want, least=2, most=MOST)

@@ -30,7 +30,7 @@ def points_of(target: Target) -> Float[Tensor, "n 3"]:
         ValueError: they are not of shape `(N, 3)`.
     """
     instance("target", target, Target, "dp.Chessboard or anything with .points (N, 3)")
-    if isinstance(target, type):
+    if isinstance(target, type) and isinstance(target.points, property):
         raise TypeError(f"target: want an instance, as dp.Chessboard(), got the class {target.__name__}")
     points = check_tensor("target.points", target.points, "N", 3)
     if points.ndim != 2:

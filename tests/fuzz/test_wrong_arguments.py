@@ -438,6 +438,7 @@ NOT_CALLED = {
     "Plane.unchecked",
     "Views.unchecked",
     "PlaneMap.unchecked",
+    "PlaneMap.quietly",  # as the constructor
     "Camera.warped_by",
     "Covariance.from_fields",  # of files
     "SoftL1.value",  # as Huber's and Cauchy's

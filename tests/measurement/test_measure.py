@@ -174,7 +174,7 @@ def test_points_counted_from_the_end_are_the_same_points(calibration: dp.Calibra
 
     same, ends = measured.quantity(total, [[2, 2]]), measured.quantity(total, [[2, -1]])
     assert torch.equal(same.deviation, ends.deviation)
-    with pytest.raises(IndexError, match="which: want numbers of the 3 points"):
+    with pytest.raises(IndexError, match="pairs: want numbers of the 3 points"):
         measured.lengths([[0, 3]])
     with pytest.raises(ValueError, match="pairs: want point numbers"):
         measured.lengths([[0, 1, 2]])
