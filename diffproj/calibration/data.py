@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._core.arguments import tensor_of
+from diffproj._core.arguments import Array, tensor_of
 from diffproj._core.numerics import in_float64
 from diffproj.calibration.distinct import shares
 from diffproj.calibration.losses import SMALLEST
@@ -38,7 +38,7 @@ class Data:
         ValueError: views, board and weights do not fit together, or the board is of no use.
     """
 
-    def __init__(self, views: Views, target: Target, weights: Tensor | None) -> None:
+    def __init__(self, views: Views, target: Target, weights: Tensor | Array | float | None) -> None:
         if len(as_views(views)) == 0:
             raise ValueError("views: want at least one, got none")
         if 0 in views.batch_shape:

@@ -33,7 +33,7 @@ class LocateOptions(TypedDict, total=False):
         throw: raise where a camera did not converge, as it does if left out; if False, look at `Calibration.status`.
     """
 
-    weights: Tensor | Array | None
+    weights: Tensor | Array | float | None
     loss: Loss | None
     max_iterations: int
     tolerance: float

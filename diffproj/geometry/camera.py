@@ -212,7 +212,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             TypeError: `left` or `top` is no number, or width and height are not whole.
             ValueError: `left` or `top` is not finite, or width or height is not positive.
         """
-        left, top = (number(name, side, "a finite place in px") for name, side in (("left", left), ("top", top)))
+        left, top = (number(name, side, "a finite number of px") for name, side in (("left", left), ("top", top)))
         width, height = (whole_number(name, side, least=1) for name, side in (("width", width), ("height", height)))
         shift = self.K.new_tensor([[0, 0, left], [0, 0, top], [0, 0, 0]])
         return self._with(K=self.K - shift, size=checked_size((width, height)))

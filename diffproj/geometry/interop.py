@@ -36,6 +36,8 @@ def tensors_from_opencv(
         rotation_vector = _three("rvec", _vector("rvec", rvec, K))
         if rotation_vector.shape[:-1].numel():
             R = axis_angle_to_rotation_matrix(rotation_vector)
+            if has_values(R) and not bool(R.isfinite().all()):
+                raise ValueError("rvec: want angles in radians, got numbers too large for any")
         else:  # which Kornia refuses
             R = rotation_vector.new_empty(*rotation_vector.shape, 3)
     t = None if tvec is None else _three("tvec", _vector("tvec", tvec, K))

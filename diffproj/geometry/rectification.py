@@ -266,8 +266,8 @@ def _checked(
             "of an image as OpenCV has it"
         )
     image, camera = check_tensor(name, image, "C", "H", "W"), as_camera(camera)
-    if 0 in image.shape[-2:]:
-        raise ValueError(f"{name}: want at least one pixel, got shape {tuple(image.shape)}")
+    if 0 in image.shape[-3:]:
+        raise ValueError(f"{name}: want at least one channel and one pixel, got shape {tuple(image.shape)}")
     plane = as_plane(plane).like(camera.K)
     check_same_kind(camera=camera.K, plane=plane.normal)
     if image.device != camera.device:  # of another dtype it may be

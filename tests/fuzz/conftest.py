@@ -38,7 +38,7 @@ def spoilt(value: Any, draw: random.Random, strangers: Sequence[Any]) -> Any:
             -value,
             0,
             value + 0.5,
-            1000 * value,
+            100 * value,
             1e-9,
             1e300,
             math.nan,

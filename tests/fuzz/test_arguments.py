@@ -103,7 +103,7 @@ WRONG: list[Case] = [
     (ValueError, "test: want at least one view", lambda _: dp.run_experiment(VIEWS, VIEWS[:0], BOARD)),
     (ValueError, "views: want those of at least one camera", lambda _: dp.calibrate(dp.Views(torch.zeros(0, 3, 54, 2), size=(9, 9)), BOARD)),
     (ValueError, "views: want 54 corners", lambda _: dp.calibrate(dp.Views(torch.zeros(3, 0, 2), size=(9, 9)), BOARD)),
-    (ValueError, "image: want at least one pixel", lambda _: dp.rectify(IMAGE[:, :0], CAMERA, PLANE, (0, 0, 9, 9), 1)),
+    (ValueError, "image: want at least one channel and one pixel", lambda _: dp.rectify(IMAGE[:, :0], CAMERA, PLANE, (0, 0, 9, 9), 1)),
     (
         ValueError,
         "distance: want poses from which the whole board is in view, got 0 of 2 views",
