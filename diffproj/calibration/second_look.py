@@ -168,11 +168,7 @@ def _poorer(task: Task) -> Task | None:
     late = [i for i, name in enumerate(names) if name in task.parameters.coefficient_names[1:]]
     if not late:
         return None
-    P, s = task.pixels.shape[0], len(names)
-    basis = torch.eye(s, dtype=task.pixels.dtype, device=task.pixels.device).expand(P, s, s)
-    basis = (basis if task.basis is None else task.basis).clone()
-    basis[:, late] = 0.0
-    return replace(task, basis=basis[..., (basis != 0).any(1).any(0)])
+    return task.holding(late)
 
 
 def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Tensor, Pose]]:

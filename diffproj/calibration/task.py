@@ -69,6 +69,14 @@ class Task:
         kind = BoardError if self.objective == "plane" else Reprojection
         return kind(self.points, self.pixels, self.used, self.lens, self.bow, self.skew)
 
+    def holding(self, where: list[int]) -> "Task":
+        """The same with some of the shared parameters held, by their positions."""
+        P, s = self.pixels.shape[0], len(self.names)
+        basis = torch.eye(s, dtype=self.pixels.dtype, device=self.pixels.device).expand(P, s, s)
+        basis = (basis if self.basis is None else self.basis).clone()
+        basis[:, where] = 0.0
+        return replace(self, basis=basis[..., (basis != 0).any(1).any(0)])
+
     def part(self, where: slice | Tensor) -> "Task":
         """The task of some of the cameras."""
         cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}

@@ -13,10 +13,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from diffproj._core.arguments import checked_seed, whole_number
-from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.data import Data
 from diffproj.calibration.distinct import alike
 from diffproj.calibration.held_out import errors_of, folds_of, repeated, without_views
+from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.options import CalibrationOptions, calibration_options
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.lens.models import LensModel
@@ -101,7 +101,7 @@ def cross_validate(
         raise ValueError("bow: want False, for held-out views are located on a flat board")
     want = f"a whole number from 2 to the number of views, {len(views)}"
     folds = whole_number("folds", folds, want, least=2, most=len(views))
-    fits, errors = without_views(views, target, distortion, folds_of(views, folds), chosen)
+    fits, errors = without_views(views, target, distortion, folds_of(views, folds), chosen, who="cross_validate")
     held_out_px, held_out_world, lost = errors.over_views()
     in_sample_px, in_sample_world, _ = errors_of(fits, fits.views.pixels, fits.used).over_views()
     parts = in_sample_px, held_out_px, in_sample_world, held_out_world
@@ -149,7 +149,7 @@ def bootstrap(
     _check_views(views)
     draws = whole_number("draws", draws, "a whole number of at least 2", least=2)
     _check_lens(distortion)
-    calibration_options("bootstrap", options)
+    chosen = calibration_options("bootstrap", options)
     if "weights" in options:
         raise ValueError("weights: want none, for they count here how often a view was drawn")
     generator = torch.Generator().manual_seed(checked_seed(seed))
@@ -162,8 +162,8 @@ def bootstrap(
     counts = torch.nn.functional.one_hot(drawn, number).sum(1).to(torch.float64)[:, group]
     every = repeated(views, draws)
     hidden = (counts == 0).unsqueeze(-1).expand(every.visible.shape)
-    options |= {"weights": counts.unsqueeze(-1), "throw": False}
-    found = calibrate(every.hiding(hidden), target, distortion, **options)
+    chosen = chosen.but(weights=counts.unsqueeze(-1), throw=False)
+    found = calibrated(every.hiding(hidden), target, distortion, chosen, "bootstrap")
     kept = found.converged
     if int(kept.sum()) < max(2, draws // 2):
         raise CalibrationError(f"bootstrap: {int(kept.sum())} of {draws} draws determine the camera; add views", found)

@@ -160,7 +160,7 @@ class PlaneMap(Copied):
     ) -> tuple[list[Tensor | None], list[Tensor], Tensor, Tensor]:
         """The components of `p`, those of the points, `1 / (b . p)`, and which are valid; 0 where they are not."""
         sight, seen = self._sight(pixels)
-        denominator, threshold = _denominator(rows[3], sight)
+        denominator, threshold = _denominator(self.matrix, rows[3], sight)
         valid = denominator > threshold  # false for NaN, too
         if seen is not None:
             valid = valid & seen
@@ -200,7 +200,7 @@ class PlaneMap(Copied):
 
     def _explain(self, pixels: Tensor) -> tuple[Tensor]:
         sight, seen = self._sight(pixels)
-        denominator, threshold = _denominator(entries(self.matrix)[3], sight)
+        denominator, threshold = _denominator(self.matrix, entries(self.matrix)[3], sight)
         reasons = torch.where(denominator > threshold, Reason.VALID, Reason.PARALLEL)
         reasons = torch.where(denominator < -threshold, Reason.BEHIND, reasons)
         reasons = torch.where((self.matrix[..., 3, :] == 0).all(dim=-1, keepdim=True), Reason.CAMERA_ON_PLANE, reasons)
@@ -341,11 +341,11 @@ def _largest_singular_value(by_u: Tensor, by_v: Tensor) -> Tensor:
     return torch.where(some, torch.where(some, squared, 1.0).sqrt(), 0.0) * size
 
 
-def _denominator(b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
+def _denominator(matrix: Tensor, b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
     """`b . p`, and the size below which rounding decides its sign: that of its terms, and of what b was built from."""
-    sizes = [entry.detach().abs() for entry in b]
-    least = torch.stack(sizes).amax(0) * torch.finfo(b[0].dtype).eps
-    bounds = [(size + least) * rounding(b[0].dtype) for size in sizes]
+    size = matrix[..., 3, :].detach().abs()
+    size = (size + size.amax(-1, keepdim=True) * torch.finfo(size.dtype).eps) * rounding(size.dtype)
+    bounds = size.unsqueeze(-1).unbind(-2)
     threshold = linear([bounds], [component if component is None else component.detach().abs() for component in sight])
     return linear([b], sight)[0], threshold[0]
 

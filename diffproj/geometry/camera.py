@@ -9,6 +9,7 @@ A world point reaches its pixel in three steps, and a pixel goes back by the sam
 `F` may be any invertible 2x2 matrix: skew, or an image that an augmentation has turned, stays exact.
 """
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -40,6 +41,8 @@ from diffproj.lens.protocol import Lens
 
 ROTATION_TOLERANCE = 1e-5
 """How far `R^T R` may be from the identity, entry by entry, where a user hands a camera in."""
+ROUNDED_ASPECT = 1.1
+"""Factor by which rounding to whole pixels may change the aspect of an image."""
 
 SQUARED = 0.45
 """The power of the largest number up to which a pixel counts as finite: its square, and what is left of it, are."""
@@ -171,7 +174,8 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         Each axis has its own scale, so that sides rounded to whole pixels stay exact.
 
         Args:
-            size: `(width, height)` of the resized image, its aspect that of the camera's to within a pixel.
+            size: `(width, height)` of the resized image, its aspect that of the camera's to within a pixel, and a
+                tenth.
             stretched: whether the whole image was stretched to another aspect, as networks of a fixed input size do.
 
         Raises:
@@ -195,7 +199,9 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         width, height = checked_size(size) or self.size
         scale = (width / self.size[0], height / self.size[1])
         # Rounding moves each side by a pixel at most: is there one scale that both may have been rounded from?
-        if abs(scale[0] - scale[1]) > 1 / self.size[0] + 1 / self.size[1] and not stretched:
+        # Of a few pixels it would leave no aspect at all: there is a limit to what it may change.
+        rounded = abs(scale[0] - scale[1]) <= 1 / self.size[0] + 1 / self.size[1]
+        if not (rounded and max(scale) <= ROUNDED_ASPECT * min(scale)) and not stretched:
             raise ValueError(
                 f"resized: want the aspect of {self.size[0]} x {self.size[1]} px, got {width} x {height}; where the "
                 "image shows a part of the camera's, use cropped(left, top, width, height) first; where all of it was "
@@ -394,8 +400,11 @@ def as_camera(camera: Camera | PinholeCamera, name: str = "camera") -> Camera:
     """
     if isinstance(camera, Camera):
         return camera
-    has_cameras = not isinstance(camera, type) and isinstance(getattr(camera, "cameras", None), Camera)
-    remedy = "give its .camera, or its .cameras for the poses" * has_cameras
+    remedy = ""
+    if isinstance(camera, str | os.PathLike):
+        remedy = "load it with dp.load_camera(path)"
+    elif not isinstance(camera, type) and isinstance(getattr(camera, "cameras", None), Camera):
+        remedy = "give its .camera, or its .cameras for the poses"
     return Camera.from_kornia(instance(name, camera, PinholeCamera, "dp.Camera or kornia's PinholeCamera", remedy))
 
 

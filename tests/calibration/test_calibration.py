@@ -894,12 +894,12 @@ def test_scales_of_weights_and_losses() -> None:
     views, board = dp.example_views("left")[:6], dp.Chessboard()
     want = dp.calibrate(views, board, "brown4")
     for weight in (1e-25, 1e-12, 1e25):
-        found = dp.calibrate(views, board, "brown4", weights=weight)
+        found = dp.calibrate(views, board, "brown4", weights=torch.tensor(weight, dtype=torch.float64))
         torch.testing.assert_close(found.camera.K, want.camera.K, rtol=1e-8, atol=0)
         deviation = found.covariance.deviations["f_x"]
         torch.testing.assert_close(deviation, want.covariance.deviations["f_x"], rtol=1e-6, atol=0)
     with pytest.raises(ValueError, match="weights: want 0 or numbers from 1e-100 to 1e"):
-        dp.calibrate(views, board, "brown4", weights=1e-300)
+        dp.calibrate(views, board, "brown4", weights=torch.tensor(1e-300, dtype=torch.float64))
     with pytest.raises(dp.CalibrationError, match="scale of the loss is so far below the residuals"):
         dp.calibrate(views, board, "none", loss=dp.Huber(1e-25))
     for scale in (1e-200, 1e200, 0.0, float("nan")):

@@ -55,7 +55,9 @@ def test_resizing_keeps_pixel_centres_at_integers(camera: dp.Camera) -> None:
     assert half.size == (320, 240)
 
 
-@pytest.mark.parametrize("size", [(321, 240), (320, 241), (319, 240), (1280, 959), (64, 48), (1, 1), (2133, 1600)])
+@pytest.mark.parametrize(
+    "size", [(321, 240), (320, 241), (319, 240), (1280, 959), (64, 48), (13, 10), (4, 3), (2133, 1600)]
+)
 def test_resizing_allows_for_sides_rounded_to_whole_pixels(camera: dp.Camera, size: tuple[int, int]) -> None:
     """Each axis keeps its own scale, so that the pixels are exactly those of the resized image."""
     points = torch.tensor([[10.0, 20, 0], [-50, 60, 0]], dtype=D)
@@ -64,7 +66,9 @@ def test_resizing_allows_for_sides_rounded_to_whole_pixels(camera: dp.Camera, si
     torch.testing.assert_close(camera.resized(size).project(points)[0], want)
 
 
-@pytest.mark.parametrize("size", [(640, 360), (1280, 720), (480, 640), (324, 240), (320, 242), (224, 224)])
+@pytest.mark.parametrize(
+    "size", [(640, 360), (1280, 720), (480, 640), (324, 240), (320, 242), (224, 224), (1, 1), (2, 2), (3, 2)]
+)
 def test_resizing_to_another_aspect_is_refused_unless_it_is_meant(camera: dp.Camera, size: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match=r"want the aspect of 640 x 480 px, got .* cropped\(left.* stretched=True"):
         camera.resized(size)

@@ -129,14 +129,16 @@ def test_points_exactly_on_a_plane_have_an_rms_with_a_gradient() -> None:
     assert torch.equal(torch.autograd.grad(rms, points)[0], torch.zeros(3, 3))
 
 
+@pytest.mark.plain
 def test_parallels_at_no_distance() -> None:
     for distance in (float("nan"), float("inf"), torch.tensor(float("nan"))):
-        with pytest.raises(ValueError, match="distance: want (a )?finite number"):
+        with pytest.raises(ValueError, match="distance: want (a )?finite numbers?, got"):
             dp.Plane.z(0.0).parallel(distance)
     with pytest.raises(TypeError, match="distance: want a number, got"):
         dp.Plane.z(0.0).parallel(None)
 
 
+@pytest.mark.plain
 def test_an_array_is_copied() -> None:
     normal = np.array([0.0, 0, 1])
     plane = dp.Plane(normal, 0.0)
