@@ -341,7 +341,7 @@ def test_sizes_and_crops_that_are_none() -> None:
     ):
         with pytest.raises(ValueError, match=f"{name}: want a finite number"):
             camera.cropped(left, top, 10, 10)
-    with pytest.raises(TypeError, match="left: want a number, got NoneType"):
+    with pytest.raises(TypeError, match="left: want a finite number of px, got None"):
         camera.cropped(None, 0, 10, 10)
 
 

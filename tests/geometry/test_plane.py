@@ -134,7 +134,7 @@ def test_parallels_at_no_distance() -> None:
     for distance in (float("nan"), float("inf"), torch.tensor(float("nan"))):
         with pytest.raises(ValueError, match="distance: want (a )?finite numbers?, got"):
             dp.Plane.z(0.0).parallel(distance)
-    with pytest.raises(TypeError, match="distance: want a number, got"):
+    with pytest.raises(TypeError, match="distance: want a tensor, an array or numbers, got None"):
         dp.Plane.z(0.0).parallel(None)
 
 
