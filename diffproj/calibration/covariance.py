@@ -28,7 +28,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.arguments import instance, position
 from diffproj._core.copying import Copied
+from diffproj._core.numerics import broadcast_batches
 from diffproj.calibration.solver import Equations
 
 SINGULAR = 2e-15
@@ -78,10 +80,11 @@ class Covariance(Copied):
 
     def between(self, view: int, other: int) -> Float[Tensor, "*batch 6 6"]:
         """The cross-covariance of the poses of two views; the covariance of the pose where they are the same."""
+        view, other = self._number("view", view), self._number("other", other)
         F, G = self._follow[..., view, :, :], self._follow[..., other, :, :]
         Q, P = self._mixed[..., view, :, :], self._mixed[..., other, :, :]
         blocks = F @ zero_where_infinite(self.shared) @ G.mT - Q @ G.mT - F @ P.mT
-        same = view % self._alone.shape[-3] == other % self._alone.shape[-3]
+        same = view == other
         if same:
             blocks = blocks + self._alone[..., view, :, :]
         blocks = self._turns[..., view, :, :] @ blocks @ self._turns[..., other, :, :].mT
@@ -91,6 +94,7 @@ class Covariance(Copied):
 
     def cross(self, view: int) -> Float[Tensor, "*batch 6 s"]:
         """The cross-covariance of a pose (rows) and the shared parameters (columns)."""
+        view = self._number("view", view)
         cross = self._mixed[..., view, :, :] - self._follow[..., view, :, :] @ zero_where_infinite(self.shared)
         return torch.where(self.undetermined_views[..., view, None, None], 0.0, self._turns[..., view, :, :] @ cross)
 
@@ -104,7 +108,13 @@ class Covariance(Copied):
 
         The noise of both is assumed independent; the bow of the other calibration's board is dropped.
         """
+        instance("known", known, Covariance, "a dp.Covariance")
         s = self.shared.shape[-1]
+        if known.names[:s] != self.names:
+            raise ValueError(
+                f"known: want a covariance of {', '.join(self.names)}, got one of {', '.join(known.names)}"
+            )
+        broadcast_batches(covariance=self.shared.shape[:-2], known=known.shared.shape[:-2])
         shared, undetermined = known.shared[..., :s, :s], known.undetermined[..., :s]
         batch = self.shared.shape[:-2]
         shared, undetermined = shared.expand(*batch, s, s), undetermined.expand(*batch, s)
@@ -177,6 +187,9 @@ class Covariance(Copied):
         ]
         known = undetermined, undetermined_views, dispersion
         return cls(tuple(fields["names"]), shared + infinite, *known, *blocks, *middle)
+
+    def _number(self, name: str, view: int) -> int:
+        return position(name, view, self._alone.shape[-3], "views")
 
     @property
     def _turns(self) -> Tensor:

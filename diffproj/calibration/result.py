@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffproj._core.arguments import instance
 from diffproj._core.copying import Copied
 from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
 from diffproj.calibration.border import border_with_rays
@@ -334,6 +335,16 @@ class Calibration(Copied):
         """How each camera ended, in a sentence."""
         codes = [Status(code) for code in self.status.flatten().tolist()]
         return [cause or SENTENCES[code] for code, cause in zip(codes, self.causes or ("",) * len(codes), strict=True)]
+
+
+def as_calibration(calibration: Calibration) -> Calibration:
+    """A calibration as it is.
+
+    Raises:
+        TypeError: it is none.
+    """
+    want = "a dp.Calibration"
+    return instance("calibration", calibration, Calibration, want, "dp.calibrate and dp.load_calibration give one")
 
 
 def _spread(deviation: Tensor | None, form: str) -> str:

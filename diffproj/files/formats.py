@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
+from diffproj._core.arguments import called
 from diffproj.calibration.result import Calibration
 from diffproj.files import opencv, own_json
 from diffproj.geometry.camera import Camera
@@ -48,6 +49,8 @@ def format_of(path: Path, name: str | None = None) -> Format:
     """
     names = " or ".join(map(repr, FORMATS))
     if name is not None:
+        if not isinstance(name, str):
+            raise TypeError(f"format: want {names}, got {called(name)}")
         if name not in FORMATS:
             raise ValueError(f"format: want {names}, got {name!r}")
         return FORMATS[name]

@@ -1,7 +1,6 @@
 """`load`, `load_camera` and `load_calibration`: cameras and calibrations from files."""
 
-from pathlib import Path
-
+from diffproj._core.arguments import file_path
 from diffproj.calibration.result import Calibration
 from diffproj.files import own_json
 from diffproj.files.formats import FormatName, PathLike, format_of
@@ -19,6 +18,7 @@ def load_camera(path: PathLike, format: FormatName | None = None) -> Camera:  # 
         The camera; in float64 from OpenCV's formats, in the dtype it was saved in from JSON.
 
     Raises:
+        TypeError: the path is none, or the format is no string.
         FileNotFoundError: there is no such file.
         ValueError: unknown suffix or format, or the file is not what it should be.
 
@@ -29,7 +29,7 @@ def load_camera(path: PathLike, format: FormatName | None = None) -> Camera:  # 
         ...     dp.load_camera(f"{folder}/camera.yaml")
         Camera(batch_shape=(), pinhole, size=(640, 480), torch.float64, cpu)
     """
-    path = Path(path)
+    path = file_path("path", path)
     return format_of(path, format).read_camera(path)
 
 
@@ -37,6 +37,7 @@ def load_calibration(path: PathLike) -> Calibration:
     """Load a whole calibration from this package's own JSON; see `save_camera`.
 
     Raises:
+        TypeError: the path is none, or the format is no string.
         FileNotFoundError: there is no such file.
         ValueError: the file is no JSON of this package, or holds a camera alone.
 
@@ -49,7 +50,7 @@ def load_calibration(path: PathLike) -> Calibration:
         >>> again.summary() == calibration.summary()
         True
     """
-    path = Path(path)
+    path = file_path("path", path)
     if format_of(path) is not own_json:
         raise ValueError(f"{path}: want a .json file, for OpenCV's formats hold no corners; load_camera reads them")
     calibration = own_json.read_calibration(path)
@@ -62,9 +63,10 @@ def load(path: PathLike) -> Camera | Calibration:
     """Load what a file holds: the whole calibration where there is one, the camera otherwise.
 
     Raises:
+        TypeError: the path is none, or the format is no string.
         FileNotFoundError: there is no such file.
         ValueError: unknown suffix, or the file is not what it should be.
     """
-    path = Path(path)
+    path = file_path("path", path)
     calibration = own_json.read_calibration(path) if format_of(path) is own_json else None
     return load_camera(path) if calibration is None else calibration

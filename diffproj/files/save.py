@@ -1,9 +1,8 @@
 """`save_camera`: cameras and calibrations to files."""
 
-from pathlib import Path
-
 from kornia.geometry.camera import PinholeCamera
 
+from diffproj._core.arguments import file_path
 from diffproj._core.atomic import write_whole
 from diffproj.calibration.result import Calibration
 from diffproj.files.formats import FormatName, PathLike, format_of
@@ -19,7 +18,7 @@ def save_camera(path: PathLike, camera: Camera | PinholeCamera | Calibration, fo
         format: `"opencv"` or `"json"`; by the suffix if left out.
 
     Raises:
-        TypeError: it is neither a camera nor a calibration.
+        TypeError: it is neither a camera nor a calibration, the path is none, or the format is no string.
         ValueError: unknown suffix or format, or something that the format cannot hold.
         OSError: the file cannot be written.
 
@@ -36,5 +35,5 @@ def save_camera(path: PathLike, camera: Camera | PinholeCamera | Calibration, fo
         raise TypeError(f"camera: want dp.Camera or dp.Calibration, got {type(camera).__name__}")
     if isinstance(camera, PinholeCamera):
         camera = as_camera(camera)
-    path = Path(path)
+    path = file_path("path", path)
     write_whole(path, format_of(path, format).dumps(path, camera))

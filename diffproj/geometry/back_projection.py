@@ -26,6 +26,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.linalg import vector_norm
 
+from diffproj._core.arguments import Array, tensor_of
 from diffproj._core.batched import register_pytree
 from diffproj._core.copying import Copied
 from diffproj._core.numerics import (
@@ -42,7 +43,7 @@ from diffproj._core.numerics import (
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.geometry.intrinsics import pixel_to_normalized
-from diffproj.geometry.plane import Plane
+from diffproj.geometry.plane import Plane, as_plane
 from diffproj.lens.slopes import by_direction
 
 
@@ -105,9 +106,7 @@ class PlaneMap(Copied):
         return plane_map
 
     def _build(self, camera: Camera | PinholeCamera, plane: Plane, warn: bool) -> None:
-        camera = as_camera(camera)
-        if not isinstance(plane, Plane):
-            raise TypeError(f"plane: want a dp.Plane, got {type(plane).__name__}")
+        camera, plane = as_camera(camera), as_plane(plane)
         plane = plane.like(camera.K)
         check_same_kind(camera=camera.K, plane=plane.normal)
         if plane.is_per_point:
@@ -124,7 +123,7 @@ class PlaneMap(Copied):
         return plane_map
 
     def __call__(
-        self, pixels: Float[Tensor, "*#batch n 2"]
+        self, pixels: Float[Tensor, "*#batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
         """Points `(*B, N, 3)` and `valid (*B, N)` of pixels `(*B, N, 2)`; see `back_project`."""
         rows = entries(self.matrix)
@@ -136,7 +135,7 @@ class PlaneMap(Copied):
         return (points.squeeze(-2), valid.squeeze(-1)) if self.is_per_point else (points, valid)
 
     def resolution(
-        self, pixels: Float[Tensor, "*#batch n 2"]
+        self, pixels: Float[Tensor, "*#batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*#batch n"], Bool[Tensor, "*#batch n"]]:
         """World units that a pixel covers `(*B, N)`, and `valid (*B, N)`; see the function `ground_resolution`."""
         rows = entries(self.matrix)
@@ -147,7 +146,7 @@ class PlaneMap(Copied):
         found, valid = in_blocks(resolution, self._checked(pixels), self.matrix, *self.camera.tensors())
         return (found.squeeze(-1), valid.squeeze(-1)) if self.is_per_point else (found, valid)
 
-    def explain(self, pixels: Float[Tensor, "*#batch n 2"]) -> Int[Tensor, "*#batch n"]:
+    def explain(self, pixels: Float[Tensor, "*#batch n 2"] | Array) -> Int[Tensor, "*#batch n"]:
         """`Reason` codes `(*B, N)` of pixels `(*B, N, 2)`; see the function `explain`."""
         (reasons,) = in_blocks(self._explain, self._checked(pixels), self.matrix, *self.camera.tensors())
         return reasons.squeeze(-1) if self.is_per_point else reasons
@@ -217,16 +216,17 @@ class PlaneMap(Copied):
         direction, seen = self.camera.directions(pixels)
         return list(direction.unbind(-1)), seen
 
-    def _checked(self, pixels: Tensor) -> Tensor:
-        if self.is_per_point and isinstance(pixels, Tensor) and pixels.ndim >= 2:
-            pixels = pixels.unsqueeze(-2)
+    def _checked(self, pixels: Tensor | Array) -> Tensor:
+        if self.is_per_point:
+            pixels = tensor_of("pixels", pixels, self.camera.K)
+            pixels = pixels.unsqueeze(-2) if pixels.ndim >= 2 else pixels
         pixels = self.camera._checked("pixels", pixels, 2)
         batch = broadcast_batches(map=self.matrix.shape[:-2], pixels=pixels.shape[:-2])
         return pixels.expand(*batch, *pixels.shape[-2:])
 
 
 def back_project(
-    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane
+    pixels: Float[Tensor, "*#batch n 2"] | Array, camera: Camera | PinholeCamera, plane: Plane
 ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
     """Intersect the viewing rays of pixels with a plane.
 
@@ -245,7 +245,7 @@ def back_project(
         camera. Points are (0, 0, 0) there, and their gradient is zero.
 
     Raises:
-        TypeError: tensors of integers or of mixed dtypes.
+        TypeError: not pixels, a camera and a plane in this order, or tensors of integers or of mixed dtypes.
         ValueError: wrong shapes, mixed devices, or batch shapes that do not broadcast.
 
     Example:
@@ -263,7 +263,7 @@ def back_project(
 
 
 def explain(
-    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane
+    pixels: Float[Tensor, "*#batch n 2"] | Array, camera: Camera | PinholeCamera, plane: Plane
 ) -> Int[Tensor, "*#batch n"]:
     """Say for each pixel why it has no point on the plane, or that it has one.
 
@@ -291,7 +291,7 @@ def explain(
 
 
 def ground_resolution(
-    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane
+    pixels: Float[Tensor, "*#batch n 2"] | Array, camera: Camera | PinholeCamera, plane: Plane
 ) -> tuple[Float[Tensor, "*#batch n"], Bool[Tensor, "*#batch n"]]:
     """World units that a pixel covers on the plane along its worst direction.
 

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffproj._core.arguments import Array
 from diffproj._core.batched import Batched, Rearrange
 from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, has_values
 from diffproj.lens.plan import AXES, Plan, Recipe, domain_of, plan_of, register_recipe
@@ -25,7 +26,7 @@ class CoefficientLens(Batched, ABC):
     coefficients: Tensor
     _key: str  # of the class, among the recipes of `plan`
 
-    def __init__(self, coefficients: Float[Tensor, "*lens k"]):
+    def __init__(self, coefficients: Float[Tensor, "*lens k"] | Array):
         coefficients = check_tensor("coefficients", coefficients, "k")
         if coefficients.shape[-1] not in self.counts:
             counts = ", ".join(map(str, self.counts))
@@ -139,9 +140,9 @@ class CoefficientLens(Batched, ABC):
         """The coefficients, zero where the lens is of no use, so that no NaN gets into a gradient."""
         return torch.where((domain > 0).unsqueeze(-1), self.coefficients, 0)
 
-    def _checked(self, name: str, points: Tensor, size: int) -> Tensor:
+    def _checked(self, name: str, points: Tensor | Array, size: int) -> Tensor:
         """Points in the lens's own kind, with all batch axes."""
-        points = check_tensor(name, points, "N", size)
+        points = check_tensor(name, points, "N", size, like=self.coefficients)
         check_same_kind(coefficients=self.coefficients, **{name: points})
         batch = broadcast_batches(lens=self.batch_shape, **{name: points.shape[:-2]})
         return points.expand(*batch, *points.shape[-2:])

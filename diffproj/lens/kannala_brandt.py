@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.arguments import Array
 from diffproj._core.numerics import has_values, in_blocks, in_float64, least_depth
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.compiling import coordinates, derivative_wanted, with_batch_in_front
@@ -74,7 +75,7 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
         return self._domain()
 
     def project_direction(
-        self, direction: Float[Tensor, "*batch n 3"]
+        self, direction: Float[Tensor, "*batch n 3"] | Array
     ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
         """Project directions of the camera frame to distorted points on the normalised plane.
 
@@ -100,7 +101,7 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
         return in_blocks(forward, self._checked("direction", direction, 3), self.coefficients)  # type: ignore[return-value]
 
     def unproject(
-        self, xy_distorted: Float[Tensor, "*batch n 2"]
+        self, xy_distorted: Float[Tensor, "*batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*out n 3"], Bool[Tensor, "*out n"]]:
         """Directions whose projections are the distorted points: the exact inverse of `project_direction`.
 

@@ -15,12 +15,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.arguments import called, number, numbers, whole_number
 from diffproj.calibration.region import in_region
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.result import Calibration, as_calibration
 from diffproj.geometry.back_projection import ground_resolution
 from diffproj.geometry.grid import pixel_grid
-from diffproj.geometry.plane import Plane
-from diffproj.measurement.measure import measure, view_number
+from diffproj.geometry.plane import Plane, as_plane
+from diffproj.measurement.measure import measure
+from diffproj.targets.views import view_number
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,7 @@ class AccuracyMap:
                 left out.
 
         Raises:
+            TypeError: it is no calibration, or another argument is of the wrong kind.
             ValueError: many cameras or planes, no size, no such view, or a step that is not positive.
 
         Example:
@@ -80,11 +83,12 @@ class AccuracyMap:
             >>> accuracy.deviation.shape, bool(accuracy.covered[6, 8])
             (torch.Size([13, 17]), True)
         """
-        size = calibration.camera.size
+        size = as_calibration(calibration).camera.size
         if calibration.views.batch_shape or size is None:
             raise ValueError("calibration: want one camera of known size; index the views, or give them a size")
-        if not step > 0:
-            raise ValueError(f"step: want a positive distance in px, got {step}")
+        step = number("step", step, "a positive distance in px", above=0)
+        if (size[0] / step) * (size[1] / step) > MOST_PLACES:
+            raise ValueError(f"step: want a positive distance in px that gives at most 10^8 places, got {step:g}")
         columns, rows = (math.ceil((side - 1) / step) + 1 for side in size)
         pixels = _grid(rows, columns, (0.0, 0.0, size[0] - 1.0, size[1] - 1.0), calibration.points)
         return _mapped(pixels, calibration, _single(plane), view, pixel_sigma)
@@ -111,7 +115,8 @@ class AccuracyMap:
                 left out.
 
         Raises:
-            ValueError: many cameras or planes, no such view, an empty extent, or an upright plane.
+            TypeError: it is no calibration, or another argument is of the wrong kind.
+            ValueError: many cameras or planes, no such view, an empty extent or shape, or an upright plane.
 
         Example:
             >>> import diffproj as dp
@@ -120,21 +125,20 @@ class AccuracyMap:
             >>> bool(accuracy.valid.all()), bool((accuracy.deviation < 0.2).all())  # millimetres
             (True, True)
         """
-        if calibration.views.batch_shape:
+        if as_calibration(calibration).views.batch_shape:
             raise ValueError(f"calibration: want one camera, got batch shape {tuple(calibration.views.batch_shape)}")
-        if len(extent) != 4:
-            raise ValueError(f"extent: want (x_min, y_min, x_max, y_max), got {tuple(extent)}")
-        x_min, y_min, x_max, y_max = extent
+        want = "finite (x_min, y_min, x_max, y_max) with room between"
+        x_min, y_min, x_max, y_max = numbers("extent", extent, want, 4)
         if not (x_max > x_min and y_max > y_min):
-            raise ValueError(f"extent: want (x_min, y_min, x_max, y_max) with room between, got {tuple(extent)}")
+            raise ValueError(f"extent: want {want}, got {tuple(extent)}")
         plane = _single(plane)
         if abs(float(plane.unit_normal[2])) < UPRIGHT:
             raise ValueError("plane: want one that is a height over the board's x and y, got an upright one")
-        rows, columns = shape
+        rows, columns = _checked_shape(shape)
         xy = _grid(rows, columns, (x_min, y_min, x_max, y_max), calibration.points)
         z = (plane.offset - (plane.normal[:2] * xy).sum(-1)) / plane.normal[2]
         points = torch.cat([xy, z.unsqueeze(-1)], dim=-1)
-        camera = calibration.cameras[view_number(calibration, view)]
+        camera = calibration.cameras[view_number(view, calibration.views.names)]
         pixels, seen = camera.project(points.flatten(0, 1))
         if camera.size is not None:
             seen = seen & camera.in_image(pixels)
@@ -144,11 +148,25 @@ class AccuracyMap:
 
 UPRIGHT = 1e-9
 """The z of a unit normal below which a plane is at right angles to the board."""
+MOST_PLACES = 10**8
+"""Of a map: more would not fit into memory, and are a step in the wrong unit."""
+
+
+def _checked_shape(shape: Sequence[int]) -> tuple[int, int]:
+    want = "(rows, columns), whole numbers of at least 1"
+    if not isinstance(shape, list | tuple) or len(shape) != 2:
+        raise TypeError(f"shape: want {want}, got {called(shape)}")
+    rows, columns = (whole_number("shape", side, want, least=1) for side in shape)
+    if rows * columns > MOST_PLACES:
+        raise ValueError(f"shape: want at most 10^8 places, got {rows} x {columns}")
+    return rows, columns
 
 
 def _single(plane: Plane | None) -> Plane:
     """One plane in float64; the board's where none was given."""
-    plane = (plane or Plane.z(0.0)).to(torch.float64)
+    plane = (Plane.z(0.0) if plane is None else as_plane(plane)).to(torch.float64)
+    if plane.normal.is_meta:
+        raise ValueError("plane: want one with values, got one on the device meta")
     if plane.batch_shape:
         raise ValueError(f"plane: want one plane, got batch shape {tuple(plane.batch_shape)}")
     return plane
@@ -168,7 +186,7 @@ def _mapped(
     shape = pixels.shape[:2]
     flat = pixels.flatten(0, 1)
     measured = measure(flat, calibration, plane, view, pixel_sigma)
-    resolution, valid = ground_resolution(flat, calibration.cameras[view_number(calibration, view)], plane)
+    resolution, valid = ground_resolution(flat, calibration.cameras[view_number(view, calibration.views.names)], plane)
 
     def shown(values: Tensor) -> Tensor:
         return torch.where(valid, values, torch.nan).reshape(shape)

@@ -26,6 +26,7 @@ from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from diffproj._core.arguments import Array
 from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64, transform
 from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.region import in_region
@@ -33,7 +34,7 @@ from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project, warn_if_rounded
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.intrinsics import pixel_to_normalized
-from diffproj.geometry.plane import Plane
+from diffproj.geometry.plane import Plane, as_plane
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.slopes import by_direction
 from diffproj.measurement import lens_reach
@@ -41,15 +42,16 @@ from diffproj.measurement.doubt import of_the_pose
 from diffproj.measurement.measurement import Measurement
 from diffproj.measurement.propagation import Noise
 from diffproj.measurement.sight import Sight
+from diffproj.targets.views import view_number
 
 
 def measure(
-    pixels: Float[Tensor, "*#batch n 2"],
+    pixels: Float[Tensor, "*#batch n 2"] | Array,
     calibration: Calibration | Camera | PinholeCamera,
     plane: Plane,
     view: int | str = 0,
-    pixel_sigma: float | Tensor | None = None,
-    plane_covariance: Float[Tensor, "*#batch 4 4"] | None = None,
+    pixel_sigma: float | Tensor | Array | None = None,
+    plane_covariance: Float[Tensor, "*#batch 4 4"] | Array | None = None,
 ) -> Measurement:
     """Measure pixels on a plane, with error bars.
 
@@ -68,8 +70,9 @@ def measure(
         A calibration's covariance, and how much larger deviations are where the lens is extrapolated, count as given.
 
     Raises:
-        ValueError: no such view, or a camera without `pixel_sigma`.
-        TypeError: `pixels` are no floating-point tensor.
+        TypeError: not pixels, a calibration or a camera, and a plane in this order, or another argument is of the wrong
+            kind.
+        ValueError: no such view, a camera without `pixel_sigma`, or shapes, devices or values that cannot be.
 
     Example:
         >>> import diffproj as dp
@@ -79,12 +82,12 @@ def measure(
         >>> print(f"{length.value[0]:.1f} ± {length.deviation[0]:.1f} mm")
         199.9 ± 0.2 mm
     """
-    pixels = in_float64(check_tensor("pixels", pixels, "N", 2))
+    pixels, plane = in_float64(check_tensor("pixels", pixels, "N", 2)), as_plane(plane)
     if isinstance(calibration, Calibration):
         camera, known, level, middle = _at_view(calibration, view)
         parameters = replace(calibration.parameters, bow=False)
     else:
-        camera, known, level, middle = as_camera(calibration).upright(), None, None, None
+        camera, known, level, middle = as_camera(calibration, "calibration").upright(), None, None, None
         parameters = Parametrisation.of(camera)
     if pixel_sigma is None and level is None:
         source = "this calibration" if isinstance(calibration, Calibration) else "a camera alone"
@@ -93,6 +96,8 @@ def measure(
     camera, plane = camera.to(torch.float64), plane.to(torch.float64)
     if plane_covariance is not None:
         plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
+        if plane_covariance.device != camera.device:
+            raise ValueError(f"plane_covariance: want device {camera.device}, got {plane_covariance.device}")
         _check_covariance(plane_covariance.detach())
         if plane.is_per_point:
             raise ValueError("plane_covariance: want one plane for all points, got one for each (Plane.per_point)")
@@ -123,7 +128,7 @@ def measure(
         covariances.append(in_float64(plane_covariance))
     away = [points.new_zeros(*points.shape, 0)]
     if isinstance(calibration, Calibration) and calibration.has_alternatives:
-        doubt = of_the_pose(pixels, calibration, view_number(calibration, view), plane, points, valid)
+        doubt = of_the_pose(pixels, calibration, view_number(view, calibration.views.names), plane, points, valid)
         away, covariances = [doubt.columns], [*covariances, doubt.covariance]
     if bool(beyond.any()):  # a parameter of which nothing is known, and no two points follow it alike
         unlike = torch.linspace(1, 2, points.shape[-2], dtype=points.dtype, device=points.device).unsqueeze(-1)
@@ -150,24 +155,12 @@ def _degrees_of_freedom(calibration: Calibration | Camera | PinholeCamera, like:
     return like.new_full(like.shape[:-2], torch.inf) if found is None else found.to(like).expand(like.shape[:-2])
 
 
-def view_number(calibration: Calibration, view: int | str) -> int:
-    """The number of a view, from 0, by its number or its name."""
-    names = calibration.views.names
-    if isinstance(view, str):
-        if view not in names:
-            raise ValueError(f"view: want one of {', '.join(names)}, got {view!r}")
-        return names.index(view)
-    if not -len(names) <= view < len(names):
-        raise ValueError(f"view: want a number below {len(names)}, got {view}")
-    return view % len(names)
-
-
 def _at_view(calibration: Calibration, view: int | str) -> tuple[Camera, Tensor | None, Tensor | None, Tensor | None]:
     """The camera at the pose of a view, the covariance of both, the noise of a pixel `(*B, 1)`, and a point `(3,)`.
 
     In the covariance the pose turns about that point. What is not known is `None`.
     """
-    number = view_number(calibration, view)
+    number = view_number(view, calibration.views.names)
     if not bool(calibration.used[..., number, :].any(-1).all()):
         raise ValueError(f"view: want one whose pose is known, got {view!r}, of which no corner was used")
     known, middle = None, None
@@ -178,9 +171,12 @@ def _at_view(calibration: Calibration, view: int | str) -> tuple[Camera, Tensor 
     return calibration.cameras[..., number], known, level, middle
 
 
-def _expanded(pixel_sigma: float | Tensor | None, like: Tensor) -> Tensor:
+def _expanded(pixel_sigma: float | Tensor | Array | None, like: Tensor) -> Tensor:
     """The standard deviation of each pixel `(*B, N)`, for points `(*B, N, 3)`."""
-    sigma = torch.as_tensor(pixel_sigma, dtype=torch.float64, device=like.device)
+    sigma = check_tensor("pixel_sigma", pixel_sigma, like=like)
+    if sigma.is_meta:
+        raise ValueError("pixel_sigma: want values, got a tensor on the device meta")
+    sigma = sigma.to(like)
     try:
         sigma = sigma.expand(like.shape[:-1])
     except RuntimeError:

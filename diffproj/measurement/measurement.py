@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core import arguments
 from diffproj._core.copying import Copied
 from diffproj.calibration.covariance import zero_where_infinite
 from diffproj.calibration.region import in_region
@@ -130,6 +131,8 @@ class Measurement(Copied):
             which: the numbers of the k points of each of M quantities, `(M, k)`.
 
         Raises:
+            TypeError: no function, or no whole numbers.
+            ValueError: not of shape `(M, k)`, or the function gives something else than a number with a gradient.
             IndexError: there is no such point.
 
         Example:
@@ -140,9 +143,20 @@ class Measurement(Copied):
             >>> print(f"{middle.value[0]:.1f} mm")  # x of the centroid of three corners in a row
             25.0 mm
         """
-        index = self._numbers(which)
+        index = self._numbers("which", which)
+        given = arguments.function("function", function, "a function of k points (k, 3)")
         chosen = self.points[..., index, :]  # (*B, M, k, 3)
-        gradient, value = torch.func.vmap(torch.func.grad_and_value(function))(chosen.flatten(0, -3))
+
+        def checked(points: Tensor) -> Tensor:
+            found = given(points)
+            if not isinstance(found, Tensor) or found.ndim or not found.is_floating_point():
+                raise ValueError(
+                    "function: want one that gives a number, a tensor without axes of floating-point type, got "
+                    f"{arguments.called(found)}"
+                )
+            return found
+
+        gradient, value = torch.func.vmap(torch.func.grad_and_value(checked))(chosen.flatten(0, -3))
         gradient, value = gradient.reshape(chosen.shape), value.reshape(chosen.shape[:-2])
         spread = Propagated.of(self._noise, index, gradient.nan_to_num(0.0, 0.0, 0.0).unsqueeze(-3))
         with torch.no_grad():
@@ -152,15 +166,14 @@ class Measurement(Copied):
 
     def lengths(self, pairs: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
         """Distances between points in world units: of successive points, or of `pairs (M, 2)`."""
-        return self._norms(difference, self._successive(2) if pairs is None else _sets("pairs", pairs, 2))
+        return self._norms(difference, self._successive(2) if pairs is None else self._numbers("pairs", pairs, 2))
 
     def angles(self, triples: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
         """Angles at the second of three points in radians: of successive points, or of `triples (M, 3)`.
 
         Where an arm has no length the deviation is infinite, and where an arm may have none any angle is possible.
         """
-        index = self._successive(3) if triples is None else _sets("triples", triples, 3)
-        index = self._numbers(index)
+        index = self._successive(3) if triples is None else self._numbers("triples", triples, 3)
         arms = [self._norms(difference, index[:, [1, end]]) for end in (0, 2)]
         undefined = (arms[0].value == 0) | (arms[1].value == 0)
         found = self._norms(turn, index, limit=torch.pi, undefined=undefined)
@@ -171,8 +184,17 @@ class Measurement(Copied):
 
         Parts of an outline that crosses itself cancel.
         """
-        every = list(range(self.points.shape[-2])) if corners is None else list(corners)
-        return self._norms(area_vector, [every])
+        if corners is None:
+            every = torch.arange(self.points.shape[-2], device=self.points.device).unsqueeze(0)
+        else:
+            want = "the numbers of the corners of one polygon, as [0, 1, 2]"
+            index = arguments.whole_numbers("corners", corners, want)
+            if index.ndim != 1:
+                raise ValueError(f"corners: want {want}, got shape {tuple(index.shape)}")
+            every = self._numbers("corners", index.unsqueeze(0))
+        if every.shape[-1] < 3:
+            raise ValueError(f"corners: want at least 3, got {every.shape[-1]}")
+        return self._norms(area_vector, every)
 
     def summary(self) -> str:
         """Points and successive lengths with their standard deviations, as a text for people; for one camera.
@@ -205,12 +227,11 @@ class Measurement(Copied):
     def _norms(
         self,
         function: Callable[[Tensor], tuple[Tensor, Tensor]],
-        which: Sequence[Sequence[int]] | Tensor,
+        index: Tensor,
         limit: float = torch.inf,
         undefined: Tensor | None = None,
     ) -> Quantity:
         """Lengths of vectors that depend on the points, or what they lack to the limit: see `shapes`."""
-        index = self._numbers(which)
         chosen = self.points[..., index, :]
 
         def twice(points: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
@@ -267,14 +288,16 @@ class Measurement(Copied):
             found.append(self._number(spread, partial(_coordinate, axis), value, torch.zeros_like(value)))
         return found
 
-    def _numbers(self, which: Sequence[Sequence[int]] | Tensor) -> Tensor:
+    def _numbers(self, name: str, which: Sequence[Sequence[int]] | Tensor, k: int | None = None) -> Tensor:
         """The numbers of points `(M, k)`, from 0."""
-        index, N = torch.as_tensor(which, device=self.points.device), self.points.shape[-2]
-        if index.ndim != 2 or index.is_floating_point():
-            raise ValueError(f"which: want the numbers of k points for each of M quantities, got {tuple(index.shape)}")
+        want = f"point numbers of shape (M, {'k' if k is None else k})"
+        index = arguments.whole_numbers(name, which, want).to(self.points.device)
+        N = self.points.shape[-2]
+        if index.ndim != 2 or index.shape[-1] != (index.shape[-1] if k is None else k) or index.shape[-1] == 0:
+            raise ValueError(f"{name}: want {want}, got shape {tuple(index.shape)}")
         if bool(((index < -N) | (index >= N)).any()):
-            raise IndexError(f"which: want numbers of the {N} points, got {index.flatten().tolist()}")
-        return index % N
+            raise IndexError(f"{name}: want numbers of the {N} points, got {index.flatten().tolist()}")
+        return index % max(1, N)
 
     def _successive(self, k: int) -> Tensor:
         N = self.points.shape[-2]
@@ -282,13 +305,6 @@ class Measurement(Copied):
             raise ValueError(f"points: want at least {k}, got {N}")
         first, following = (torch.arange(count, device=self.points.device) for count in (N - k + 1, k))
         return first.unsqueeze(-1) + following
-
-
-def _sets(name: str, which: Sequence[Sequence[int]] | Tensor, k: int) -> Tensor:
-    index = which if isinstance(which, Tensor) else torch.as_tensor(which, device="cpu")
-    if index.ndim != 2 or index.shape[-1] != k:
-        raise ValueError(f"{name}: want point numbers of shape (M, {k}), got {tuple(index.shape)}")
-    return index
 
 
 def _coordinate(axis: int, points: Tensor) -> Tensor:

@@ -15,14 +15,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.arguments import flag
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.plane import Plane
 from diffproj.lens.models import LensModel
-from diffproj.targets.chessboard import Chessboard
-from diffproj.targets.views import Views
+from diffproj.targets.chessboard import Chessboard, as_board
+from diffproj.targets.views import Views, as_views
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,7 @@ def run_experiment(
         The outcome, in the board's unit.
 
     Raises:
+        TypeError: not views, views and a board in this order, or another argument is of the wrong kind.
         ValueError: views and board do not fit together, or too few views or corners.
         CalibrationError: the fitting views do not determine the camera.
 
@@ -117,6 +119,15 @@ def run_experiment(
         >>> outcome.rows[-1].view, max(outcome.rows[-1].mean) < 0.09  # millimetres
         ('all', True)
     """
+    as_views(fit, "fit")
+    if as_views(test, "test").batch_shape or fit.batch_shape:
+        batch = tuple(fit.batch_shape), tuple(test.batch_shape)
+        raise ValueError(f"fit, test: want views of one camera, got batch shapes {batch[0]} and {batch[1]}")
+    for name, views in (("fit", fit), ("test", test)):
+        if len(views) == 0:
+            raise ValueError(f"{name}: want at least one view, got none")
+    as_board(board)
+    strict = flag("strict", strict)
     calibration = calibrate(fit, board, distortion)
     held_out = torch.zeros(test.pixels.shape[-2], dtype=torch.bool, device=test.device)
     if strict:

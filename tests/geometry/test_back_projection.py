@@ -330,7 +330,11 @@ def test_a_camera_on_the_plane_sees_none_of_it(camera: dp.Camera, pixels: Tensor
 def test_bad_input_is_refused_by_name(camera: dp.Camera, pixels: Tensor) -> None:
     plane = dp.Plane.z(0.0)
     cases = [
-        (TypeError, "pixels: want a torch.Tensor, got ndarray", lambda: dp.back_project(pixels.numpy(), camera, plane)),
+        (
+            TypeError,
+            "pixels: want a tensor, an array or numbers, got 'uv'",
+            lambda: dp.back_project("uv", camera, plane),
+        ),
         (
             TypeError,
             "pixels: want a floating-point tensor, got torch.int64",

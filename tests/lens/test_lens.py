@@ -490,7 +490,7 @@ def test_halves_are_lifted() -> None:
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: BrownConrady([0.0] * 5), TypeError, "coefficients: want a torch.Tensor, got list"),  # type: ignore[arg-type]
+        (lambda: BrownConrady("k1"), TypeError, "coefficients: want a tensor, an array or numbers, got 'k1'"),  # type: ignore[arg-type]
         (lambda: BrownConrady(torch.zeros(5, dtype=torch.int64)), TypeError, "coefficients: want a floating-point"),
         (lambda: BrownConrady(torch.zeros(6)), ValueError, "coefficients: want 4, 5, 8, 12, 14 of them"),
         (lambda: KannalaBrandt(torch.zeros(5)), ValueError, "coefficients: want 4 of them"),

@@ -174,7 +174,7 @@ def test_points_counted_from_the_end_are_the_same_points(calibration: dp.Calibra
 
     same, ends = measured.quantity(total, [[2, 2]]), measured.quantity(total, [[2, -1]])
     assert torch.equal(same.deviation, ends.deviation)
-    with pytest.raises(IndexError, match="which: want numbers of the 3 points"):
+    with pytest.raises(IndexError, match="pairs: want numbers of the 3 points"):
         measured.lengths([[0, 3]])
     with pytest.raises(ValueError, match="pairs: want point numbers"):
         measured.lengths([[0, 1, 2]])
@@ -301,7 +301,7 @@ def test_bad_input_is_refused_by_name(calibration: dp.Calibration) -> None:
     pixels = calibration.views.pixels[0, :2]
     with pytest.raises(ValueError, match="view: want one of left01.jpg, .* got 'left99.jpg'"):
         dp.measure(pixels, calibration, Z, view="left99.jpg")
-    with pytest.raises(ValueError, match="view: want a number below 13, got 13"):
+    with pytest.raises(ValueError, match="view: want a number from -13 to 12, of the views, got 13"):
         dp.measure(pixels, calibration, Z, view=13)
     with pytest.raises(ValueError, match="pixel_sigma: want the noise of the pixels"):
         dp.measure(pixels, calibration.cameras[0], Z)
