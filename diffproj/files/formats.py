@@ -1,14 +1,33 @@
-"""The formats by name, and by the suffix of a file."""
+"""The formats by name, told apart by what is in a file, and for writing by its suffix."""
 
 import os
 from pathlib import Path
+from types import ModuleType
 from typing import Literal, Protocol, runtime_checkable
 
 from diffproj.calibration.result import Calibration
-from diffproj.files import opencv, own_json
+from diffproj.files import (
+    colmap,
+    foreign,
+    kalibr,
+    kitti,
+    matlab,
+    metashape,
+    mrcal,
+    nerfstudio,
+    numpy_arrays,
+    nuscenes,
+    opencv,
+    own_json,
+    ros,
+)
+from diffproj.files.document import Document
+from diffproj.files.found import Found
 from diffproj.geometry.camera import Camera
 
-FormatName = Literal["opencv", "json"]
+FormatName = Literal[
+    "json", "numpy", "colmap", "mrcal", "kitti", "matlab", "metashape", "nerfstudio", "nuscenes", "kalibr", "ros", "opencv"
+]
 PathLike = str | os.PathLike[str]
 
 
@@ -16,43 +35,91 @@ PathLike = str | os.PathLike[str]
 class Format(Protocol):
     """What the module of a format offers."""
 
-    SUFFIXES: tuple[str, ...]
-    """Of its files, in lower case."""
-
-    def dumps(self, path: Path, item: Camera | Calibration) -> str:
-        """A camera or a calibration as the text of the file.
-
-        Raises:
-            ValueError: it has something that the format cannot hold.
-        """
+    def recognises(self, document: Document) -> bool:
+        """Whether the file says that it is of this format; never fails."""
         ...
 
-    def read_camera(self, path: Path) -> Camera:
-        """The camera in a file; of a calibration, the one without a pose.
+    def read(self, document: Document) -> Found:
+        """The cameras of the file.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file is not of this format, or damaged.
+            ValueError: it is not of this format, is damaged, or holds what no camera of this package is.
         """
         ...
 
 
-FORMATS: dict[FormatName, Format] = {"opencv": opencv, "json": own_json}
+@runtime_checkable
+class WritableFormat(Format, Protocol):
+    """A format that is written too."""
+
+    def write(self, path: Path, item: Camera | Calibration) -> dict[Path, str] | dict[Path, bytes]:
+        """The content of each file that is to be written.
+
+        Raises:
+            ValueError: the camera has something that the format cannot hold.
+        """
+        ...
 
 
-def format_of(path: Path, name: str | None = None) -> Format:
+FORMATS: dict[FormatName, ModuleType] = {
+    "json": own_json,
+    "numpy": numpy_arrays,
+    "colmap": colmap,
+    "mrcal": mrcal,
+    "kitti": kitti,
+    "matlab": matlab,
+    "metashape": metashape,
+    "nerfstudio": nerfstudio,
+    "nuscenes": nuscenes,
+    "kalibr": kalibr,
+    "ros": ros,
+    "opencv": opencv,
+}
+"""In the order in which a file is offered to them."""
+
+SUFFIXES: dict[str, FormatName] = {
+    ".json": "json",
+    ".yaml": "opencv",
+    ".yml": "opencv",
+    ".xml": "opencv",
+    ".npz": "numpy",
+    ".txt": "colmap",
+}
+"""What is written under a suffix where no format is named."""
+
+
+def format_of(document: Document, name: str | None = None) -> Format:
+    """The format of that name, or else the one that the file is of.
+
+    Raises:
+        ValueError: there is no such format, or the file is of none.
+    """
+    if name is not None:
+        return _named(name)
+    for known in FORMATS.values():
+        if known.recognises(document):
+            return known
+    raise ValueError(foreign.explanation(document))
+
+
+def format_to_write(path: Path, name: str | None = None) -> WritableFormat:
     """The format of that name, or else the one that goes with the suffix.
 
     Raises:
-        ValueError: there is no such format, or none with this suffix.
+        ValueError: there is no such format, it is only read, or none goes with this suffix.
     """
-    names = " or ".join(map(repr, FORMATS))
+    writable = [known for known, module in FORMATS.items() if isinstance(module, WritableFormat)]
     if name is not None:
-        if name not in FORMATS:
-            raise ValueError(f"format: want {names}, got {name!r}")
-        return FORMATS[name]
-    for known in FORMATS.values():
-        if path.suffix.lower() in known.SUFFIXES:
-            return known
-    suffixes = ", ".join(suffix for known in FORMATS.values() for suffix in known.SUFFIXES)
-    raise ValueError(f"{path}: want a suffix of {suffixes}, or format={names}")
+        found = _named(name)
+        if not isinstance(found, WritableFormat):
+            raise ValueError(f"format: want {' or '.join(map(repr, writable))} to write, got {name!r}, which is only read")
+        return found
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"want a suffix of {', '.join(SUFFIXES)}, or format={' or '.join(map(repr, writable))}")
+    return FORMATS[SUFFIXES[path.suffix.lower()]]  # type: ignore[return-value]
+
+
+def _named(name: str) -> Format:
+    if name not in FORMATS:
+        raise ValueError(f"format: want {' or '.join(map(repr, FORMATS))}, got {name!r}")
+    return FORMATS[name]  # type: ignore[return-value]

@@ -4,23 +4,32 @@ from pathlib import Path
 
 from diffproj.calibration.result import Calibration
 from diffproj.files import own_json
+from diffproj.files.document import Document
 from diffproj.files.formats import FormatName, PathLike, format_of
+from diffproj.files.found import Found
 from diffproj.geometry.camera import Camera
 
 
-def load_camera(path: PathLike, format: FormatName | None = None) -> Camera:  # noqa: A002
+def load_camera(path: PathLike, format: FormatName | None = None, camera: str | int | None = None) -> Camera:  # noqa: A002
     """Load a camera; of a calibration, the camera without a pose.
+
+    The formats are told apart by what is in the file; `diffproj.files` lists them with their conventions, which are
+    turned into those of `Camera`. What is not understood to the last coefficient of the lens is refused.
 
     Args:
         path: the file to read.
-        format: as for `save_camera`.
+        format: the format, where it is not to be told by the content: `"opencv"`, `"ros"`, `"json"`, ...
+        camera: which one of several, by its name in the file or its number, counted from 0. Left out, several cameras
+            are a batch where they have one lens model and one size.
 
     Returns:
-        The camera; in float64 from OpenCV's formats, in the dtype it was saved in from JSON.
+        The camera; in float64, from this package's own JSON in the dtype it was saved in.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: unknown suffix or format, or the file is not what it should be.
+        TypeError: `camera` is neither a name nor a number.
+        OSError: there is no such file, or it cannot be read.
+        ValueError: the file is of no known format, is damaged, holds a lens that is none of this package's, or holds
+            several cameras that make no batch; the message names the file and what to do.
 
     Example:
         >>> import tempfile, torch, diffproj as dp
@@ -29,16 +38,28 @@ def load_camera(path: PathLike, format: FormatName | None = None) -> Camera:  # 
         ...     dp.load_camera(f"{folder}/camera.yaml")
         Camera(batch_shape=(), pinhole, size=(640, 480), torch.float64, cpu)
     """
-    path = Path(path)
-    return format_of(path, format).read_camera(path)
+    document = Document.read(Path(path))
+    try:
+        return found_in(document, format).chosen(camera)
+    except (ArithmeticError, LookupError, RecursionError, ValueError) as error:
+        raise ValueError(_message(document, error)) from error
+
+
+def found_in(document: Document, format: FormatName | None = None) -> Found:  # noqa: A002
+    """All cameras of a file.
+
+    Raises:
+        ValueError: as for `load_camera`, without the name of the file.
+    """
+    return format_of(document, format).read(document)
 
 
 def load_calibration(path: PathLike) -> Calibration:
     """Load a whole calibration from this package's own JSON; see `save_camera`.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is no JSON of this package, or holds a camera alone.
+        OSError: there is no such file, or it cannot be read.
+        ValueError: the file is no JSON of this package, is damaged, or holds a camera alone.
 
     Example:
         >>> import tempfile, diffproj as dp
@@ -49,12 +70,13 @@ def load_calibration(path: PathLike) -> Calibration:
         >>> again.summary() == calibration.summary()
         True
     """
-    path = Path(path)
-    if format_of(path) is not own_json:
-        raise ValueError(f"{path}: want a .json file, for OpenCV's formats hold no corners; load_camera reads them")
-    calibration = own_json.read_calibration(path)
+    document = Document.read(Path(path))
+    calibration = _calibration(document)
     if calibration is None:
-        raise ValueError(f"{path}: want a calibration, got a camera alone; load_camera reads it")
+        raise ValueError(
+            f"{path}: want a calibration as save_camera writes it to .json, got a file with cameras alone; load_camera "
+            "reads it"
+        )
     return calibration
 
 
@@ -62,9 +84,21 @@ def load(path: PathLike) -> Camera | Calibration:
     """Load what a file holds: the whole calibration where there is one, the camera otherwise.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: unknown suffix, or the file is not what it should be.
+        OSError: there is no such file, or it cannot be read.
+        ValueError: as for `load_camera`.
     """
-    path = Path(path)
-    calibration = own_json.read_calibration(path) if format_of(path) is own_json else None
+    calibration = _calibration(Document.read(Path(path)))
     return load_camera(path) if calibration is None else calibration
+
+
+def _calibration(document: Document) -> Calibration | None:
+    try:
+        return own_json.read_calibration(document) if own_json.recognises(document) else None
+    except (ArithmeticError, LookupError, RecursionError, ValueError) as error:
+        raise ValueError(_message(document, error)) from error
+
+
+def _message(document: Document, error: Exception) -> str:
+    """One line that names the file; a key that no reader foresaw to be missing is a damaged file."""
+    said = " ".join(str(error).split())
+    return f"{document.path}: {said if isinstance(error, ValueError) else f'the file is damaged ({error!r})'}"

@@ -21,52 +21,56 @@ from torch import Tensor
 from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.result import Calibration
+from diffproj.files.document import Document
+from diffproj.files.found import Found
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import KINDS, coefficients_of
 from diffproj.targets.views import Views
 
 T = TypeVar("T")
-SUFFIXES: tuple[str, ...] = (".json",)
 KIND, VERSION = "diffproj camera", 1
 """What every file says of itself."""
 
 
-def dumps(path: Path, item: Camera | Calibration) -> str:
-    """A camera or a calibration as the text of a file.
+def recognises(document: Document) -> bool:
+    """Whether it calls itself a camera file of diffproj."""
+    return document.mapping.get("format") == KIND
+
+
+def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
+    """A camera or a calibration.
 
     Raises:
         ValueError: a lens of another library.
     """
     camera = item.camera if isinstance(item, Calibration) else item
-    document = {"format": KIND, "version": VERSION, "camera": _camera_fields(path, camera)}
+    document = {"format": KIND, "version": VERSION, "camera": _camera_fields(camera)}
     if isinstance(item, Calibration):
         document["calibration"] = _calibration_fields(item)
-    return _readable(json.dumps(_without_nan(document), indent=1, allow_nan=False))
+    return {path: _readable(json.dumps(_without_nan(document), indent=1, allow_nan=False))}
 
 
-def read_camera(path: Path) -> Camera:
-    """The camera of a file; of a calibration, the one without a pose.
+def read(document: Document) -> Found:
+    """The camera of a file, a batch where it is one; of a calibration, the one without a pose.
 
     Raises:
-        FileNotFoundError: there is no such file.
         ValueError: it is no camera file of this package, or damaged.
     """
-    return _camera(path, _document(path)["camera"])
+    return Found({"camera": _camera(_checked(document)["camera"])})
 
 
-def read_calibration(path: Path) -> Calibration | None:
+def read_calibration(document: Document) -> Calibration | None:
     """The calibration in a file; `None` where it holds a camera alone.
 
     Raises:
-        FileNotFoundError: there is no such file.
         ValueError: it is no camera file of this package, or damaged.
     """
-    document = _document(path)
-    if "calibration" not in document:
+    fields = _checked(document)
+    if "calibration" not in fields:
         return None
-    camera = _camera(path, document["camera"])
+    camera = _camera(fields["camera"])
     try:
-        found = document["calibration"]
+        found = fields["calibration"]
         R, t, points, pixels = (_tensor(found[key], torch.float64) for key in ("R", "t", "points", "pixels"))
         visible = torch.tensor(found["visible"], dtype=torch.bool)
         views = Views(pixels, visible, found["names"], _size(found["size"]))
@@ -98,15 +102,15 @@ def read_calibration(path: Path) -> Calibration | None:
             _remarks=partial(_same, tuple(found["remarks"])) if "remarks" in found else None,
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
+        raise ValueError(f"the calibration in this file is damaged ({error})") from error
 
 
-def _camera_fields(path: Path, camera: Camera) -> dict[str, Any]:
+def _camera_fields(camera: Camera) -> dict[str, Any]:
     lens = camera.distortion
     try:
         coefficients = coefficients_of(lens, camera.t)
     except TypeError:
-        raise ValueError(f"{path}: distortion: want one of {', '.join(KINDS)}, got {type(lens).__name__}") from None
+        raise ValueError(f"distortion: want one of {', '.join(KINDS)}, got {type(lens).__name__}") from None
     return {
         "dtype": str(camera.dtype).removeprefix("torch."),
         "size": camera.size,
@@ -186,20 +190,17 @@ def _readable(text: str) -> str:
     return re.sub(r"\[[^\[\]{}]*\]", lambda match: re.sub(r"\s*\n\s*", " ", match[0]), text) + "\n"
 
 
-def _document(path: Path) -> dict[str, Any]:
-    """What is in a file, known to be one of this package and of this version."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path}: want a JSON file, got something else ({error})") from error
-    if not isinstance(document, dict) or document.get("format") != KIND or "camera" not in document:
-        raise ValueError(f"{path}: want a camera file of diffproj, got another JSON file")
-    if document.get("version") != VERSION:
-        raise ValueError(f"{path}: want version {VERSION}, got {document.get('version')}; a newer diffproj reads it")
-    return document
+def _checked(document: Document) -> dict[str, Any]:
+    """What is in a file, known to be one of this package and of a version that is read."""
+    fields = document.mapping
+    if fields.get("format") != KIND or "camera" not in fields:
+        raise ValueError("want a camera file of diffproj, got another file")
+    if fields.get("version") != VERSION:
+        raise ValueError(f"want version {VERSION}, got {fields.get('version')}; a newer diffproj reads it")
+    return fields
 
 
-def _camera(path: Path, fields: dict[str, Any]) -> Camera:
+def _camera(fields: dict[str, Any]) -> Camera:
     try:
         dtype = {"float32": torch.float32, "float64": torch.float64}[fields["dtype"]]
         K, R, t = (_tensor(fields[key], dtype) for key in ("K", "R", "t"))
@@ -207,7 +208,7 @@ def _camera(path: Path, fields: dict[str, Any]) -> Camera:
         distortion = lens and KINDS[lens["model"]](_tensor(lens["coefficients"], dtype))
         return Camera(K, R, t, distortion, _size(fields["size"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: the camera in this file is damaged ({error})") from error
+        raise ValueError(f"the camera in this file is damaged ({error})") from error
 
 
 def _size(size: list[int] | None) -> tuple[int, int] | None:
