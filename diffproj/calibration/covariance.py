@@ -28,6 +28,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj.calibration.fields import mask, tensor
 from diffproj.calibration.solver import Equations
 
 SINGULAR = 2e-15
@@ -151,8 +152,8 @@ class Covariance:
 
         Raises:
             KeyError: a field is missing.
-            TypeError: a field holds something other than numbers.
-            ValueError: a field's lists are not of equal lengths.
+            ValueError: a field holds something other than numbers, shapes do not fit each other, or a variance is
+                negative.
 
         Example:
             >>> import diffproj as dp
@@ -160,19 +161,28 @@ class Covariance:
             >>> torch.equal(dp.Covariance.from_fields(covariance.to_fields()).full(), covariance.full())
             True
         """
-        undetermined, undetermined_views = (
-            torch.tensor(fields[key], dtype=torch.bool) for key in ("undetermined", "undetermined_views")
-        )
-        shared, *blocks = (
-            torch.tensor(fields[key], dtype=torch.float64) for key in ("shared", "follow", "mixed", "alone")
-        )
+        names = fields["names"]
+        if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+            raise ValueError("names: want a list of texts, got something else")
+        count = len(names)
+        undetermined_views = mask(fields, "undetermined_views")
+        *batch, views = undetermined_views.shape
+        undetermined = mask(fields, "undetermined", (*batch, count))
+        shared = tensor(fields, "shared", (*batch, count, count), gaps=True)
+        follow, mixed = (tensor(fields, name, (*batch, views, 6, count), gaps=True) for name in ("follow", "mixed"))
+        alone = tensor(fields, "alone", (*batch, views, 6, 6), gaps=True)
+        for name, block in (("shared", shared), ("alone", alone)):
+            if bool((block.diagonal(dim1=-2, dim2=-1) < 0).any()):
+                raise ValueError(f"{name}: want variances of at least 0, got a negative one")
         dispersion = torch.ones_like(shared[..., 0, 0])  # a file of an earlier version has none
         if "dispersion" in fields:
-            dispersion = torch.tensor(fields["dispersion"], dtype=torch.float64)
+            dispersion = tensor(fields, "dispersion", tuple(batch), least=0, gaps=True)
+        middle = []
+        if "middle" in fields or "arm" in fields:
+            middle = [tensor(fields, "middle", (3,)), tensor(fields, "arm", (*batch, views, 3))]
         infinite = torch.diag_embed(torch.where(undetermined, torch.inf, 0.0).to(shared))
-        middle = [torch.tensor(fields[key], dtype=torch.float64) for key in ("middle", "arm") if key in fields]
         known = undetermined, undetermined_views, dispersion
-        return cls(tuple(fields["names"]), shared + infinite, *known, *blocks, *middle)
+        return cls(tuple(names), shared + infinite, *known, follow, mixed, alone, *middle)
 
     @property
     def _turns(self) -> Tensor:
