@@ -55,7 +55,7 @@ from diffproj.calibration.refine import refine
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Status
 from diffproj.calibration.validation import CrossValidation, bootstrap, cross_validate
-from diffproj.files.load import load_calibration, load_camera
+from diffproj.files.load import load, load_calibration, load_camera
 from diffproj.files.save import save_camera
 from diffproj.geometry.back_projection import PlaneMap, Reason, back_project, explain, ground_resolution
 from diffproj.geometry.camera import Camera
@@ -132,6 +132,7 @@ __all__ = [
     "explain",
     "ground_resolution",
     "image_residuals",
+    "load",
     "load_calibration",
     "load_camera",
     "locate",

@@ -77,6 +77,22 @@ FORMATS: dict[FormatName, ModuleType] = {
 }
 """In the order in which a file is offered to them."""
 
+CONVENTIONS: dict[FormatName, str] = {
+    "json": "this package's own: world to camera, pixel centres at whole numbers, coefficients in OpenCV's order",
+    "numpy": "arrays as OpenCV has them: pixel centres at whole numbers, coefficients in its order",
+    "colmap": "world to camera; the first pixel's centre is at 0.5 there, and half a pixel was taken off",
+    "mrcal": "reference frame to camera; pixel centres at whole numbers, coefficients in OpenCV's order",
+    "kitti": "rectified images: K and t of P, without a lens; the world is the rectified camera 0",
+    "matlab": "MATLAB's principal point is one-based, and 1 was taken off it; Bouguet's is zero-based",
+    "metashape": "camera to chunk and one pixel's centre at 0.5 there, both turned; P1 and P2 are exchanged",
+    "nerfstudio": "camera to world in OpenGL's axes and the first pixel's centre at 0.5 there, all three turned",
+    "nuscenes": "sensor to vehicle there, turned: the world is the vehicle; undistorted images in nuScenes",
+    "kalibr": "IMU or first camera to camera; pixel centres at whole numbers",
+    "ros": "K and D of the raw image; --camera rectified is that of the rectified one, by P",
+    "opencv": "pixel centres at whole numbers, coefficients in OpenCV's order; of two cameras, R and T from 1 to 2",
+}
+"""What was turned into the conventions of `Camera`, in a line each."""
+
 SUFFIXES: dict[str, FormatName] = {
     ".json": "json",
     ".yaml": "opencv",
@@ -100,6 +116,11 @@ def format_of(document: Document, name: str | None = None) -> Format:
         if known.recognises(document):
             return known
     raise ValueError(foreign.explanation(document))
+
+
+def name_of(found: Format) -> FormatName:
+    """What a format is called."""
+    return next(name for name, module in FORMATS.items() if module is found)
 
 
 def format_to_write(path: Path, name: str | None = None) -> WritableFormat:

@@ -174,6 +174,8 @@ def _unpacked(value: Any) -> Any:
         raise ValueError(f"packed numbers: want base64, got something else ({error})") from None
     if math.prod(shape) * PACKED[kind].itemsize != len(data):
         raise ValueError(f"packed numbers: want {shape} of {kind}, got {len(data)} bytes")
+    if kind == "bool" and data.translate(None, b"\x00\x01"):
+        raise ValueError("packed numbers: want 0 and 1 as booleans, got others")
     return np.frombuffer(data, PACKED[kind]).reshape(shape)
 
 
