@@ -47,7 +47,7 @@ _IMAGE = re.compile(r"\d+(\s+[-+.\deE]+){7}\s+\d+\s+\S.*")
 def recognises(document: Document) -> bool:
     """Whether it is one of the four, by its name where it is binary, by its first line of content otherwise."""
     if document.text is None:
-        return document.path.name.lower() in ("cameras.bin", "images.bin")
+        return document.path.suffix.lower() == ".bin"
     if re.match(r"# (Camera list with one line|Image list with two lines)", document.text):
         return True
     line = next((line for line in document.text.splitlines() if line.strip() and line[0] != "#"), "")

@@ -76,30 +76,37 @@ class Document:
         text = self.data.decode("utf-16" if utf16 else "utf-8-sig", errors="replace")
         return None if "\0" in text else text.replace("\r\n", "\n")
 
-    @cached_property
+    @property
     def tree(self) -> Any:
         """What JSON, YAML or XML says, in Python's own types; see `trees`.
 
         Raises:
             ValueError: it is none of the three.
         """
-        if self.text is None:
-            raise ValueError("want JSON, YAML or XML, got a binary file")
-        if self.text.lstrip().startswith("<"):
-            return xml_tree(self.text)
-        if self.path.suffix.lower() == ".json":
-            return json_tree(self.text)
-        if self.text.lstrip()[:1] in ("{", "["):
-            try:
-                return json_tree(self.text)
-            except ValueError:  # YAML has lists and mappings in brackets too
-                return yaml_tree(self.text)
-        return yaml_tree(self.text)
+        tree, problem = self._parsed
+        if problem:
+            raise ValueError(problem)
+        return tree
 
-    @cached_property
+    @property
     def mapping(self) -> dict[str, Any]:
         """The tree where it is a mapping; empty where it is a list, or no tree at all."""
-        try:
-            return self.tree if isinstance(self.tree, dict) else {}
-        except ValueError:
-            return {}
+        tree, _ = self._parsed
+        return tree if isinstance(tree, dict) else {}
+
+    @cached_property
+    def _parsed(self) -> tuple[Any, str]:
+        """The tree, or why there is none: found out once, though every format asks."""
+        if self.text is None:
+            return None, "want JSON, YAML or XML, got a binary file"
+        start = self.text.lstrip()[:1]
+        parsers = [xml_tree] if start == "<" else [json_tree] if self.path.suffix.lower() == ".json" else [yaml_tree]
+        if start in ("{", "[") and parsers == [yaml_tree]:
+            parsers = [json_tree, yaml_tree]  # YAML has lists and mappings in brackets too
+        problem = ""
+        for parser in parsers:
+            try:
+                return parser(self.text), ""
+            except ValueError as error:
+                problem = str(error)
+        return None, problem

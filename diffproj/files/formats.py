@@ -108,10 +108,13 @@ def format_of(document: Document, name: str | None = None) -> Format:
     """The format of that name, or else the one that the file is of.
 
     Raises:
-        ValueError: there is no such format, or the file is of none.
+        ValueError: there is no such format, or the file is of none, or of another than the named one.
     """
     if name is not None:
-        return _named(name)
+        found = _named(name)
+        if not found.recognises(document):
+            raise ValueError(f"format: want a file of {name!r}, got another; {foreign.explanation(document)}")
+        return found
     for known in FORMATS.values():
         if known.recognises(document):
             return known

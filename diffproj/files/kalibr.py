@@ -20,7 +20,7 @@ from diffproj.geometry.camera import Camera
 
 Pose = tuple[np.ndarray, np.ndarray]
 INTO_CAMERA = ("T_cam_imu",)
-FROM_CAMERA = ("T_imu_cam", "T_BS", "T_imu_body_cam")
+FROM_CAMERA = ("T_imu_cam", "T_BS")
 
 
 def recognises(document: Document) -> bool:
@@ -124,10 +124,11 @@ def _poses(cameras: dict[str, dict[str, Any]]) -> dict[str, Pose]:
 
 def _own_pose(name: str, fields: dict[str, Any]) -> Pose | None:
     for key, value in fields.items():
-        if value is None or not (key.startswith("T_") or "_T_" in key):
+        if value is None or key == "T_cn_cnm1" or not (key.startswith("T_") or "_T_" in key):
             continue
         if key in INTO_CAMERA:
             return rigid(f"{name}, {key}", value)
         if key in FROM_CAMERA or key.startswith("body_T_cam"):
             return inverse(rigid(f"{name}, {key}", value))
+        raise ValueError(f"{name}, {key}: want T_cam_imu or T_imu_cam as the pose, got a transformation of another name")
     return None

@@ -39,6 +39,9 @@ def read(document: Document) -> Found:
         if parts[1] in fields:
             raise ValueError(f"{parts[1]}: want the line once, got it twice")
         fields[parts[1]] = _floats(parts[1], parts[2])
+    for name in fields:
+        if re.fullmatch(r"[DRT]_\d\d", name) and f"K_{name[2:]}" not in fields:
+            raise ValueError(f"K_{name[2:]}: want the camera matrix beside {name}, got none")
     rectified = {name: _rectified(name, fields) for name in fields if re.fullmatch(r"P\d|P_rect_\d\d", name)}
     raw = {name[2:]: _raw(name[2:], fields) for name in fields if re.fullmatch(r"K_\d\d", name)}
     return Found(raw, rectified) if raw else Found(rectified)

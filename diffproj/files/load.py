@@ -2,12 +2,17 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from diffproj.calibration.result import Calibration
 from diffproj.files import own_json
 from diffproj.files.document import Document
 from diffproj.files.formats import FormatName, PathLike, format_of
 from diffproj.files.found import Found
 from diffproj.geometry.camera import Camera
+
+DAMAGE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
+"""What a reader meets in a file that is not what it says; all become one `ValueError` that names the file."""
 
 
 def load_camera(path: PathLike, format: FormatName | None = None, camera: str | int | None = None) -> Camera:  # noqa: A002
@@ -39,9 +44,10 @@ def load_camera(path: PathLike, format: FormatName | None = None, camera: str | 
         Camera(batch_shape=(), pinhole, size=(640, 480), torch.float64, cpu)
     """
     document = Document.read(Path(path))
+    found = found_in(document, format)
     try:
-        return found_in(document, format).chosen(camera)
-    except (ArithmeticError, LookupError, RecursionError, ValueError) as error:
+        return found.chosen(camera)
+    except ValueError as error:
         raise ValueError(_message(document, error)) from error
 
 
@@ -49,9 +55,13 @@ def found_in(document: Document, format: FormatName | None = None) -> Found:  # 
     """All cameras of a file.
 
     Raises:
-        ValueError: as for `load_camera`, without the name of the file.
+        ValueError: as for `load_camera`.
     """
-    return format_of(document, format).read(document)
+    try:
+        with np.errstate(all="ignore"):  # a camera that is not finite is refused where it is built
+            return format_of(document, format).read(document)
+    except DAMAGE as error:
+        raise ValueError(_message(document, error)) from error
 
 
 def load_calibration(path: PathLike) -> Calibration:
@@ -94,11 +104,15 @@ def load(path: PathLike) -> Camera | Calibration:
 def _calibration(document: Document) -> Calibration | None:
     try:
         return own_json.read_calibration(document) if own_json.recognises(document) else None
-    except (ArithmeticError, LookupError, RecursionError, ValueError) as error:
+    except DAMAGE as error:
         raise ValueError(_message(document, error)) from error
 
 
 def _message(document: Document, error: Exception) -> str:
-    """One line that names the file; a key that no reader foresaw to be missing is a damaged file."""
+    """One line that names the file and what is wrong with it."""
     said = " ".join(str(error).split())
-    return f"{document.path}: {said if isinstance(error, ValueError) else f'the file is damaged ({error!r})'}"
+    if isinstance(error, KeyError):
+        said = f"want the key {said.strip(chr(39))}, got a file without it"
+    elif not isinstance(error, ValueError):
+        said = f"the file is damaged ({error!r})"
+    return f"{document.path}: {said}"

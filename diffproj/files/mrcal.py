@@ -7,6 +7,7 @@ CAHVOR and stereographic ones are other lenses.
 
 import ast
 import re
+import warnings
 
 import cv2
 import numpy as np
@@ -35,7 +36,9 @@ def read(document: Document) -> Found:
     if len(text) > MOST_CHARACTERS or re.search(r"([\[({]\s*){20}", text):
         raise ValueError("want a .cameramodel, got a text that is too long, or too deeply nested")
     try:
-        fields = ast.literal_eval(text.strip())
+        with warnings.catch_warnings():  # of odd literals, which the checks below see
+            warnings.simplefilter("ignore")
+            fields = ast.literal_eval(text.strip())
     except (SyntaxError, ValueError, TypeError, MemoryError, RecursionError) as error:
         raise ValueError(f"want a Python literal, got something else ({type(error).__name__})") from None
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):

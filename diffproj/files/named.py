@@ -13,6 +13,7 @@ from diffproj.files.found import Found
 from diffproj.files.lenses import Kind, brown, kind_of, lens_of
 from diffproj.files.numbers import camera_of, described, image_size, intrinsics, matrix, rigid, shape_of, square
 from diffproj.geometry.camera import Camera
+from diffproj.lens.brown_conrady import BrownConrady
 
 MATRICES = frozenset(
     "cameramatrix cameramat cammatrix cammat cammtx mtx matrix k kmatrix cm m intrinsic intrinsics intrinsicmatrix "
@@ -63,8 +64,11 @@ def read(mapping: dict[str, Any], four_is_brown: bool = True) -> Found:
         elif core in SIZES and (size := _size(key, value)) is not None:
             sizes[label] = size
         else:
-            _check_no_lens(key, value)
+            check_no_lens_key(key, value)
             check_no_lens(value, [])
+    if not lenses:
+        for key, value in mapping.items():
+            _check_no_vector(key, value)
     if not matrices:
         raise ValueError(_nothing(mapping))
     size, kind = _sides(mapping), _kind(mapping)
@@ -101,7 +105,7 @@ def check_no_lens(tree: Any, read_elsewhere: list[Any]) -> None:
         for key, value in tree.items():
             if _parted(key)[1] in LENSES and isinstance(value, list | dict | str):
                 raise ValueError(f"{key}: want the lens in the same mapping as its camera matrix, got it elsewhere")
-            _check_no_lens(key, value)
+            check_no_lens_key(key, value)
     for item in tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ():
         if isinstance(item, dict | list) and not any(item is known for known in read_elsewhere):
             check_no_lens(item, read_elsewhere)
@@ -125,7 +129,7 @@ def _once(known: dict[str, tuple[str, Any]], label: str, key: str, value: Any) -
     known[label] = key, value
 
 
-def _check_no_lens(key: str, value: Any) -> None:
+def check_no_lens_key(key: str, value: Any) -> None:
     """Refuse a key that looks as if it held something of the lens."""
     plain = re.sub(r"[^a-z0-9]", "", key.lower())
     if plain in MODELS or re.search("std|dev|err|undistort|distance(?!coef)|sigma|covariance", plain):
@@ -140,6 +144,24 @@ def _check_no_lens(key: str, value: Any) -> None:
         raise ValueError(
             f"{key}: want a name that is known to hold the lens, such as distortion_coefficients, got {described(value)} "
             "under this one; rename it, or build dp.Camera.from_opencv(K, dist)"
+        )
+
+
+def _check_no_vector(key: str, value: Any) -> None:
+    """Refuse a vector of as many numbers as a lens has, under a name that nobody knows, where no lens was found."""
+    plain = re.sub(r"[^a-z0-9]", "", key.lower())
+    if not isinstance(value, list | dict | np.ndarray) or re.search("std|dev|err|roi|quat|rot|orient|vec|rms|time", plain):
+        return
+    if _parted(key)[1] in MATRICES | SIZES:
+        return
+    try:
+        found = matrix(key, value)
+    except ValueError:
+        return
+    if found.size in BrownConrady.counts and found.size == max(found.shape):
+        raise ValueError(
+            f"{key}: want the lens under a name that is known, such as distortion_coefficients, got {found.size} numbers "
+            "under this one, as a lens has; rename it, or take it out of the file where it is none"
         )
 
 
@@ -185,6 +207,8 @@ def _size(key: str, value: Any) -> tuple[int, int] | None:
     """A size given as width and height in one, by their names or in this order."""
     if isinstance(value, dict) and "rows" not in value:
         return image_size(value.get("width"), value.get("height"), key)
+    if isinstance(value, str) and re.search(r"\d", value):
+        raise ValueError(f"{key}: want width and height as numbers, got {described(value)}")
     if not isinstance(value, list | dict | np.ndarray):
         return None
     sides = matrix(key, value).ravel().tolist()

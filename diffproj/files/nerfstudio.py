@@ -17,6 +17,7 @@ from diffproj.calibration.result import Calibration
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import brown, coefficients, first_brown, fisheye, is_fisheye, unused
+from diffproj.files.named import check_no_lens_key
 from diffproj.files.numbers import camera_of, focal_lengths, image_size, inverse, number, rigid
 from diffproj.files.writing import cameras_of
 from diffproj.geometry.camera import Camera
@@ -27,6 +28,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 KEYS = ("k1", "k2", "p1", "p2", "k3")
+KNOWN = frozenset(KEYS) | {"k4", "k5", "k6", "distortion_params", "camera_model", "is_fisheye"}
 
 
 def recognises(document: Document) -> bool:
@@ -126,9 +128,12 @@ def _focal(fields: dict[str, Any], axis: str, side: int) -> float | None:
 
 
 def _lens(fields: dict[str, Any]) -> Lens | None:
+    for key, value in fields.items():
+        if key not in KNOWN:
+            check_no_lens_key(key, value)
     model = fields.get("camera_model", "OPENCV")
     given = {key: number(key, fields[key]) for key in ("k1", "k2", "k3", "k4", "p1", "p2") if key in fields}
-    for key in ("k5", "k6", "distortion_params", "rolling_shutter_time"):
+    for key in ("k5", "k6", "distortion_params"):
         value = fields.get(key)
         if value is not None and not (value == 0 or (isinstance(value, list) and not any(value))):
             raise ValueError(f"{key}: want 0 or none, got {value}: no camera of this package has it")

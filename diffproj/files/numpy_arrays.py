@@ -8,6 +8,8 @@ camera.
 
 import io
 import re
+import tokenize
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -28,6 +30,9 @@ from diffproj.geometry.camera import Camera
 NPY, NPZ = b"\x93NUMPY", b"PK\x03\x04"
 MOST_BYTES = 2**26
 """Of one array; larger ones hold photographs or corners, and are not looked at."""
+
+HEADER_DAMAGE = (KeyError, TypeError, SyntaxError, ValueError, tokenize.TokenError, MemoryError, RecursionError)
+"""What numpy raises where the header of an array, a Python literal, is none."""
 
 
 def recognises(document: Document) -> bool:
@@ -107,8 +112,10 @@ def _array(name: str, data: bytes) -> Any:
     try:
         version = npy.read_magic(stream)
         header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
-        shape, by_columns, dtype = header(stream)
-    except (KeyError, TypeError, SyntaxError, ValueError) as error:
+        with warnings.catch_warnings():  # of headers that Python 2 wrote
+            warnings.simplefilter("ignore")
+            shape, by_columns, dtype = header(stream)
+    except HEADER_DAMAGE as error:
         raise ValueError(f"{name}: want an array as numpy.save writes it, got a damaged one ({error})") from None
     if dtype.hasobject:
         if re.search("mtx|matrix|dist|coef|intrinsic", name.lower()):

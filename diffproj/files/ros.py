@@ -154,13 +154,15 @@ def _sections(text: str) -> dict[str, dict[str, Any]]:
         if "camera matrix" not in fields:
             continue
         D = _numbers(fields.get("distortion", []))
+        if len(_numbers(fields.get("projection", []))) != 12:
+            raise ValueError(f"{name}: want a projection of 12 numbers at its end, got another; the file was cut off")
         cameras[name.strip("[]")] = {
             "image_width": width[0],
             "image_height": height[0],
             "camera_matrix": _numbers(fields["camera matrix"]),
             "distortion_coefficients": D or None,
             "distortion_model": {5: "plumb_bob", 4: "plumb_bob", 8: "rational_polynomial"}.get(len(D), f"of {len(D)}"),
-            **({"projection_matrix": _numbers(fields["projection"])} if "projection" in fields else {}),
+            "projection_matrix": _numbers(fields["projection"]),
         }
     if not cameras:
         raise ValueError("want a camera matrix in a section, got none")

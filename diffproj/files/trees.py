@@ -147,12 +147,13 @@ def _xml_node(element: ElementTree.Element, depth: int) -> Any:
         return content if not attributes else _without_doubles([*attributes, ("<text>", content)])
     if not attributes and all(tag == "_" for tag, _ in children):
         return [item for _, item in children]
-    names = [tag for tag, _ in children]
-    many = {tag: [item for other, item in children if other == tag] for tag in names if names.count(tag) > 1}
-    if many and not attributes and not any(tag in PLURAL for tag in many):
-        raise ValueError(f"{next(iter(many))}: want the element once, got it {len(next(iter(many.values())))} times")
-    once = [(tag, item) for tag, item in children if tag not in many]
-    return _without_doubles([*attributes, *once, *((tag, items) for tag, items in many.items())])
+    many: dict[str, list[Any]] = {}
+    for tag, item in children:
+        many.setdefault(tag, []).append(item)
+    for tag, items in many.items():
+        if len(items) > 1 and tag not in PLURAL:
+            raise ValueError(f"{tag}: want the element once, got it {len(items)} times")
+    return _without_doubles([*attributes, *((tag, items if len(items) > 1 else items[0]) for tag, items in many.items())])
 
 
 PLURAL = frozenset({"sensor", "camera", "group", "component", "property", "marker", "chunk", "covariance", "frame", "calibration"})
