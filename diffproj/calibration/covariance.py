@@ -185,6 +185,13 @@ class Covariance:
         return cls(tuple(names), shared + infinite, *known, follow, mixed, alone, *middle)
 
     @property
+    def has_gaps(self) -> Bool[Tensor, "*batch"]:
+        """Whether anything in it is not a number `(*B,)`, as of a camera that did not converge."""
+        blocks = (self._follow, self._mixed, self._alone)
+        gaps = self.shared.isnan().flatten(-2).any(-1) | self.dispersion.isnan()
+        return gaps | torch.stack([block.isnan().flatten(-3).any(-1) for block in blocks]).any(0)
+
+    @property
     def _turns(self) -> Tensor:
         """From poses that turn about the middle to those about the world's origin `(*B, V, 6, 6)`.
 

@@ -129,7 +129,7 @@ def _covariance(fields: dict[str, Any], batch: tuple[int, ...], views: int, stat
     found = Covariance.from_fields(fields["covariance"])
     if tuple(found.undetermined_views.shape) != (*batch, views):
         raise ValueError(f"covariance: want {views} views, got shape {tuple(found.undetermined_views.shape)}")
-    unknown = found.shared.diagonal(dim1=-2, dim2=-1).isnan().any(-1) | found.dispersion.isnan()
+    unknown = found.has_gaps
     if bool((unknown & (status == Status.CONVERGED)).any()):
         raise ValueError("covariance: want finite numbers where the calibration converged, got gaps")
     return found

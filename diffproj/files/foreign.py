@@ -7,9 +7,8 @@ from diffproj.files.document import Document
 
 CANNOT = "; build dp.Camera(K, R, t, lens, size) from its numbers"
 
-
-def _holding(*keys: str) -> Callable[[Document], bool]:
-    return lambda document: all(key in document.mapping for key in keys)
+KINDS = {str: "text", list: "list", dict: "mapping without keys"} | dict.fromkeys((int, float, bool), "number alone")
+KINDS[type(None)] = "file without content"
 
 
 def _text(pattern: str) -> Callable[[Document], bool]:
@@ -43,5 +42,5 @@ def explanation(document: Document) -> str:
     if problem:
         return f"want a camera file, got one that is no format known here: {problem}"
     keys = [str(key) for key in tree if not str(key).startswith("<")] if isinstance(tree, dict) else []
-    got = f"the keys {', '.join(keys[:8])}{' and more' * (len(keys) > 8)}" if keys else f"a {type(tree).__name__}"
+    got = f"the keys {', '.join(keys[:8])}{' and more' * (len(keys) > 8)}" if keys else f"a {KINDS[type(tree)]}"
     return f"want a camera matrix under a known name, such as camera_matrix, got {got}; build dp.Camera.from_opencv(K, dist)"

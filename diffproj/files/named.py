@@ -57,7 +57,7 @@ def read(mapping: dict[str, Any], four_is_brown: bool = True) -> Found:
     sizes: dict[str, tuple[int, int]] = {}
     for key, value in mapping.items():
         label, core = _parted(key)
-        if core in MATRICES and (core != "m" or label) and isinstance(value, list | dict | np.ndarray):
+        if _is_matrix(label, core, value):
             _once(matrices, label, key, value)
         elif core in LENSES:
             _once(lenses, label, key, value)
@@ -85,10 +85,14 @@ def read(mapping: dict[str, Any], four_is_brown: bool = True) -> Found:
 
 def holds_matrix(mapping: dict[str, Any]) -> bool:
     """Whether K stands in a mapping under one of the names."""
-    return any(
-        core in MATRICES and (core != "m" or label) and isinstance(value, list | dict | np.ndarray)
-        for (label, core), value in ((_parted(key), value) for key, value in mapping.items())
-    )
+    return any(_is_matrix(*_parted(key), value) for key, value in mapping.items())
+
+
+def _is_matrix(label: str, core: str, value: Any) -> bool:
+    """Whether a key and what it holds may be K; lists of mappings are cameras of other programs."""
+    if core not in MATRICES or (core == "m" and not label):
+        return False
+    return isinstance(value, dict | np.ndarray) or (isinstance(value, list) and not any(isinstance(x, dict) for x in value))
 
 
 def check_no_lens(tree: Any, read_elsewhere: list[Any]) -> None:

@@ -39,6 +39,7 @@ MANY = 4096
 """Numbers in a list from which on they are packed."""
 
 PACKED = {"float64": np.dtype("<f8"), "bool": np.dtype("bool")}
+DAMAGE = (AttributeError, KeyError, OverflowError, TypeError, ValueError)
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
@@ -81,8 +82,12 @@ def read_calibration(document: Document) -> Calibration | None:
     camera = _camera(fields["camera"])
     try:
         return Calibration.from_fields(_unpacked(fields["calibration"]), camera)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"the calibration in this file is damaged ({error})") from error
+    except DAMAGE as error:
+        raise ValueError(f"the calibration in this file is damaged ({_said(error)})") from error
+
+
+def _said(error: Exception) -> str:
+    return f"want the key {error.args[0]}, got none" if isinstance(error, KeyError) else str(error)
 
 
 def _camera_fields(camera: Camera) -> dict[str, Any]:
@@ -110,8 +115,8 @@ def _camera(fields: Any) -> Camera:
         distortion = None if lens is None else KINDS[lens["model"]](_tensor(lens, "coefficients", dtype))
         size = None if fields["size"] is None else _size(fields["size"])
         return Camera(K, R, t, distortion, size)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"the camera in this file is damaged ({error})") from error
+    except DAMAGE as error:
+        raise ValueError(f"the camera in this file is damaged ({_said(error)})") from error
 
 
 def _size(size: Any) -> tuple[int, int] | None:
