@@ -33,7 +33,9 @@ def _replace(path: Path, data: bytes) -> None:
     if path.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
     if path.exists() and not path.is_file():
-        raise OSError(errno.EISDIR if path.is_dir() else errno.EEXIST, "want the place of a file, got a folder or a device")
+        raise OSError(
+            errno.EISDIR if path.is_dir() else errno.EEXIST, "want the place of a file, got a folder or a device"
+        )
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     handle = os.open(temporary, flags, 0o666)  # less the umask, which the system takes off by itself

@@ -1,4 +1,4 @@
-"""Reading what a file says of a calibration: numbers that are numbers, in the shape and the range that they have to be."""
+"""Reading what a file says of a calibration: numbers, in the shape and the range that they have to be in."""
 
 from typing import Any
 
@@ -32,7 +32,7 @@ def tensor(
         ValueError: it holds something else than finite numbers, in another shape, or smaller ones.
     """
     array = _array(name, fields[name], gaps)
-    if shape is not None and (len(shape) != array.ndim or any(s not in (None, g) for s, g in zip(shape, array.shape, strict=True))):
+    if shape is not None and not _fits(array.shape, shape):
         wanted = ", ".join("any" if side is None else str(side) for side in shape)
         raise ValueError(f"{name}: want shape ({wanted}), got {array.shape}")
     known = array[~np.isnan(array)] if gaps else array
@@ -76,6 +76,10 @@ def present(fields: dict[str, Any], name: str) -> bool:
     return fields.get(name) is not None
 
 
+def _fits(found: tuple[int, ...], wanted: Shape) -> bool:
+    return len(found) == len(wanted) and all(want in (None, got) for want, got in zip(wanted, found, strict=True))
+
+
 def _regular(name: str, value: Any) -> np.ndarray:
     try:
         return np.array(value)
@@ -86,9 +90,11 @@ def _regular(name: str, value: Any) -> np.ndarray:
 def _array(name: str, value: Any, gaps: bool) -> np.ndarray:
     array = _regular(name, value)
     if array.dtype == object and gaps:
-        if not all(item is None or (isinstance(item, int | float) and not isinstance(item, bool)) for item in array.flat):
+        if any(item is not None and type(item) not in (int, float) for item in array.flat):
             raise ValueError(f"{name}: want numbers or null, got something else")
         array = np.array(array, dtype=np.float64)  # NaN for None
     if array.dtype.kind not in "fiu" and array.size:
-        raise ValueError(f"{name}: want numbers, got {'gaps or mixed values' if array.dtype == object else array.dtype}")
+        raise ValueError(
+            f"{name}: want numbers, got {'gaps or mixed values' if array.dtype == object else array.dtype}"
+        )
     return array.astype(np.float64)

@@ -16,6 +16,12 @@ from diffproj.targets.views import Views
 T = TypeVar("T")
 
 OBJECTIVES = ("image", "plane")
+TENSORS = (
+    *("rms", "status", "iterations", "bow", "points", "used", "rejected", "pixel_sigma", "shares"),
+    *("degrees_of_freedom", "lens_region"),
+)
+"""Attributes that go into a file as they are."""
+
 SAME_RMS = 1e-6
 """Relative difference of the RMS that a file says from that of what it holds: above it, something was changed."""
 
@@ -35,11 +41,7 @@ class Recorded:
             >>> again.summary() == calibration.summary()
             True
         """
-        lists: dict[str, Tensor | None] = {
-            name: getattr(self, name)
-            for name in ("rms", "status", "iterations", "bow", "points", "used", "rejected", "pixel_sigma", "shares")
-            + ("degrees_of_freedom", "lens_region")
-        }
+        lists: dict[str, Tensor | None] = {name: getattr(self, name) for name in TENSORS}
         lists |= {"R": self.cameras.R, "t": self.cameras.t, "pixels": self.views.pixels, "visible": self.views.visible}
         others = self.other_poses if self.has_alternatives else None
         return {
@@ -74,7 +76,9 @@ class Recorded:
         if visible.ndim != len(batch) + 2 or tuple(visible.shape[:-2]) != batch:
             raise ValueError(f"visible: want shape (*{batch}, V, N) as the camera says, got {tuple(visible.shape)}")
         V, N = visible.shape[-2:]
-        views = Views(tensor(fields, "pixels", (*batch, V, N, 2)), visible, _names(fields["names"], V), _size(fields["size"]))
+        views = Views(
+            tensor(fields, "pixels", (*batch, V, N, 2)), visible, _names(fields["names"], V), _size(fields["size"])
+        )
         used, rejected = (mask(fields, name, (*batch, V, N)) for name in ("used", "rejected"))
         if bool((used & ~visible).any()) or bool((used & rejected).any()):
             raise ValueError("used: want corners that are visible and not rejected, got others")
@@ -116,7 +120,9 @@ def _check_rms(fields: dict[str, Any], rms: Tensor) -> None:
     """Compare the RMS that is told with that of the corners, the board and the camera, all of which it depends on."""
     told = tensor(fields, "rms", tuple(rms.shape), least=0, gaps=True)
     both = told.isfinite() & rms.isfinite()
-    if bool((told.isfinite() != rms.isfinite()).any()) or bool(((told - rms).abs() > SAME_RMS * rms + 1e-12)[both].any()):
+    if bool((told.isfinite() != rms.isfinite()).any()) or bool(
+        ((told - rms).abs() > SAME_RMS * rms + 1e-12)[both].any()
+    ):
         raise ValueError(
             f"rms: want {rms.flatten()[:3].tolist()} px, as the camera and the corners in the file give, got "
             f"{told.flatten()[:3].tolist()}: something was changed; calibrate again"
@@ -170,7 +176,7 @@ def _texts(name: str, value: Any) -> tuple[str, ...]:
 
 def _flag(name: str, value: Any) -> bool:
     if not isinstance(value, bool):
-        raise ValueError(f"{name}: want true or false, got {value!r}")
+        raise ValueError(f"{name}: want true or false, got {value!r}")  # noqa: TRY004
     return value
 
 

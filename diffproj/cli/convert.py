@@ -25,6 +25,7 @@ formats:
   written goes with the suffix: .json for diffproj's own, .yaml, .yml and .xml
   for OpenCV's, .npz for numpy's, .txt for COLMAP's (cameras.txt, or with poses
   images.txt). --to names another: ros, kalibr, nerfstudio, or opencv for .json.
+  Only read are kitti, nuscenes, mrcal, matlab and metashape.
 
 examples:
   diffproj convert cameras.txt camera.yaml
@@ -54,11 +55,21 @@ def add_options(command: argparse.ArgumentParser) -> None:
     names = get_args(FormatName)
     command.add_argument("input", type=Path, metavar="IN", help="the camera file to read")
     command.add_argument("output", type=Path, metavar="OUT", help="the camera file to write; its folder must exist")
-    command.add_argument("--from", dest="source", choices=names, help="format of IN, where its content does not tell it")
-    command.add_argument("--to", choices=names, help="format of OUT, where its suffix does not tell it")
+    command.add_argument(
+        "--from",
+        dest="source",
+        choices=names,
+        metavar="FORMAT",
+        help="format of IN, where its content does not tell it",
+    )
+    command.add_argument(
+        "--to", choices=names, metavar="FORMAT", help="format of OUT, where its suffix does not tell it"
+    )
     command.add_argument("--camera", metavar="NAME", help="which camera of IN, by its name, or its number from 0")
     command.add_argument("--size", type=image_size, metavar="WxH", help="size of the image in px, where IN has none")
-    command.add_argument("--without-pose", action="store_true", help="leave the pose out, and put the world in the camera")
+    command.add_argument(
+        "--without-pose", action="store_true", help="leave the pose out, and put the world in the camera"
+    )
     command.set_defaults(run=functools.partial(run, command))
 
 
@@ -66,7 +77,9 @@ def image_size(text: str) -> tuple[int, int]:
     """Read a size such as `640x480`."""
     width, separator, height = text.lower().partition("x")
     if not (separator and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"want the size of the image as WIDTHxHEIGHT in px, such as 640x480, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"want the size of the image as WIDTHxHEIGHT in px, such as 640x480, got {text!r}"
+        )
     return int(width), int(height)
 
 

@@ -8,12 +8,13 @@ from typing import get_args
 
 import torch
 
+from diffproj.calibration.result import Calibration
 from diffproj.cli.convert import named
 from diffproj.cli.terminal import note, result
 from diffproj.files.document import Document
 from diffproj.files.formats import CONVENTIONS, FormatName, format_of, name_of
 from diffproj.files.load import load, load_camera
-from diffproj.calibration.result import Calibration
+from diffproj.files.writing import has_pose
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import model_of
 
@@ -40,7 +41,13 @@ def add_options(command: argparse.ArgumentParser) -> None:
     command.description = DESCRIPTION
     command.formatter_class = argparse.RawDescriptionHelpFormatter
     command.add_argument("file", type=Path, metavar="FILE", help="the camera file")
-    command.add_argument("--from", dest="source", choices=get_args(FormatName), help="format, where the content does not tell it")
+    command.add_argument(
+        "--from",
+        dest="source",
+        choices=get_args(FormatName),
+        metavar="FORMAT",
+        help="format, where the content does not tell it",
+    )
     command.add_argument("--camera", metavar="NAME", help="one camera alone, by its name, or its number from 0")
     command.set_defaults(run=functools.partial(run, command))
 
@@ -97,8 +104,7 @@ def _say(name: str, camera: Camera) -> None:
     result(f"  focal lengths    {f_x:.6g}, {f_y:.6g} px" + (f", skew {skew:.4g}" * bool(skew)))
     result(f"  principal point  {c_x:.6g}, {c_y:.6g} px")
     result(f"  lens             {_lens(camera)}")
-    posed = bool((camera.R != torch.eye(3, dtype=camera.dtype)).any() or (camera.t != 0).any())
-    if posed:
+    if has_pose(camera):
         result(f"  centre           {', '.join(f'{x:.6g}' for x in camera.center.tolist())} in the world")
     if camera.size is not None:
         _say_view(name, camera)
@@ -109,7 +115,9 @@ def _lens(camera: Camera) -> str:
         return "none in the file"
     model = model_of(camera.distortion)
     numbers = camera.distortion.coefficients.tolist()  # type: ignore[attr-defined]
-    return f"{model.name}: " + " ".join(f"{key} {x:.5g}" for key, x in zip(model.coefficient_names, numbers, strict=True))
+    return f"{model.name}: " + " ".join(
+        f"{key} {x:.5g}" for key, x in zip(model.coefficient_names, numbers, strict=True)
+    )
 
 
 def _say_view(name: str, camera: Camera) -> None:

@@ -1,7 +1,7 @@
 """COLMAP: `cameras.txt` and `cameras.bin` for lenses, `images.txt` and `images.bin` for poses with the cameras beside.
 
-The first pixel's centre is at 0.5: `c_here = c_colmap - 0.5`. Poses are world to camera, in OpenCV's axes. Of the models
-those that equal OpenCV's are read; THIN_PRISM_FISHEYE is not OpenCV's prism, FOV and others are other lenses.
+The first pixel's centre is at 0.5: `c_here = c_colmap - 0.5`. Poses are world to camera, in OpenCV's axes. Of the
+models those that equal OpenCV's are read; THIN_PRISM_FISHEYE is not OpenCV's prism, FOV and others are other lenses.
 
 Of `cameras` the names are the ids, and the cameras have no pose; of `images`, the file names of the images. Saved as
 `images.txt`, a camera brings its `cameras.txt` and an empty `points3D.txt` along, which make a model that COLMAP reads.
@@ -88,11 +88,17 @@ def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
         raise ValueError("want cameras.txt or images.txt to write; COLMAP's model_converter makes .bin of them")
     cameras, posed = cameras_of(item, "COLMAP"), "images" in path.stem
     if not posed and any(map(has_pose, cameras)):
-        raise ValueError("want cameras without a pose, which cameras.txt does not hold; save images.txt, or without_pose()")
+        raise ValueError(
+            "want cameras without a pose, which cameras.txt does not hold; save images.txt, or without_pose()"
+        )
     lines = [_line(camera) for camera in cameras]
     known = list(dict.fromkeys(lines)) if posed else lines
     numbered = [f"{i} {line}" for i, line in enumerate(known, 1)]
-    listed = ["# Camera list with one line of data per camera:", NOTICE, "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    listed = [
+        "# Camera list with one line of data per camera:",
+        NOTICE,
+        "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
+    ]
     text = "\n".join([*listed, *numbered]) + "\n"
     if not posed:
         return {path: text}

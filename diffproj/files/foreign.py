@@ -20,7 +20,10 @@ KNOWN: tuple[tuple[Callable[[Document], bool], str], ...] = (
     (_text(r'"camera_type"\s*:\s*"'), "a calibration of Basalt; export it from there as Kalibr's camchain"),
     (_text(r"^\s*cam0\s*=\s*\["), "a Middlebury calib.txt, of rectified images: K is cam0, without a lens" + CANNOT),
     (_text(r"^\[cam_?\d+\]"), "an anipose calibration.toml" + CANNOT),
-    (_text(r'"?projection_type"?\s*:|^\s*"?FOCAL"?\s*:'), "cameras of OpenSfM, in units of the image's longer side" + CANNOT),
+    (
+        _text(r'"?projection_type"?\s*:|^\s*"?FOCAL"?\s*:'),
+        "cameras of OpenSfM, in units of the image's longer side" + CANNOT,
+    ),
     (_text(r"\bxi\b.*:|\bMEI\b"), "an omnidirectional camera (xi), which is neither perspective nor OpenCV's fisheye"),
     (_text(r"^\s*(rvec|tvec|R|T|Tr)\b|<rvec|<R\b"), "a pose alone, without K; give the file with the camera matrix"),
 )
@@ -43,4 +46,5 @@ def explanation(document: Document) -> str:
         return f"want a camera file, got one that is no format known here: {problem}"
     keys = [str(key) for key in tree if not str(key).startswith("<")] if isinstance(tree, dict) else []
     got = f"the keys {', '.join(keys[:8])}{' and more' * (len(keys) > 8)}" if keys else f"a {KINDS[type(tree)]}"
-    return f"want a camera matrix under a known name, such as camera_matrix, got {got}; build dp.Camera.from_opencv(K, dist)"
+    wanted = "want a camera matrix under a known name, such as camera_matrix"
+    return f"{wanted}, got {got}; build dp.Camera.from_opencv(K, dist)"

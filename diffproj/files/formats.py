@@ -2,8 +2,7 @@
 
 import os
 from pathlib import Path
-from types import ModuleType
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from diffproj.calibration.result import Calibration
 from diffproj.files import (
@@ -26,7 +25,18 @@ from diffproj.files.found import Found
 from diffproj.geometry.camera import Camera
 
 FormatName = Literal[
-    "json", "numpy", "colmap", "mrcal", "kitti", "matlab", "metashape", "nerfstudio", "nuscenes", "kalibr", "ros", "opencv"
+    "json",
+    "numpy",
+    "colmap",
+    "mrcal",
+    "kitti",
+    "matlab",
+    "metashape",
+    "nerfstudio",
+    "nuscenes",
+    "kalibr",
+    "ros",
+    "opencv",
 ]
 PathLike = str | os.PathLike[str]
 
@@ -61,7 +71,7 @@ class WritableFormat(Format, Protocol):
         ...
 
 
-FORMATS: dict[FormatName, ModuleType] = {
+FORMATS: dict[FormatName, Any] = {
     "json": own_json,
     "numpy": numpy_arrays,
     "colmap": colmap,
@@ -136,14 +146,16 @@ def format_to_write(path: Path, name: str | None = None) -> WritableFormat:
     if name is not None:
         found = _named(name)
         if not isinstance(found, WritableFormat):
-            raise ValueError(f"format: want {' or '.join(map(repr, writable))} to write, got {name!r}, which is only read")
+            raise ValueError(
+                f"format: want {' or '.join(map(repr, writable))} to write, got {name!r}, which is only read"
+            )
         return found
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"want a suffix of {', '.join(SUFFIXES)}, or format={' or '.join(map(repr, writable))}")
-    return FORMATS[SUFFIXES[path.suffix.lower()]]  # type: ignore[return-value]
+    return FORMATS[SUFFIXES[path.suffix.lower()]]
 
 
 def _named(name: str) -> Format:
     if name not in FORMATS:
         raise ValueError(f"format: want {' or '.join(map(repr, FORMATS))}, got {name!r}")
-    return FORMATS[name]  # type: ignore[return-value]
+    return FORMATS[name]  # type: ignore[index]

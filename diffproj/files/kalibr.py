@@ -1,8 +1,8 @@
 """Kalibr's `camchain.yaml`, and the `sensor.yaml` of EuRoC, which has one camera in the same terms.
 
 `pinhole` with `radtan` (k1 k2 p1 p2) or `equidistant` (Kannala-Brandt); integer pixel centres; `resolution` is width,
-height. `T_cam_imu` takes IMU to camera, so the world is the IMU; without it, `T_cn_cnm1` takes the camera before to this
-one, and the world is the first camera. `T_imu_cam`, `T_BS` and `body_T_cam0` run the other way.
+height. `T_cam_imu` takes IMU to camera, so the world is the IMU; without it, `T_cn_cnm1` takes the camera before to
+this one, and the world is the first camera. `T_imu_cam`, `T_BS` and `body_T_cam0` run the other way.
 """
 
 from pathlib import Path
@@ -78,8 +78,8 @@ def _camera(name: str, fields: dict[str, Any], pose: Pose | None) -> Camera:
     model = fields.get("camera_model", "pinhole")
     if model != "pinhole":
         raise ValueError(
-            f"{name}, camera_model: want pinhole, got {model!r}, whose equations no lens of this package has; calibrate "
-            "with pinhole-radtan or pinhole-equi"
+            f"{name}, camera_model: want pinhole, got {model!r}, whose equations no lens of this package has; "
+            "calibrate with pinhole-radtan or pinhole-equi"
         )
     if "distortion_model" not in fields:
         raise ValueError(f"{name}: want a distortion_model, got none")
@@ -91,9 +91,10 @@ def _camera(name: str, fields: dict[str, Any], pose: Pose | None) -> Camera:
     if kind is None or (kind == "brown" and len(lens) not in (4, 5)) or (kind == "fisheye" and len(lens) != 4):
         raise ValueError(f"{name}, {key}: want 4 coefficients of {fields['distortion_model']}, got {len(lens)}")
     f_x, f_y, c_x, c_y = vector(f"{name}, intrinsics", fields["intrinsics"], (4,))
-    size = None
+    width, height = None, None
     if fields.get("resolution") is not None:
-        size = image_size(*vector(f"{name}, resolution", fields["resolution"], (2,)), f"{name}, resolution")
+        width, height = vector(f"{name}, resolution", fields["resolution"], (2,))
+    size = image_size(width, height, f"{name}, resolution")
     return camera_of(focal_lengths(f_x, f_y, c_x, c_y), lens_of(kind, lens), size, pose)
 
 
@@ -130,5 +131,7 @@ def _own_pose(name: str, fields: dict[str, Any]) -> Pose | None:
             return rigid(f"{name}, {key}", value)
         if key in FROM_CAMERA or key.startswith("body_T_cam"):
             return inverse(rigid(f"{name}, {key}", value))
-        raise ValueError(f"{name}, {key}: want T_cam_imu or T_imu_cam as the pose, got a transformation of another name")
+        raise ValueError(
+            f"{name}, {key}: want T_cam_imu or T_imu_cam as the pose, got a transformation of another name"
+        )
     return None

@@ -1,8 +1,8 @@
 """KITTI: `calib.txt` of the odometry and object sets, and `calib_cam_to_cam.txt` of the raw ones.
 
 `P0` to `P3` are of rectified images: K is the left 3 x 3 numbers, there is no lens, and `t = K^-1 P[:, 3]` from the
-rectified camera 0, the world. In the raw sets `K_0x` and `D_0x` hold for raw images, with the pose `R_0x T_0x` from camera
-0; the rectified ones are to be asked for, by `camera="P_rect_02"`. A `calib.txt` does not tell the size of its images.
+rectified camera 0, the world. In the raw sets `K_0x` and `D_0x` hold for raw images, with the pose `R_0x T_0x` from
+camera 0; the rectified ones are to be asked for, by `camera="P_rect_02"`. A `calib.txt` does not tell the size.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""Lenses by the names that files give them, with their coefficients; what is no lens of this package is refused by name.
+"""Lenses by the names that files give them; what is no lens of this package is refused by name.
 
 Equal to Brown-Conrady or to Kannala-Brandt are only those named here: under other names stand other equations.
 """
@@ -13,18 +13,24 @@ from diffproj.lens.kannala_brandt import KannalaBrandt
 
 Kind = Literal["none", "brown", "fisheye"]
 
+_BROWN = (
+    *("plumb_bob", "radtan", "radial_tangential", "brown", "brown_conrady", "rational_polynomial", "rational"),
+    *("brown4", "brown5", "brown8", "brown12", "brown14", "opencv", "opencv4", "opencv5", "opencv8", "full_opencv"),
+)
+_FISHEYE = (
+    "equidistant",
+    "fisheye",
+    "kannala_brandt",
+    "kannala_brandt4",
+    "kannala_brandt8",
+    "kb4",
+    "equi",
+    "opencv_fisheye",
+)
 KINDS_BY_NAME: dict[str, Kind] = {
-    **dict.fromkeys(("none", "pinhole_without_distortion", "simple_pinhole"), "none"),
-    **dict.fromkeys(
-        ("plumb_bob", "radtan", "radial_tangential", "brown", "brown_conrady", "brown4", "brown5", "brown8", "brown12")
-        + ("brown14", "rational_polynomial", "rational", "opencv", "opencv4", "opencv5", "opencv8", "full_opencv"),
-        "brown",
-    ),
-    **dict.fromkeys(
-        ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4", "kannala_brandt8", "kb4", "kb8")
-        + ("opencv_fisheye", "equi"),
-        "fisheye",
-    ),
+    **dict.fromkeys(("none", "simple_pinhole"), "none"),
+    **dict.fromkeys(_BROWN, "brown"),
+    **dict.fromkeys(_FISHEYE, "fisheye"),
 }
 """What a lens of a file is here; the names in lower case, with `_` between words."""
 

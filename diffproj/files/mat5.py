@@ -7,7 +7,20 @@ from typing import Any
 import numpy as np
 
 HEADER = 128
-NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8", 16: "u1", 17: "u2"}
+NUMBERS = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+    16: "u1",
+    17: "u2",
+}
 """NumPy's types of the element types."""
 
 MATRIX, COMPRESSED = 14, 15
@@ -18,7 +31,7 @@ MOST_BYTES = 2**27
 DEEPEST = 20
 
 
-class Unreadable(str):  # noqa: SLOT000
+class Unreadable(str):
     """A variable that holds something else than numbers, text and structs; it says what."""
 
 
@@ -90,9 +103,11 @@ def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
     if not elements:
         return "", np.zeros(0)
     kind = int(_numbers(elements[0], order)[0]) & 0xFF if elements[0][1] else 0
-    if len(elements) < 3 or not FIRST_NUMBER <= kind <= LAST_NUMBER and kind not in (STRUCT, TEXT):
+    if len(elements) < 3 or not (FIRST_NUMBER <= kind <= LAST_NUMBER or kind in (STRUCT, TEXT)):
         names = [content for type_, content in elements[1:4] if type_ == 1]
-        what = Unreadable({1: "a cell array", 3: "an object", 5: "a sparse matrix", 17: "an object"}.get(kind, "something else"))
+        what = Unreadable(
+            {1: "a cell array", 3: "an object", 5: "a sparse matrix", 17: "an object"}.get(kind, "something else")
+        )
         return names[0].decode("latin-1") if names else "", what
     shape = _numbers(elements[1], order).astype(int).tolist()
     name = elements[2][1].decode("latin-1")

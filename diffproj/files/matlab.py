@@ -36,7 +36,7 @@ def read(document: Document) -> Found:
     Raises:
         ValueError: it holds MATLAB's objects, or something is missing or not understood.
     """
-    if document.data.startswith(HDF5) or document.data[124:126] == b"\x00\x02" and b"7.3" in document.data[:30]:
+    if document.data.startswith(HDF5) or (b"MAT-file" in document.data[:30] and b"7.3" in document.data[:30]):
         raise ValueError(f"want a .mat file of version 7, got one of 7.3 (HDF5); in MATLAB: {TO_STRUCT}")
     if document.data.startswith(b"MATLAB"):
         fields = mat5.variables(document.data)
@@ -64,8 +64,8 @@ def _is_bouguet_text(document: Document) -> bool:
 
 def _camera(fields: dict[str, Any]) -> Camera:
     if "IntrinsicMatrix" not in fields and "K" not in fields and "FocalLength" in fields:
-        f, c = (vector(key, fields[key], (2,)) for key in ("FocalLength", "PrincipalPoint"))
-        K = focal_lengths(*f, *c, _scalar("Skew", fields.get("Skew", 0.0)))
+        (f_x, f_y), (c_x, c_y) = (vector(key, fields[key], (2,)) for key in ("FocalLength", "PrincipalPoint"))
+        K = focal_lengths(f_x, f_y, c_x, c_y, _scalar("Skew", fields.get("Skew", 0.0)))
     elif "K" in fields:
         K = intrinsics("K", fields["K"], skew=True).copy()
     elif "IntrinsicMatrix" in fields:
@@ -99,10 +99,13 @@ def _bouguet_camera(fields: dict[str, Any], side: str, pose: Any) -> Camera:
     for key in ("fc", "cc", "kc"):
         if key + side not in fields:
             raise ValueError(f"want {key + side}, got none")
-    f, c = (vector(key, fields[key + side], (2,)) for key in ("fc", "cc"))
-    skew = _scalar("alpha_c", fields.get("alpha_c" + side, 0.0)) * f[0]
-    size = image_size(*(None if key not in fields else _scalar(key, fields[key]) for key in ("nx", "ny")))
-    return camera_of(focal_lengths(*f, *c, skew), brown(vector("kc", fields["kc" + side], (4, 5))), size, pose)
+    (f_x, f_y), (c_x, c_y) = (vector(key, fields[key + side], (2,)) for key in ("fc", "cc"))
+    skew = _scalar("alpha_c", fields.get("alpha_c" + side, 0.0)) * f_x
+    width, height = (None if key not in fields else _scalar(key, fields[key]) for key in ("nx", "ny"))
+    size = image_size(width, height)
+    return camera_of(
+        focal_lengths(f_x, f_y, c_x, c_y, skew), brown(vector("kc", fields["kc" + side], (4, 5))), size, pose
+    )
 
 
 def _scalar(name: str, value: Any) -> float:

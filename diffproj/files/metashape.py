@@ -14,7 +14,17 @@ import numpy as np
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import brown, unused
-from diffproj.files.numbers import camera_of, focal_lengths, image_size, inverse, number, rigid, rotation, square, vector
+from diffproj.files.numbers import (
+    camera_of,
+    focal_lengths,
+    image_size,
+    inverse,
+    number,
+    rigid,
+    rotation,
+    square,
+    vector,
+)
 from diffproj.geometry.camera import Camera
 
 KEYS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
@@ -78,11 +88,14 @@ def _calibrated(label: str, fields: dict[str, Any]) -> Camera:
     several = [item for item in (found if isinstance(found, list) else [found]) if isinstance(item, dict)]
     adjusted = [item for item in several if item.get("class") == "adjusted"] or several
     if not adjusted or "f" not in adjusted[0]:
-        raise ValueError(f"sensor {label}: want a calibration with f, got none; align the photographs, and export again")
+        raise ValueError(
+            f"sensor {label}: want a calibration with f, got none; align the photographs, and export again"
+        )
     resolution = adjusted[0].get("resolution", fields.get("resolution"))
     if not isinstance(resolution, dict):
         raise ValueError(f"sensor {label}: want a resolution, got none")
-    size = image_size(*(_attribute(side, resolution.get(side)) for side in ("width", "height")))
+    width, height = (_attribute(side, resolution.get(side)) for side in ("width", "height"))
+    size = image_size(width, height)
     return _sensor(adjusted[0], size, adjusted[0].get("type", fields.get("type")))
 
 

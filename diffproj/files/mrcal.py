@@ -1,8 +1,8 @@
 """mrcal's `.cameramodel`: a Python literal with `lensmodel`, `intrinsics`, `extrinsics` and `imagersize`.
 
-`intrinsics` are f_x f_y c_x c_y and OpenCV's coefficients in their order; `extrinsics`, now `rt_cam_ref`, are a rotation
-vector and a translation from the reference frame, the world, to the camera. Integer pixel centres. Splined models,
-CAHVOR and stereographic ones are other lenses.
+`intrinsics` are f_x f_y c_x c_y and OpenCV's coefficients in their order; `extrinsics`, now `rt_cam_ref`, are a
+rotation vector and a translation from the reference frame, the world, to the camera. Integer pixel centres. Splined
+models, CAHVOR and stereographic ones are other lenses.
 """
 
 import ast

@@ -15,24 +15,29 @@ from diffproj.files.numbers import camera_of, described, image_size, intrinsics,
 from diffproj.geometry.camera import Camera
 from diffproj.lens.brown_conrady import BrownConrady
 
-MATRICES = frozenset(
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+MATRICES = _words(
     "cameramatrix cameramat cammatrix cammat cammtx mtx matrix k kmatrix cm m intrinsic intrinsics intrinsicmatrix "
-    "intrinsicsmatrix intrinsicparameters cameraintrinsic cameraintrinsics cameraintrinsicmatrix".split()
+    "intrinsicsmatrix intrinsicparameters cameraintrinsic cameraintrinsics cameraintrinsicmatrix"
 )
 """Names of K in lower case, without what stands between words."""
 
-LENSES = frozenset(
+LENSES = _words(
     "distortioncoefficients distortioncoefficient distortioncoefficents distortioncoeffs distortioncoeff distcoeffs "
     "distcoeff distcoefs distcoef dist d distortion distortions distorsion distortionvector distortionparameters "
-    "distortioncoeficients distcoefficients kc".split()
+    "distortioncoeficients distcoefficients kc"
 )
-SIZES = frozenset("cameraresolution imagesize imgsize resolution size framesize imageresolution".split())
+SIZES = _words("cameraresolution imagesize imgsize resolution size framesize imageresolution")
 SIDES = (("imagewidth", "imageheight"), ("imgwidth", "imgheight"), ("width", "height"))
-MODELS = frozenset(
-    "distortionmodel cameramodel modeltype lensmodel fisheyemodel fisheye isfisheye distortiontype cameratype".split()
+MODELS = _words(
+    "distortionmodel cameramodel modeltype lensmodel fisheyemodel fisheye isfisheye distortiontype cameratype"
 )
-OMNIDIRECTIONAL = frozenset("xi mirrorparameters alpha gamma1 gamma2".split())
-COEFFICIENTS = frozenset("k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4 taux tauy r1 r2 t1 t2".split())
+OMNIDIRECTIONAL = _words("xi mirrorparameters alpha gamma1 gamma2")
+COEFFICIENTS = _words("k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4 taux tauy r1 r2 t1 t2")
 
 _LABEL = re.compile(
     r"(?:(?P<front>left|right|cam\d*|camera\d+|proj|projector|rgb|colou?r|depth|ir|l|r)_)?"
@@ -79,7 +84,9 @@ def read(mapping: dict[str, Any], four_is_brown: bool = True) -> Found:
         found[label or "camera"] = camera_of(K, lens, _plausible(sizes.get(label, sizes.get("", size)), K))
     strays = [name for label, (name, _) in lenses.items() if label not in matrices]
     if strays:
-        raise ValueError(f"{strays[0]}: want a camera matrix to this lens, got {', '.join(n for n, _ in matrices.values())}")
+        raise ValueError(
+            f"{strays[0]}: want a camera matrix to this lens, got {', '.join(n for n, _ in matrices.values())}"
+        )
     return Found(_posed(found, mapping))
 
 
@@ -92,7 +99,9 @@ def _is_matrix(label: str, core: str, value: Any) -> bool:
     """Whether a key and what it holds may be K; lists of mappings are cameras of other programs."""
     if core not in MATRICES or (core == "m" and not label):
         return False
-    return isinstance(value, dict | np.ndarray) or (isinstance(value, list) and not any(isinstance(x, dict) for x in value))
+    return isinstance(value, dict | np.ndarray) or (
+        isinstance(value, list) and not any(isinstance(x, dict) for x in value)
+    )
 
 
 def check_no_lens(tree: Any, read_elsewhere: list[Any]) -> None:
@@ -144,19 +153,20 @@ def check_no_lens_key(key: str, value: Any) -> None:
             "calibrate again with one of them"
         )
     looks = re.search("dist|coef|radial|tangential|lens", plain) or plain == "kc"
-    if (looks and isinstance(value, list | dict | np.ndarray | float)) or plain in COEFFICIENTS and not hasattr(value, "__len__"):
+    if (looks and isinstance(value, list | dict | np.ndarray | float)) or (
+        plain in COEFFICIENTS and not hasattr(value, "__len__")
+    ):
         raise ValueError(
-            f"{key}: want a name that is known to hold the lens, such as distortion_coefficients, got {described(value)} "
-            "under this one; rename it, or build dp.Camera.from_opencv(K, dist)"
+            f"{key}: want a name that is known to hold the lens, such as distortion_coefficients, got "
+            f"{described(value)} under this one; rename it, or build dp.Camera.from_opencv(K, dist)"
         )
 
 
 def _check_no_vector(key: str, value: Any) -> None:
     """Refuse a vector of as many numbers as a lens has, under a name that nobody knows, where no lens was found."""
     plain = re.sub(r"[^a-z0-9]", "", key.lower())
-    if not isinstance(value, list | dict | np.ndarray) or re.search("std|dev|err|roi|quat|rot|orient|vec|rms|time", plain):
-        return
-    if _parted(key)[1] in MATRICES | SIZES:
+    harmless = re.search("std|dev|err|roi|quat|rot|orient|vec|rms|time", plain) or _parted(key)[1] in MATRICES | SIZES
+    if harmless or not isinstance(value, list | dict | np.ndarray):
         return
     try:
         found = matrix(key, value)
@@ -164,8 +174,8 @@ def _check_no_vector(key: str, value: Any) -> None:
         return
     if found.size in BrownConrady.counts and found.size == max(found.shape):
         raise ValueError(
-            f"{key}: want the lens under a name that is known, such as distortion_coefficients, got {found.size} numbers "
-            "under this one, as a lens has; rename it, or take it out of the file where it is none"
+            f"{key}: want the lens under a name that is known, such as distortion_coefficients, got {found.size} "
+            "numbers under this one, as a lens has; rename it, or take it out of the file where it is none"
         )
 
 
@@ -182,9 +192,7 @@ def _kind(mapping: dict[str, Any]) -> Kind | None:
     return next(iter(kinds), None)
 
 
-def _lens(
-    lenses: dict[str, tuple[str, Any]], label: str, count: int, kind: Kind | None, four_is_brown: bool
-) -> Any:
+def _lens(lenses: dict[str, tuple[str, Any]], label: str, count: int, kind: Kind | None, four_is_brown: bool) -> Any:
     if label not in lenses:
         if lenses and count > 1:
             raise ValueError(f"camera {label}: want its distortion, as another camera of the file has, got none")
@@ -224,17 +232,22 @@ def _size(key: str, value: Any) -> tuple[int, int] | None:
 def _sides(mapping: dict[str, Any]) -> tuple[int, int] | None:
     plain = {re.sub(r"[^a-z0-9]", "", key.lower()): value for key, value in mapping.items()}
     for width, height in SIDES:
-        if width in plain and height in plain or width.startswith("im") and (width in plain or height in plain):
+        if (width in plain and height in plain) or (width.startswith("im") and (width in plain or height in plain)):
             return image_size(plain.get(width), plain.get(height), width.removesuffix("width") or "size")
     return None
 
 
 def _plausible(size: tuple[int, int] | None, K: np.ndarray) -> tuple[int, int] | None:
-    """The size, unless it is (height, width): the principal point lies outside of it then, and inside the other way."""
-    if size is not None and size[0] != size[1]:
-        x, y = float(K[0, 2]), float(K[1, 2])
-        if not (x < size[0] and y < size[1]) and 0 <= x < size[1] and 0 <= y < size[0]:
-            raise ValueError(f"size: want width and height, got {size}, which looks like height and width: c is ({x:g}, {y:g})")
+    """The size, unless it is (height, width), or that of something else, as the principal point tells."""
+    x, y = float(K[0, 2]), float(K[1, 2])
+    if size is not None and not (-size[0] < x < 2 * size[0] and -size[1] < y < 2 * size[1]):
+        raise ValueError(
+            f"size: want that of the image, got {size}, far from which the principal point is: ({x:g}, {y:g})"
+        )
+    if size is not None and not (x < size[0] and y < size[1]) and 0 <= x < size[1] and 0 <= y < size[0]:
+        raise ValueError(
+            f"size: want width and height, got {size}, which looks like height and width: c is ({x:g}, {y:g})"
+        )
     return size
 
 
@@ -249,7 +262,10 @@ def _posed(cameras: dict[str, Camera], mapping: dict[str, Any]) -> dict[str, Cam
             raise ValueError(f"T: want 3 numbers, got {t.size}")
         R, t = rigid("R", np.column_stack([R, t]))
         second = cameras[names[1]]
-        return {names[0]: cameras[names[0]], names[1]: camera_of(second.K.numpy(), second.distortion, second.size, (R, t))}
+        return {
+            names[0]: cameras[names[0]],
+            names[1]: camera_of(second.K.numpy(), second.distortion, second.size, (R, t)),
+        }
     if len(names) == 1 and "R" in mapping and "t" in mapping:
         pose = rigid("R", np.column_stack([square("R", mapping["R"], 3, 3), square("t", mapping["t"], 3, 1)]))
         only = cameras[names[0]]

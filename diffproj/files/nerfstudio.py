@@ -34,7 +34,9 @@ KNOWN = frozenset(KEYS) | {"k4", "k5", "k6", "distortion_params", "camera_model"
 def recognises(document: Document) -> bool:
     """Whether it has frames with a `transform_matrix`, or `fl_x`, or `camera_angle_x`."""
     tree, frames = document.mapping, document.mapping.get("frames")
-    posed = isinstance(frames, list) and any(isinstance(frame, dict) and "transform_matrix" in frame for frame in frames)
+    posed = isinstance(frames, list) and any(
+        isinstance(frame, dict) and "transform_matrix" in frame for frame in frames
+    )
     return posed or "fl_x" in tree or "camera_angle_x" in tree
 
 
@@ -71,12 +73,13 @@ def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
     cameras = cameras_of(item, "nerfstudio")
     fields = [_fields(camera) for camera in cameras]
     shared = {key: value for key, value in fields[0].items() if all(other.get(key) == value for other in fields)}
-    frames = []
+    frames: list[dict[str, Any]] = []
     for i, (camera, own) in enumerate(zip(cameras, fields, strict=True)):
         R, t = inverse((camera.R.numpy(), camera.t.numpy()))
         rows = np.vstack([np.column_stack([R @ FLIP, t]), [0, 0, 0, 1]])
-        rest = {key: value for key, value in own.items() if key not in shared}
-        frames.append({"file_path": f"images/{i:06d}.png", **rest, "transform_matrix": (rows + 0.0).tolist()})
+        frame: dict[str, Any] = {"file_path": f"images/{i:06d}.png"}
+        frame |= {key: value for key, value in own.items() if key not in shared}
+        frames.append(frame | {"transform_matrix": (rows + 0.0).tolist()})
     return {path: json.dumps(shared | {"frames": frames}, indent=1, allow_nan=False) + "\n"}
 
 
@@ -93,13 +96,15 @@ def _fields(camera: Camera) -> dict[str, Any]:
         model, lens = (model, lens) if camera.distortion is not None else ("PINHOLE", {})
     width, height = camera.size
     K = {"fl_x": f_x, "fl_y": f_y, "cx": c_x + 0.5, "cy": c_y + 0.5}
-    return {"camera_model": model, "w": width, "h": height, **K, **lens}
+    return {"camera_model": model, "w": width, "h": height} | K | lens
 
 
 def _camera(fields: dict[str, Any], pose: Any) -> Camera:
     size = image_size(fields.get("w"), fields.get("h"), "w, h")
     if size is None and not all(key in fields for key in ("fl_x", "cx", "cy")):
-        raise ValueError("want w and h, the size of the image, or fl_x, cx and cy, got neither; add w and h to the file")
+        raise ValueError(
+            "want w and h, the size of the image, or fl_x, cx and cy, got neither; add w and h to the file"
+        )
     width, height = size or (0, 0)
     f_x = _focal(fields, "x", width)
     f_y = _focal(fields, "y", height)

@@ -2,8 +2,8 @@
 
 Pickles in them are never opened. `rvecs` and `tvecs` are many views and no pose; `newcameramtx` is of another image.
 4 coefficients need the model beside them, `camera_model`, for they may be those of `cv2.fisheye`. Written are
-`camera_matrix`, `dist_coeffs`, `camera_model`, `image_size` (width, height), and of a posed camera `R` and `t`, world to
-camera.
+`camera_matrix`, `dist_coeffs`, `camera_model`, `image_size` (width, height), and of a posed camera `R` and `t`, world
+to camera.
 """
 
 import io

@@ -19,7 +19,11 @@ from diffproj.files.numbers import camera_of, image_size, intrinsics, matrix, nu
 from diffproj.files.writing import numbers_text, one_camera, without_pose
 from diffproj.geometry.camera import Camera
 
-MATRIX, LENS, RECTIFIED = ("camera_matrix", "K", "k"), ("distortion_coefficients", "D", "d"), ("projection_matrix", "P", "p")
+MATRIX, LENS, RECTIFIED = (
+    ("camera_matrix", "K", "k"),
+    ("distortion_coefficients", "D", "d"),
+    ("projection_matrix", "P", "p"),
+)
 COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
 
 
@@ -80,11 +84,13 @@ def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
 
 
 def _camera(fields: dict[str, Any]) -> Found:
-    missing = [name[0] for name in (MATRIX, LENS) if _first(fields, name) is None]
-    if missing or not fields.get("distortion_model"):
-        raise ValueError(f"want {', '.join([*missing, *([] if fields.get('distortion_model') else ['distortion_model'])])}")
+    wanted = (MATRIX, LENS, ("distortion_model",))
+    missing = [names[0] for names in wanted if _first(fields, names) in (None, ("distortion_model", ""))]
+    if missing:
+        raise ValueError(f"want {' and '.join(missing)} in a camera_info, got none")
     _check_whole_image(fields)
-    size = image_size(*(fields.get(f"image_{side}", fields.get(side)) for side in ("width", "height")))
+    width, height = (fields.get(f"image_{side}", fields.get(side)) for side in ("width", "height"))
+    size = image_size(width, height)
     K = intrinsics(*_first(fields, MATRIX))
     name, value = _first(fields, LENS)
     found, model = matrix(name, value).ravel().tolist(), str(fields["distortion_model"]).strip()
@@ -94,7 +100,8 @@ def _camera(fields: dict[str, Any]) -> Found:
         raise ValueError(f"{name}: want {counts} coefficients for distortion_model {model}, got {len(found)}")
     aside = {}
     if _first(fields, RECTIFIED) is not None:
-        P = square(*_first(fields, RECTIFIED), 3, 4)
+        name, value = _first(fields, RECTIFIED)
+        P = square(name, value, 3, 4)
         if P[0, 0] > 0:
             K_rectified = intrinsics("projection_matrix", P[:, :3])
             aside["rectified"] = camera_of(K_rectified, None, size, (np.eye(3), np.linalg.solve(K_rectified, P[:, 3])))
@@ -102,6 +109,7 @@ def _camera(fields: dict[str, Any]) -> Found:
 
 
 def _first(fields: dict[str, Any], names: tuple[str, ...]) -> Any:
+    """The first of the names that holds something, with what it holds; `None` where none does."""
     return next(((name, fields[name]) for name in names if fields.get(name) is not None), None)
 
 
@@ -116,15 +124,17 @@ def _check_whole_image(fields: dict[str, Any]) -> None:
     roi = fields.get("roi") or {}
     if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset", "width", "height")):
         whole = [roi.get("x_offset", 0), roi.get("y_offset", 0), roi.get("width"), roi.get("height")]
-        if whole != [0, 0, fields.get("width", fields.get("image_width")), fields.get("height", fields.get("image_height"))]:
+        width, height = (fields.get(side, fields.get(f"image_{side}")) for side in ("width", "height"))
+        if whole != [0, 0, width, height]:
             raise ValueError(
-                f"roi: want the whole image, got {whole}: K is of the image before cropping; remove the key, and cut by "
-                "camera.cropped(left, top, width, height)"
+                f"roi: want the whole image, got {whole}: K is of the image before cropping; remove the key, and cut "
+                "by camera.cropped(left, top, width, height)"
             )
 
 
 def _is_ini(document: Document) -> bool:
-    return bool(re.search(r"^\[image\]\s*$", document.text or "", re.MULTILINE)) and "camera matrix" in (document.text or "")
+    text = document.text or ""
+    return "camera matrix" in text and re.search(r"^\[image\]\s*$", text, re.MULTILINE) is not None
 
 
 def _sections(text: str) -> dict[str, dict[str, Any]]:

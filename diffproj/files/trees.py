@@ -153,10 +153,14 @@ def _xml_node(element: ElementTree.Element, depth: int) -> Any:
     for tag, items in many.items():
         if len(items) > 1 and tag not in PLURAL:
             raise ValueError(f"{tag}: want the element once, got it {len(items)} times")
-    return _without_doubles([*attributes, *((tag, items if len(items) > 1 else items[0]) for tag, items in many.items())])
+    return _without_doubles(
+        [*attributes, *((tag, items if len(items) > 1 else items[0]) for tag, items in many.items())]
+    )
 
 
-PLURAL = frozenset({"sensor", "camera", "group", "component", "property", "marker", "chunk", "covariance", "frame", "calibration"})
+PLURAL = frozenset(
+    {"sensor", "camera", "group", "component", "property", "marker", "chunk", "covariance", "frame", "calibration"}
+)
 """Elements that stand more than once in one element, in Metashape's files."""
 
 

@@ -7,7 +7,7 @@ from diffproj.geometry.camera import Camera
 
 
 def cameras_of(item: Camera | Calibration, what: str) -> list[Camera]:
-    """The single cameras of a batch, upright, without skew, in float64 on the CPU; of a calibration, the one without pose.
+    """The single cameras of a batch, upright, without skew, in float64 on the CPU; of a calibration, that without pose.
 
     Raises:
         ValueError: the format does not hold their skew.
@@ -16,7 +16,9 @@ def cameras_of(item: Camera | Calibration, what: str) -> list[Camera]:
     camera = camera.detach().to("cpu", torch.float64).upright()
     skew = camera.K[..., 0, 1]
     if bool((skew != 0).any()):
-        raise ValueError(f"K: want no skew, which {what} does not hold, got {float(skew.abs().max()):.3g} px; use .json")
+        raise ValueError(
+            f"K: want no skew, which {what} does not hold, got {float(skew.abs().max()):.3g} px; use .json"
+        )
     if camera.batch_shape.numel() == 0:
         raise ValueError(f"want at least one camera for {what}, got batch shape {tuple(camera.batch_shape)}")
     if not camera.batch_shape:
@@ -39,7 +41,8 @@ def one_camera(item: Camera | Calibration, what: str) -> Camera:
 
 def has_pose(camera: Camera) -> bool:
     """Whether the world frame is another than the camera's."""
-    return bool((camera.R != torch.eye(3, dtype=camera.dtype)).any() or (camera.t != 0).any())
+    turned = camera.R != torch.eye(3, dtype=camera.dtype)  # noqa: SIM300
+    return bool(turned.any() or (camera.t != 0).any())
 
 
 def without_pose(camera: Camera, what: str) -> Camera:

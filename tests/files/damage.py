@@ -4,7 +4,36 @@ import random
 import re
 
 NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
-WORDS = (b"nan", b".nan", b"NaN", b"1e300", b"1e999", b"-1e300", b"Infinity", b"-0", b"true", b"null", b"[]", b"{}", b'"640"', b"'1'", b"abc", b"*a", b"&a 1", b"0x10", b"010", b"1_000", b"12:30", b"!!python/object:os.system 1", b"99999999999999999999999999", b"-5", b"0", b"0.5", b"\xff\xfe", b"\x00")
+WORDS = (
+    b"nan",
+    b".nan",
+    b"NaN",
+    b"1e300",
+    b"1e999",
+    b"-1e300",
+    b"Infinity",
+    b"-0",
+    b"true",
+    b"null",
+    b"[]",
+    b"{}",
+    b'"640"',
+    b"'1'",
+    b"abc",
+    b"*a",
+    b"&a 1",
+    b"0x10",
+    b"010",
+    b"1_000",
+    b"12:30",
+    b"!!python/object:os.system 1",
+    b"99999999999999999999999999",
+    b"-5",
+    b"0",
+    b"0.5",
+    b"\xff\xfe",
+    b"\x00",
+)
 
 
 def truncated(data: bytes, rng: random.Random) -> bytes:
@@ -58,12 +87,16 @@ def renamed(data: bytes, rng: random.Random) -> bytes:
     if not found:
         return flipped(data, rng)
     match = rng.choice(found)
-    name = rng.choice((match[0][1:], match[0] + b"x", match[0].upper(), match[0].lower(), b"distortion", b"K", b"data", b""))
+    name = rng.choice(
+        (match[0][1:], match[0] + b"x", match[0].upper(), match[0].lower(), b"distortion", b"K", b"data", b"")
+    )
     return data[: match.start()] + name + data[match.end() :]
 
 
 def nested(data: bytes, rng: random.Random) -> bytes:
-    opening, closing = rng.choice(((b"[", b"]"), (b"{", b"}"), (b"(", b")"), (b"<a>", b"</a>"), (b'{"a":', b"}"), (b"- ", b""), (b"[\n", b"]\n")))
+    opening, closing = rng.choice(
+        ((b"[", b"]"), (b"{", b"}"), (b"(", b")"), (b"<a>", b"</a>"), (b'{"a":', b"}"), (b"- ", b""), (b"[\n", b"]\n"))
+    )
     depth, at = rng.choice((5, 100, 3000, 100_000)), rng.randrange(len(data))
     return data[:at] + opening * depth + closing * rng.choice((0, depth)) + data[at:]
 
@@ -75,7 +108,10 @@ def spliced(data: bytes, rng: random.Random) -> bytes:
 
 
 def marked(data: bytes, rng: random.Random) -> bytes:
-    return rng.choice((b"\xef\xbb\xbf", b"\xff\xfe", b"\xfe\xff", b"\n\n", b"\x00", b"\x1f\x8b", b"%YAML:1.0\n", b"#!\n")) + data
+    return (
+        rng.choice((b"\xef\xbb\xbf", b"\xff\xfe", b"\xfe\xff", b"\n\n", b"\x00", b"\x1f\x8b", b"%YAML:1.0\n", b"#!\n"))
+        + data
+    )
 
 
 def line_ends(data: bytes, rng: random.Random) -> bytes:
@@ -90,7 +126,22 @@ def noise(data: bytes, rng: random.Random) -> bytes:
     return data[: rng.choice((0, 8, 128))] + rng.randbytes(rng.choice((1, 20, 3000)))
 
 
-KINDS = (truncated, flipped, renumbered, quoted, without_line, doubled_line, swapped_lines, renamed, nested, spliced, marked, line_ends, utf16, noise)
+KINDS = (
+    truncated,
+    flipped,
+    renumbered,
+    quoted,
+    without_line,
+    doubled_line,
+    swapped_lines,
+    renamed,
+    nested,
+    spliced,
+    marked,
+    line_ends,
+    utf16,
+    noise,
+)
 
 
 def damaged(data: bytes, rng: random.Random) -> tuple[str, bytes]:

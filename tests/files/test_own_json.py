@@ -67,7 +67,11 @@ DAMAGE = [
     ("calibration/status", 0.5, "status: want whole numbers"),
     ("calibration/skew", 0, "skew: want true or false"),
     ("calibration/size", [640], "size: want width and height"),
-    ("calibration/covariance/shared/0/0", float("nan"), "covariance: want finite numbers where the calibration converged"),
+    (
+        "calibration/covariance/shared/0/0",
+        float("nan"),
+        "covariance: want finite numbers where the calibration converged",
+    ),
     ("calibration/covariance/shared/0/0", None, "covariance: want finite numbers where the calibration converged"),
     ("calibration/covariance/shared/0/0", -1.0, "shared: want variances of at least 0"),
     ("calibration/covariance/alone/0/0/0", -1.0, "alone: want variances of at least 0"),
@@ -132,7 +136,9 @@ def test_fields_come_and_go_without_a_file(calibration: dp.Calibration) -> None:
     assert torch.equal(again.likelihood_ratio, calibration.likelihood_ratio)
     assert again.summary() == calibration.summary()
     with pytest.raises(KeyError, match="pixels"):
-        dp.Calibration.from_fields({k: v for k, v in calibration.to_fields().items() if k != "pixels"}, calibration.camera)
+        dp.Calibration.from_fields(
+            {k: v for k, v in calibration.to_fields().items() if k != "pixels"}, calibration.camera
+        )
 
 
 def test_many_views_are_packed_and_come_back_exactly(tmp_path: Path) -> None:
@@ -150,7 +156,10 @@ def test_many_views_are_packed_and_come_back_exactly(tmp_path: Path) -> None:
     assert time.perf_counter() - before < 0.5  # 0.03 s; a thousand views take 0.1 s
     assert torch.equal(found.covariance.full(), want.covariance.full())
     assert torch.equal(found.residuals, want.residuals)
-    for value, message in (({"shape": [100, 54, 2], "float64": "AAAA"}, "got 3 bytes"), ({"shape": 4, "bool": ""}, "packed")):
+    for value, message in (
+        ({"shape": [100, 54, 2], "float64": "AAAA"}, "got 3 bytes"),
+        ({"shape": 4, "bool": ""}, "packed"),
+    ):
         with pytest.raises(ValueError, match=message):
             dp.load_calibration(write(tmp_path / "d.json", json.loads(text), "calibration/pixels", value))
 

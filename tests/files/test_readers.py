@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from tests.files.samples import DIST, K, OPENCV_STEREO, OPENCV_YAML, PLAIN_YAML, ROS, SAMPLES, npy, npz
 
 import diffproj as dp
 from diffproj.files.formats import CONVENTIONS, FORMATS, Format, FormatName
+from tests.files.samples import DIST, OPENCV_STEREO, OPENCV_YAML, PLAIN_YAML, ROS, SAMPLES, K, npy, npz
 
 D = torch.float64
 
@@ -182,7 +182,10 @@ def test_ros_ini_says_the_same_as_yaml(tmp_path: Path) -> None:
     assert numbers(camera)[0] == [369.344588, 367.154330, 320.739078, 203.592450]
     assert numbers(camera)[1] == [0.189544, -0.018229, -0.000630, 0.000054, -0.000212]
     assert camera.size == (640, 480)
-    assert numbers(load(tmp_path, "ost.txt", camera="rectified")) == ([262.927429, 302.056213, 320.984481, 188.592437], [])
+    assert numbers(load(tmp_path, "ost.txt", camera="rectified")) == (
+        [262.927429, 302.056213, 320.984481, 188.592437],
+        [],
+    )
 
 
 def test_colmap_takes_half_a_pixel_off(tmp_path: Path) -> None:
@@ -194,7 +197,9 @@ def test_colmap_takes_half_a_pixel_off(tmp_path: Path) -> None:
     )
     posed = load(tmp_path, "images.txt", camera="left/a b.png")
     turn = cv2.Rodrigues(np.array([0, np.deg2rad(30), 0]))[0]
-    np.testing.assert_allclose(poses(posed), np.vstack([np.column_stack([turn, [0.1, 0.2, 3]]), [0, 0, 0, 1]]), atol=1e-12)
+    np.testing.assert_allclose(
+        poses(posed), np.vstack([np.column_stack([turn, [0.1, 0.2, 3]]), [0, 0, 0, 1]]), atol=1e-12
+    )
     assert numbers(load(tmp_path, "images.txt", camera="right.png"))[0][0] == 608.56
 
 
@@ -219,7 +224,9 @@ def test_nerfstudio_turns_opengls_axes(tmp_path: Path) -> None:
 
 def test_nerfstudio_takes_the_focal_length_from_the_angle(tmp_path: Path) -> None:
     frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
-    camera = load(tmp_path, "transforms.json", json.dumps({"camera_angle_x": 0.8, "w": 800, "h": 600, "frames": [frame]}))
+    camera = load(
+        tmp_path, "transforms.json", json.dumps({"camera_angle_x": 0.8, "w": 800, "h": 600, "frames": [frame]})
+    )
     focal = 400 / np.tan(0.4)
     np.testing.assert_allclose(numbers(camera)[0], [focal, focal, 399.5, 299.5])
     assert camera.distortion is None
@@ -233,12 +240,16 @@ def test_kalibr_chains_its_cameras(tmp_path: Path) -> None:
     assert numbers(both[1])[0] == [457.587, 456.134, 379.999, 255.238]
     assert both.size == (752, 480)
     turned = SAMPLES["camchain.yaml"].decode().replace("T_cam_imu", "T_imu_cam")
-    np.testing.assert_allclose(poses(load(tmp_path, "camchain.yaml", turned, camera=0)), np.linalg.inv(first), atol=1e-12)
+    np.testing.assert_allclose(
+        poses(load(tmp_path, "camchain.yaml", turned, camera=0)), np.linalg.inv(first), atol=1e-12
+    )
 
 
 def test_kitti_divides_by_k(tmp_path: Path) -> None:
     both = load(tmp_path, "calib.txt")
-    P = np.array([[float(x) for x in line.split()[1:]] for line in SAMPLES["calib.txt"].decode().splitlines()[:4]]).reshape(-1, 3, 4)
+    P = np.array(
+        [[float(x) for x in line.split()[1:]] for line in SAMPLES["calib.txt"].decode().splitlines()[:4]]
+    ).reshape(-1, 3, 4)
     assert both.batch_shape == (4,)
     assert both.size is None
     np.testing.assert_allclose(both[2].t.numpy(), [0.06046, -0.00176, 0.00498], atol=1e-5)

@@ -21,7 +21,9 @@ LENSES = {
     "brown4": dp.BrownConrady(torch.tensor([-0.28, 0.07, 1.3e-3, 1e-5], dtype=D)),
     "brown5": dp.BrownConrady(torch.tensor([-0.28, 0.07, 1.3e-3, 1e-5, 0.002], dtype=D)),
     "brown8": dp.BrownConrady(torch.tensor([0.1, 0.07, 1.3e-3, 1e-5, 0.002, 0.3, 0.05, 0.01], dtype=D)),
-    "brown12": dp.BrownConrady(torch.tensor([0.1, 0.07, 1e-3, 1e-5, 0.002, 0.3, 0.05, 0.01, 1e-3, 2e-3, -1e-3, 1e-4], dtype=D)),
+    "brown12": dp.BrownConrady(
+        torch.tensor([0.1, 0.07, 1e-3, 1e-5, 0.002, 0.3, 0.05, 0.01, 1e-3, 2e-3, -1e-3, 1e-4], dtype=D)
+    ),
     "brown14": dp.BrownConrady(
         torch.tensor([0.1, 0.07, 1e-3, 1e-5, 0.002, 0.3, 0.05, 0.01, 1e-3, 2e-3, -1e-3, 1e-4, 0.01, -0.02], dtype=D)
     ),
@@ -56,7 +58,9 @@ def cameras(lens: str, count: int = 3, seed: int = 0) -> dp.Camera:
 def points(camera: dp.Camera, seed: int = 1) -> torch.Tensor:
     """World points in front of each camera."""
     g = torch.Generator().manual_seed(seed)
-    xyz = torch.cat([torch.rand(40, 2, dtype=D, generator=g) - 0.5, torch.rand(40, 1, dtype=D, generator=g) + 1], dim=-1)
+    xyz = torch.cat(
+        [torch.rand(40, 2, dtype=D, generator=g) - 0.5, torch.rand(40, 1, dtype=D, generator=g) + 1], dim=-1
+    )
     return (xyz - camera.t.unsqueeze(-2)) @ camera.R
 
 
