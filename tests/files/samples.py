@@ -3,6 +3,7 @@
 import io
 import struct
 import zipfile
+import zlib
 
 import numpy as np
 
@@ -327,6 +328,31 @@ METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
   </chunk>
 </document>
 """
+
+
+def mat(variables: dict[str, object], compressed: bool = False) -> bytes:
+    """A `.mat` file of version 5 with matrices of numbers and structs."""
+
+    def element(kind: int, content: bytes) -> bytes:
+        return struct.pack("<II", kind, len(content)) + content + b"\0" * (-len(content) % 8)
+
+    def matrix(name: str, value: object) -> bytes:
+        if isinstance(value, dict):
+            names = b"".join(key.encode().ljust(32, b"\0") for key in value)
+            head, shape = 2, (1, 1)
+            body = struct.pack("<HHI", 5, 4, 32) + element(1, names) + b"".join(matrix("", item) for item in value.values())
+        else:
+            array = np.atleast_2d(np.asarray(value, dtype=np.float64))
+            head, shape, body = 6, array.shape, element(9, array.tobytes("F"))
+        parts = element(6, struct.pack("<II", head, 0)) + element(5, struct.pack("<ii", *shape)) + element(1, name.encode())
+        return element(14, parts + body)
+
+    content = b""
+    for name, value in variables.items():
+        one = matrix(name, value)
+        packed = zlib.compress(one)
+        content += struct.pack("<II", 15, len(packed)) + packed if compressed else one
+    return b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + content
 
 
 def npz(**arrays: np.ndarray) -> bytes:

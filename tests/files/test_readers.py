@@ -12,7 +12,7 @@ import yaml
 
 import diffproj as dp
 from diffproj.files.formats import CONVENTIONS, FORMATS, Format, FormatName
-from tests.files.samples import DIST, OPENCV_STEREO, OPENCV_YAML, PLAIN_YAML, ROS, SAMPLES, K, npy, npz
+from tests.files.samples import DIST, OPENCV_STEREO, OPENCV_YAML, PLAIN_YAML, ROS, SAMPLES, K, mat, npy, npz
 
 D = torch.float64
 
@@ -289,6 +289,9 @@ def test_mrcal_is_reference_to_camera(tmp_path: Path) -> None:
     np.testing.assert_allclose(camera.R.numpy(), cv2.Rodrigues(np.array([2e-2, -3e-1, -1e-2]))[0], atol=1e-15)
     assert camera.t.tolist() == [1.0, 2.0, -3.0]
     assert len(numbers(camera)[1]) == 8
+    X = torch.tensor([[1.1316275232135746, -2.416378929785561, 5.901620007664578]], dtype=D)
+    want = [2158.554977866744, 763.406885017728]  # of mrcal 2.2
+    np.testing.assert_allclose(camera.project(X)[0][0].numpy(), want, atol=1e-9)
     assert camera.size == (4000, 2200)
 
 
@@ -299,6 +302,29 @@ def test_matlab_is_transposed_and_one_based(tmp_path: Path) -> None:
     bouguet = load(tmp_path, "Calib_Results.m")
     assert numbers(bouguet)[0] == [657.302804801291540, 657.744296340400240, 302.716587683502560, 242.333978595866210]
     assert bouguet.size == (640, 480)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_mat_files_of_a_struct_of_its_fields_and_of_bouguet(tmp_path: Path, compressed: bool) -> None:
+    matrix = np.array([[700.0, 0, 321], [0, 701, 242], [0, 0, 1]])
+    lens = {"RadialDistortion": [-0.35, 0.15, 0.01], "TangentialDistortion": [0.001, -0.002], "ImageSize": [480, 640]}
+    old, new = lens | {"IntrinsicMatrix": matrix.T}, lens | {"K": matrix}
+    for variables in ({"cameraParams": old}, old, new, {"other": [1, 2], "p": new}):
+        camera = load(tmp_path, "a.mat", mat(variables, compressed))
+        assert numbers(camera) == ([700.0, 701.0, 320.0, 241.0], [-0.35, 0.15, 0.001, -0.002, 0.01])
+        assert camera.size == (640, 480)
+    kc = [[-0.25], [0.12], [0.001], [0.002], [0.0]]
+    bouguet = {"fc": [[657], [658]], "cc": [[302], [242]], "kc": kc, "alpha_c": 0.5, "nx": 640, "ny": 480}
+    camera = load(tmp_path, "a.mat", mat(bouguet, compressed))
+    assert camera.K.tolist() == [[657.0, 328.5, 302.0], [0.0, 658.0, 242.0], [0.0, 0.0, 1.0]]
+    pair = {f"{key}_{side}": bouguet[key] for key in ("fc", "cc", "kc", "alpha_c") for side in ("left", "right")}
+    both = load(tmp_path, "a.mat", mat(pair | {"om": [0, 0, np.pi / 2], "T": [-100, 1, 2]}, compressed))
+    np.testing.assert_allclose(both[1].R.numpy(), [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
+    assert both[1].t.tolist() == [-100.0, 1.0, 2.0]
+    data = mat({"cameraParams": old}, compressed)
+    for length in (130, len(data) // 2, len(data) - 9):
+        with pytest.raises(ValueError, match=r"a\.mat"):
+            load(tmp_path, "a.mat", data[:length])
 
 
 def test_metashape_projects_as_its_manual_says(tmp_path: Path) -> None:
