@@ -24,12 +24,12 @@ def write_whole(path: str | os.PathLike[str], content: str | bytes) -> None:
     real = Path(os.path.realpath(path))
     data = content.encode() if isinstance(content, str) else content
     try:
-        _replace(real, data)
+        _put(real, data)
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), os.fspath(path)) from error
 
 
-def _replace(path: Path, data: bytes) -> None:
+def _put(path: Path, data: bytes) -> None:
     if path.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
     if path.exists() and not path.is_file():

@@ -17,6 +17,7 @@ or not at all.
 | `"numpy"` | `.npz`, `.npy` | arrays of K, lens, size, R and t | `.npz`, one camera |
 | `"kitti"` | `calib.txt`, `calib_cam_to_cam.txt` | rectified cameras; raw ones with lens | |
 | `"nuscenes"` | `calibrated_sensor.json`; Argoverse's | K and pose, no size | |
+| `"open3d"` | `PinholeCameraIntrinsic`, `...Parameters` | K, size, pose; no lens | |
 | `"mrcal"` | `.cameramodel` | PINHOLE, OPENCV4 to 12, with pose | |
 | `"matlab"` | `toStruct` in `.mat`, JSON; Bouguet's | K, lens, size | |
 | `"metashape"` | XML of cameras, or of one calibration | frame sensors, poses by label | |
@@ -34,6 +35,7 @@ What each says, where it differs from here:
 | `"numpy"` | | | 4 need `camera_model` |
 | `"kitti"` | | t = K^-1 P[:, 3]; raw: camera 0 to camera | none; raw: 5 |
 | `"nuscenes"` | | sensor to vehicle | none; Argoverse: k1 k2 k3 |
+| `"open3d"` | | | matrices column by column |
 | `"mrcal"` | | reference to camera | |
 | `"matlab"` | first centre at 1; Bouguet's as here | none; Bouguet's: left to right | radial, tangential |
 | `"metashape"` | from the image's middle | camera to chunk to world | P1 is p2, P2 is p1 |

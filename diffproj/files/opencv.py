@@ -71,8 +71,8 @@ def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
     camera = item.camera if isinstance(item, Calibration) else item
     if camera.batch_shape:
         raise ValueError(
-            f"OpenCV's formats hold one camera, got batch shape {tuple(camera.batch_shape)}; use .json, or save them one "
-            "by one"
+            f"OpenCV's formats hold one camera, got batch shape {tuple(camera.batch_shape)}; "
+            "use .json, or save them one by one"
         )
     K, dist, rvec, tvec = camera.to_opencv()
     if rvec.any() or tvec.any():

@@ -273,6 +273,12 @@ MRCAL = """{
 }
 """
 
+OPEN3D = """{"width": 640, "height": 480, "intrinsic_matrix": [525.0, 0, 0, 0, 526.0, 0, 319.5, 239.5, 1]}"""
+
+OPEN3D_POSED = """{"class_name": "PinholeCameraParameters", "extrinsic": [0.8, 0.6, 0, 0, -0.6, 0.8, 0, 0, 0, 0, 1, 0, 1.5, 2.5, 3.5, 1],
+ "intrinsic": {"height": 480, "intrinsic_matrix": [525.0, 0, 0, 0, 526.0, 0, 319.5, 239.5, 1], "width": 640},
+ "version_major": 1, "version_minor": 0}"""
+
 MATLAB_JSON = """{"cameraParams": {"RadialDistortion": [-0.35, 0.15], "TangentialDistortion": [0.001, -0.002], "ImageSize": [480, 640],
  "WorldUnits": "mm", "EstimateSkew": false,
  "IntrinsicMatrix": [[700.0, 0.0, 0.0], [0.0, 701.0, 0.0], [321.0, 242.0, 1.0]], "Version": {"Major": 9}}}
@@ -340,11 +346,17 @@ def mat(variables: dict[str, object], compressed: bool = False) -> bytes:
         if isinstance(value, dict):
             names = b"".join(key.encode().ljust(32, b"\0") for key in value)
             head, shape = 2, (1, 1)
-            body = struct.pack("<HHI", 5, 4, 32) + element(1, names) + b"".join(matrix("", item) for item in value.values())
+            body = (
+                struct.pack("<HHI", 5, 4, 32)
+                + element(1, names)
+                + b"".join(matrix("", item) for item in value.values())
+            )
         else:
             array = np.atleast_2d(np.asarray(value, dtype=np.float64))
             head, shape, body = 6, array.shape, element(9, array.tobytes("F"))
-        parts = element(6, struct.pack("<II", head, 0)) + element(5, struct.pack("<ii", *shape)) + element(1, name.encode())
+        parts = (
+            element(6, struct.pack("<II", head, 0)) + element(5, struct.pack("<ii", *shape)) + element(1, name.encode())
+        )
         return element(14, parts + body)
 
     content = b""
@@ -415,6 +427,8 @@ SAMPLES: dict[str, bytes] = {
     "calibrated_sensor.json": NUSCENES.encode(),
     "vehicle_calibration_info.json": ARGOVERSE.encode(),
     "camera.cameramodel": MRCAL.encode(),
+    "open3d.json": OPEN3D.encode(),
+    "view.json": OPEN3D_POSED.encode(),
     "matlab.json": MATLAB_JSON.encode(),
     "Calib_Results.m": BOUGUET.encode(),
     "cameras.xml": METASHAPE.encode(),

@@ -340,6 +340,16 @@ def test_what_formats_have_and_we_do_not(tmp_path: Path, name: str, change: tupl
         ("a.toml", '[cam_0]\nname = "A"\nsize = [ 1920, 1080,]\n', "an anipose calibration"),
         ("a.json", '{"v2": {"projection_type": "perspective", "focal": 0.85, "k1": 0.0}}', "cameras of OpenSfM"),
         ("a.yaml", "model_type: MEI\nmirror_parameters:\n   xi: 3.6\n", "an omnidirectional camera"),
+        (
+            "a.yaml",
+            "Camera.fx: 458.6\nCamera.fy: 457.3\nViewer.PointSize:2\nCamera.k1: -0.28\n",
+            "settings of ORB-SLAM",
+        ),
+        (
+            "a.yaml",
+            "Camera:\n  fx: 441.7\n  fy: 442.5\n  cx: 480.4\n  cy: 275.5\n  k1: 0.1\n",
+            "numbers stand one by one",
+        ),
         ("a.xml", "<opencv_storage><rvec>1 2 3</rvec></opencv_storage>", "a pose alone"),
         ("a.npy", npy(np.zeros((7, 17))), "the poses of LLFF"),
         ("a.mat", b"MATLAB 7.3 MAT-file" + b" " * 105 + b"\x00\x02IM" + b"\0" * 400, "toStruct"),

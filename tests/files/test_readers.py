@@ -284,6 +284,16 @@ def test_argoverse_has_three_radial_coefficients(tmp_path: Path) -> None:
     np.testing.assert_allclose(camera.center.numpy(), [1.1058, 0.2462, 1.3735], atol=1e-12)
 
 
+def test_open3d_runs_column_by_column(tmp_path: Path) -> None:
+    for name in ("open3d.json", "view.json"):
+        camera = load(tmp_path, name)
+        assert numbers(camera) == ([525.0, 526.0, 319.5, 239.5], [])
+        assert camera.size == (640, 480)
+    np.testing.assert_array_equal(
+        poses(camera), [[0.8, -0.6, 0, 1.5], [0.6, 0.8, 0, 2.5], [0, 0, 1, 3.5], [0, 0, 0, 1]]
+    )
+
+
 def test_mrcal_is_reference_to_camera(tmp_path: Path) -> None:
     camera = load(tmp_path, "camera.cameramodel")
     np.testing.assert_allclose(camera.R.numpy(), cv2.Rodrigues(np.array([2e-2, -3e-1, -1e-2]))[0], atol=1e-15)
