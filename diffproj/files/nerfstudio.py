@@ -28,6 +28,9 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 KEYS = ("k1", "k2", "p1", "p2", "k3")
+OTHERS = ("ftheta", "latlong", "equirect", "ortho", "omni")
+"""In the names of instant-ngp's keys for other cameras."""
+
 KNOWN = frozenset(KEYS) | {"k4", "k5", "k6", "distortion_params", "camera_model", "is_fisheye"}
 
 
@@ -134,6 +137,8 @@ def _focal(fields: dict[str, Any], axis: str, side: int) -> float | None:
 
 def _lens(fields: dict[str, Any]) -> Lens | None:
     for key, value in fields.items():
+        if any(word in key.lower() for word in OTHERS) and value:
+            raise ValueError(f"{key}: want a perspective or fisheye lens of OpenCV, got one of other equations")
         if key not in KNOWN:
             check_no_lens_key(key, value)
     model = fields.get("camera_model", "OPENCV")

@@ -261,6 +261,9 @@ def test_what_is_no_file(tmp_path: Path) -> None:
         (("[0.6, 0.0, 0.8, 1.0]", "[-0.6, 0.0, -0.8, 1.0]"), "left-handed"),
         (("[0.6, 0.0, 0.8, 1.0]", "[0.6, 0.0, 0.9, 1.0]"), "want a rotation"),
         (("frame_00002", "frame_00001"), "want each file once"),
+        (('"k1"', '"ftheta_p0": 0.1, "k1"'), "ftheta_p0: want a perspective or fisheye lens"),
+        (('"OPENCV"', '"OPENCV_FISHEYE"'), "p1: want 0"),
+        (('"w": 3008, ', ""), "want width and height, got only one"),
     ],
 )
 def test_what_nerfstudio_has_and_we_do_not(tmp_path: Path, change: tuple[str, str], message: str) -> None:
