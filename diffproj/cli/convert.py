@@ -25,7 +25,7 @@ formats:
   written goes with the suffix: .json for diffproj's own, .yaml, .yml and .xml
   for OpenCV's, .npz for numpy's, .txt for COLMAP's (cameras.txt, or with poses
   images.txt). --to names another: ros, kalibr, nerfstudio, or opencv for .json.
-  Only read are kitti, nuscenes, open3d, mrcal, matlab and metashape.
+  Only read are kitti, nuscenes, open3d, mrcal, matlab, metashape, settings.
 
 examples:
   diffproj convert cameras.txt camera.yaml

@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 from diffproj.files.document import Document
 
-ONE_BY_ONE = "; build dp.Camera.from_opencv([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], [k1, k2, p1, p2], size=(w, h))"
 CANNOT = "; build dp.Camera(K, R, t, lens, size) from its numbers"
 
 KINDS = {str: "text", list: "list", dict: "mapping without keys"} | dict.fromkeys((int, float, bool), "number alone")
@@ -25,13 +24,7 @@ KNOWN: tuple[tuple[Callable[[Document], bool], str], ...] = (
         _text(r'"?projection_type"?\s*:|^\s*"?FOCAL"?\s*:'),
         "cameras of OpenSfM, in units of the image's longer side" + CANNOT,
     ),
-    (_text(r"^\s*Camera\d?\.fx\s*:"), "settings of ORB-SLAM, whose numbers stand one by one" + ONE_BY_ONE),
-    (
-        _text(r"^\s*projection_parameters\s*:[\s\S]*\bfx\b"),
-        "a camera of VINS, whose numbers stand one by one" + ONE_BY_ONE,
-    ),
     (_text(r"\bxi\b.*:|\bMEI\b"), "an omnidirectional camera (xi), which is neither perspective nor OpenCV's fisheye"),
-    (_text(r"^\s*fx\s*:[\s\S]*^\s*cy\s*:"), "a camera whose numbers stand one by one" + ONE_BY_ONE),
     (_text(r"^\s*-\s*camera\s*:"), "a camera rig of SVO; export it as Kalibr's camchain, or" + CANNOT[1:]),
     (_text(r"^\s*(rvec|tvec|R|T|Tr)\b|<rvec|<R\b"), "a pose alone, without K; give the file with the camera matrix"),
 )

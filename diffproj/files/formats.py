@@ -20,6 +20,7 @@ from diffproj.files import (
     opencv,
     own_json,
     ros,
+    settings,
 )
 from diffproj.files.document import Document
 from diffproj.files.found import Found
@@ -38,6 +39,7 @@ FormatName = Literal[
     "open3d",
     "kalibr",
     "ros",
+    "settings",
     "opencv",
 ]
 PathLike = str | os.PathLike[str]
@@ -86,6 +88,7 @@ FORMATS: dict[FormatName, Any] = {
     "open3d": open3d,
     "kalibr": kalibr,
     "ros": ros,
+    "settings": settings,
     "opencv": opencv,
 }
 """In the order in which a file is offered to them."""
@@ -103,6 +106,7 @@ CONVENTIONS: dict[FormatName, str] = {
     "open3d": "matrices column by column there; world to camera, pixel centres at whole numbers, no lens",
     "kalibr": "IMU or first camera to camera; pixel centres at whole numbers",
     "ros": "K and D of the raw image; --camera rectified is that of the rectified one, by P",
+    "settings": "pixel centres at whole numbers, k1 k2 p1 p2 k3 one by one; poses in a body are not taken",
     "opencv": "pixel centres at whole numbers, coefficients in OpenCV's order; of two cameras, R and T from 1 to 2",
 }
 """What was turned into the conventions of `Camera`, in a line each."""

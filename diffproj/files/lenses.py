@@ -24,6 +24,7 @@ _FISHEYE = (
     "kannala_brandt4",
     "kannala_brandt8",
     "kb4",
+    "kannalabrandt8",
     "equi",
     "opencv_fisheye",
 )

@@ -279,6 +279,63 @@ OPEN3D_POSED = """{"class_name": "PinholeCameraParameters", "extrinsic": [0.8, 0
  "intrinsic": {"height": 480, "intrinsic_matrix": [525.0, 0, 0, 0, 526.0, 0, 319.5, 239.5, 1], "width": 640},
  "version_major": 1, "version_minor": 0}"""
 
+ORB_SLAM = """%YAML:1.0
+
+# Camera Parameters
+Camera.type: "PinHole"
+Camera1.fx: 458.654
+Camera1.fy: 457.296
+Camera1.cx: 367.215
+Camera1.cy: 248.375
+Camera1.k1: -0.28340811
+Camera1.k2: 0.07395907
+Camera1.p1: 0.00019359
+Camera1.p2: 1.76187114e-05
+Camera.width: 752
+Camera.height: 480
+Tbc: !!opencv-matrix
+   rows: 4
+   cols: 4
+   dt: f
+   data: [1.0, 0.0, 0.0, 0.1, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+Viewer.PointSize:2
+"""
+
+STELLA = """Camera:
+  name: "LUMIX 8mm fisheye"
+  setup: "monocular"
+  model: "fisheye"
+  fx: 441.73
+  fy: 442.52
+  cx: 480.36
+  cy: 275.49
+  k1: -3.07e-02
+  k2: -3.34e-03
+  k3: -2.88e-03
+  k4: -5.92e-04
+  cols: 960
+  rows: 540
+Feature:
+  scale_factor: 1.2
+"""
+
+VINS = """%YAML:1.0
+---
+model_type: KANNALA_BRANDT
+camera_name: camera
+image_width: 752
+image_height: 480
+projection_parameters:
+   k2: -1.6e-03
+   k3: 2.4e-02
+   k4: -3.6e-02
+   k5: 2.0e-02
+   mu: 461.5
+   mv: 460.1
+   u0: 356.4
+   v0: 231.2
+"""
+
 MATLAB_JSON = """{"cameraParams": {"RadialDistortion": [-0.35, 0.15], "TangentialDistortion": [0.001, -0.002], "ImageSize": [480, 640],
  "WorldUnits": "mm", "EstimateSkew": false,
  "IntrinsicMatrix": [[700.0, 0.0, 0.0], [0.0, 701.0, 0.0], [321.0, 242.0, 1.0]], "Version": {"Major": 9}}}
@@ -428,6 +485,9 @@ SAMPLES: dict[str, bytes] = {
     "vehicle_calibration_info.json": ARGOVERSE.encode(),
     "camera.cameramodel": MRCAL.encode(),
     "open3d.json": OPEN3D.encode(),
+    "EuRoC.yaml": ORB_SLAM.encode(),
+    "stella.yaml": STELLA.encode(),
+    "cam0_kb.yaml": VINS.encode(),
     "view.json": OPEN3D_POSED.encode(),
     "matlab.json": MATLAB_JSON.encode(),
     "Calib_Results.m": BOUGUET.encode(),

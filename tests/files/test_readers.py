@@ -284,6 +284,28 @@ def test_argoverse_has_three_radial_coefficients(tmp_path: Path) -> None:
     np.testing.assert_allclose(camera.center.numpy(), [1.1058, 0.2462, 1.3735], atol=1e-12)
 
 
+def test_settings_have_numbers_one_by_one(tmp_path: Path) -> None:
+    orb = load(tmp_path, "EuRoC.yaml")
+    assert numbers(orb) == ([458.654, 457.296, 367.215, 248.375], [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05])
+    assert orb.size == (752, 480)
+    stella, vins = load(tmp_path, "stella.yaml"), load(tmp_path, "cam0_kb.yaml")
+    assert numbers(stella) == ([441.73, 442.52, 480.36, 275.49], [-3.07e-02, -3.34e-03, -2.88e-03, -5.92e-04])
+    assert numbers(vins) == ([461.5, 460.1, 356.4, 231.2], [-1.6e-03, 2.4e-02, -3.6e-02, 2.0e-02])
+    assert isinstance(stella.distortion, dp.KannalaBrandt)
+    assert isinstance(vins.distortion, dp.KannalaBrandt)
+    assert stella.size == (960, 540)
+
+
+def test_settings_of_a_stereo_pair(tmp_path: Path) -> None:
+    text = SAMPLES["EuRoC.yaml"].decode().replace("PinHole", "KannalaBrandt8").replace("p1", "k3").replace("p2", "k4")
+    second = "".join(line.replace("Camera1", "Camera2") + "\n" for line in text.splitlines() if "Camera1" in line)
+    pose = text[text.index("Tbc") : text.index("Viewer")].replace("Tbc", "Stereo.T_c1_c2")
+    both = load(tmp_path, "EuRoC.yaml", text + second + pose)
+    assert both.batch_shape == (2,)
+    assert both.t.tolist() == [[0.0, 0.0, 0.0], [-0.1, 0.0, 0.0]]
+    assert isinstance(both.distortion, dp.KannalaBrandt)
+
+
 def test_open3d_runs_column_by_column(tmp_path: Path) -> None:
     for name in ("open3d.json", "view.json"):
         camera = load(tmp_path, name)

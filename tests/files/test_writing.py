@@ -192,7 +192,7 @@ def test_one_camera_where_a_format_holds_one(tmp_path: Path, name: str) -> None:
         dp.save_camera(tmp_path / FLAT[name], cameras("none").without_pose(), format=name)
 
 
-@pytest.mark.parametrize("name", ["kitti", "nuscenes", "open3d", "mrcal", "matlab", "metashape"])
+@pytest.mark.parametrize("name", ["kitti", "nuscenes", "open3d", "settings", "mrcal", "matlab", "metashape"])
 def test_formats_that_are_only_read(tmp_path: Path, name: str) -> None:
     with pytest.raises(ValueError, match=f"to write, got '{name}', which is only read"):
         dp.save_camera(tmp_path / "a", cameras("none")[0], format=name)
