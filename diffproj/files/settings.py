@@ -18,7 +18,16 @@ from diffproj.geometry.camera import Camera
 from diffproj.lens.protocol import Lens
 
 FOCAL = ("fx", "fy", "cx", "cy")
-VINS_FISHEYE = {"mu": "fx", "mv": "fy", "u0": "cx", "v0": "cy", "k2": "k1", "k3": "k2", "k4": "k3", "k5": "k4"}
+VINS_FISHEYE: dict[str, str] = {
+    "mu": "fx",
+    "mv": "fy",
+    "u0": "cx",
+    "v0": "cy",
+    "k2": "k1",
+    "k3": "k2",
+    "k4": "k3",
+    "k5": "k4",
+}
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 SIZES = (("width", "height"), ("image_width", "image_height"), ("cols", "rows"))
 TYPES = ("type", "model", "model_type", "camera_model")
@@ -70,7 +79,8 @@ def _is_whole(fields: dict[str, Any]) -> bool:
 
 def _vins(tree: dict[str, Any]) -> dict[str, Any]:
     """The fields of VINS's sections under the names of the others."""
-    fields, lens = tree["projection_parameters"], tree.get("distortion_parameters", {})
+    fields: dict[str, Any] = tree["projection_parameters"]
+    lens = tree.get("distortion_parameters", {})
     if tree["model_type"] == "KANNALA_BRANDT":
         fields = {VINS_FISHEYE.get(key, key): value for key, value in fields.items()}
     elif tree["model_type"] != "PINHOLE" or not isinstance(lens, dict):
