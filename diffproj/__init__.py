@@ -99,6 +99,7 @@ __all__ = [
     "explain",
     "ground_resolution",
     "image_residuals",
+    "load",
     "load_calibration",
     "load_camera",
     "locate",

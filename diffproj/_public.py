@@ -22,6 +22,7 @@ from diffproj.calibration.solver import Status as Status
 from diffproj.calibration.validation import CrossValidation as CrossValidation
 from diffproj.calibration.validation import bootstrap as bootstrap
 from diffproj.calibration.validation import cross_validate as cross_validate
+from diffproj.files.load import load as load
 from diffproj.files.load import load_calibration as load_calibration
 from diffproj.files.load import load_camera as load_camera
 from diffproj.files.save import save_camera as save_camera

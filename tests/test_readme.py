@@ -54,6 +54,10 @@ def folder(example: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) ->
     shutil.copy(folder / "photos" / "3.jpg", folder / "photo.jpg")
     dp.save_camera(folder / "camera.json", calibration)
     dp.save_camera(folder / "camera.yaml", calibration)
+    two = calibration.cameras[:2]
+    two = dp.Camera(two.K, two.R, two.t, size=two.size)
+    dp.save_camera(folder / "camchain.yaml", two, format="kalibr")
+    dp.save_camera(folder / "cameras.txt", two.without_pose())
     return folder
 
 

@@ -31,6 +31,7 @@ from torch import Tensor
 from diffproj._core.arguments import instance, position
 from diffproj._core.copying import Copied
 from diffproj._core.numerics import broadcast_batches
+from diffproj.calibration.fields import mask, tensor
 from diffproj.calibration.solver import Equations
 
 SINGULAR = 2e-15
@@ -162,8 +163,8 @@ class Covariance(Copied):
 
         Raises:
             KeyError: a field is missing.
-            TypeError: a field holds something other than numbers.
-            ValueError: a field's lists are not of equal lengths.
+            ValueError: a field holds something other than numbers, shapes do not fit each other, or a variance is
+                negative.
 
         Example:
             >>> import diffproj as dp
@@ -171,22 +172,35 @@ class Covariance(Copied):
             >>> torch.equal(dp.Covariance.from_fields(covariance.to_fields()).full(), covariance.full())
             True
         """
-        undetermined, undetermined_views = (
-            torch.tensor(fields[key], dtype=torch.bool, device="cpu") for key in ("undetermined", "undetermined_views")
-        )
-        shared, *blocks = (
-            torch.tensor(fields[key], dtype=torch.float64, device="cpu")
-            for key in ("shared", "follow", "mixed", "alone")
-        )
+        names = fields["names"]
+        if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+            raise ValueError("names: want a list of texts, got something else")
+        count = len(names)
+        undetermined_views = mask(fields, "undetermined_views")
+        *batch, views = undetermined_views.shape
+        undetermined = mask(fields, "undetermined", (*batch, count))
+        shared = tensor(fields, "shared", (*batch, count, count), gaps=True)
+        follow, mixed = (tensor(fields, name, (*batch, views, 6, count), gaps=True) for name in ("follow", "mixed"))
+        alone = tensor(fields, "alone", (*batch, views, 6, 6), gaps=True)
+        for name, block in (("shared", shared), ("alone", alone)):
+            if bool((block.diagonal(dim1=-2, dim2=-1) < 0).any()):
+                raise ValueError(f"{name}: want variances of at least 0, got a negative one")
         dispersion = torch.ones_like(shared[..., 0, 0])  # a file of an earlier version has none
         if "dispersion" in fields:
-            dispersion = torch.tensor(fields["dispersion"], dtype=torch.float64, device="cpu")
+            dispersion = tensor(fields, "dispersion", tuple(batch), least=0, gaps=True)
+        middle = []
+        if "middle" in fields or "arm" in fields:
+            middle = [tensor(fields, "middle", (3,)), tensor(fields, "arm", (*batch, views, 3))]
         infinite = torch.diag_embed(torch.where(undetermined, torch.inf, 0.0).to(shared))
-        middle = [
-            torch.tensor(fields[key], dtype=torch.float64, device="cpu") for key in ("middle", "arm") if key in fields
-        ]
         known = undetermined, undetermined_views, dispersion
-        return cls(tuple(fields["names"]), shared + infinite, *known, *blocks, *middle)
+        return cls(tuple(names), shared + infinite, *known, follow, mixed, alone, *middle)
+
+    @property
+    def has_gaps(self) -> Bool[Tensor, "*batch"]:
+        """Whether anything in it is not a number `(*B,)`, as of a camera that did not converge."""
+        blocks = (self._follow, self._mixed, self._alone)
+        gaps = self.shared.isnan().flatten(-2).any(-1) | self.dispersion.isnan()
+        return gaps | torch.stack([block.isnan().flatten(-3).any(-1) for block in blocks]).any(0)
 
     def _number(self, name: str, view: int) -> int:
         return position(name, view, self._alone.shape[-3], "views")

@@ -18,6 +18,7 @@ from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.distinct import alike, described
 from diffproj.calibration.parametrisation import BOW, SKEW, Parametrisation
+from diffproj.calibration.record import Recorded
 from diffproj.calibration.region import covered_region
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
@@ -52,7 +53,7 @@ class CalibrationError(RuntimeError):
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration(Copied):
+class Calibration(Copied, Recorded):
     """A camera with the poses of the views that it was found from, and those views.
 
     Many cameras side by side have a batch shape `*B`; for one camera it is empty.
