@@ -50,6 +50,7 @@ from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.locate import locate
 from diffproj.calibration.losses import Cauchy, Huber, Loss, SoftL1
+from diffproj.calibration.mismatch import CameraMismatchWarning
 from diffproj.calibration.options import CalibrationOptions, LocateOptions
 from diffproj.calibration.refine import refine
 from diffproj.calibration.result import Calibration, CalibrationError
@@ -98,6 +99,7 @@ __all__ = [
     "CalibrationOptions",
     "CalibrationPrior",
     "Camera",
+    "CameraMismatchWarning",
     "Cauchy",
     "Chessboard",
     "Covariance",

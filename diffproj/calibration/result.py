@@ -9,12 +9,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffproj.calibration import mismatch as mismatches
 from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
 from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.bow import bowed
 from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.distinct import alike, described
+from diffproj.calibration.mismatch import Mismatch
 from diffproj.calibration.parametrisation import BOW, SKEW, Parametrisation
 from diffproj.calibration.region import covered_region
 from diffproj.calibration.solver import Status
@@ -101,6 +103,7 @@ class Calibration:
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
     _remarks: Callable[[], tuple[str, ...]] | None = None
+    _mismatch: Callable[[], Mismatch] | None = None
 
     @property
     def board_points(self) -> Float[Tensor, "*batch n 3"]:
@@ -157,6 +160,15 @@ class Calibration:
 
     @property
     def doubts(self) -> str:
+        """What makes the poses doubtful, in words; empty where nothing does, or where it is not known.
+
+        Views that are `ambiguous`; and, of a calibration that `locate` found with another, views that this one does
+        not fit: see `mismatch`.
+        """
+        return "; ".join(filter(None, [self.ambiguity, mismatches.described(self.mismatch, self.views.names)]))
+
+    @property
+    def ambiguity(self) -> str:
         """Which views are ambiguous, in words; empty where none is, or where other poses are not known."""
         if not self.has_alternatives:
             return ""
@@ -168,6 +180,16 @@ class Calibration:
             return ""
         more = f" and {len(doubtful) - MAX_NAMES} more views" if len(doubtful) > MAX_NAMES else ""
         return f"two poses fit {', '.join(doubtful[:MAX_NAMES])}{more}, and the one that was kept may be the wrong one"
+
+    @cached_property
+    def mismatch(self) -> Mismatch:
+        """How the views compare with the calibration that they were located with: `ratio`, `doubtful`, `scale`.
+
+        The photographs of another camera, zoom or focus are `doubtful`: their corners are not where this calibration
+        sees them, by more than noise and what it leaves open. Their `ratio`, residuals in times the calibration's, need
+        not be large. The ratio is NaN and nothing is doubtful where there is nothing to compare with.
+        """
+        return self._mismatch() if self._mismatch is not None else mismatches.none_at_all(self.used)
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
