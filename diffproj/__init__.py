@@ -68,6 +68,7 @@ from diffproj.lens.kannala_brandt import KannalaBrandt
 from diffproj.lens.models import register_lens
 from diffproj.lens.protocol import Lens
 from diffproj.measurement.accuracy_map import AccuracyMap
+from diffproj.measurement.choices import PixelNoiseWarning
 from diffproj.measurement.measure import measure
 from diffproj.measurement.measurement import Measurement
 from diffproj.measurement.quantity import Quantity
@@ -115,6 +116,7 @@ __all__ = [
     "Loss",
     "Measurement",
     "PaperSetup",
+    "PixelNoiseWarning",
     "Plane",
     "PlaneLoss",
     "PlaneMap",

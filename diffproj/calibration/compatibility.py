@@ -22,6 +22,7 @@ from diffproj.calibration.covariance import local_inverse, zero_where_infinite
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.leftover import f_deviations
 from diffproj.calibration.mismatch import Mismatch, none_at_all
+from diffproj.calibration.noise import Noise, noise_of
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.result import Calibration
 
@@ -46,14 +47,15 @@ def mismatch(found: Fit, known: Calibration, batch: Sequence[int]) -> Mismatch:
 
     Of weighted corners nothing is said, for their noise is not the calibration's.
     """
-    if known.pixel_sigma is None or known.degrees_of_freedom is None or found.task.weights is not None:
+    noise = noise_of(known, batch)
+    if noise is None or found.task.weights is not None:
         return none_at_all(found.task.used.unflatten(0, tuple(batch)) if batch else found.task.used.squeeze(0))
     with torch.no_grad():
-        ratio, doubtful, scale = _compared(found, known, tuple(batch))
-    return Mismatch(*(part.reshape(*batch, part.shape[-1]) for part in (ratio, doubtful, scale)))
+        compared = _compared(found, known, noise, tuple(batch))
+    return Mismatch(*(part.reshape(*batch, part.shape[-1]) for part in compared))
 
 
-def _compared(found: Fit, known: Calibration, batch: tuple[int, ...]) -> Mismatch:
+def _compared(found: Fit, known: Calibration, usual: Noise, batch: tuple[int, ...]) -> Mismatch:
     def of_each(value: Tensor, behind: int = 0) -> Tensor:
         """A number or a matrix of the calibrations for each of the P cameras, `(P, 1)` or `(P, 1, n, n)`."""
         shape = value.shape[value.ndim - behind :]
@@ -61,8 +63,7 @@ def _compared(found: Fit, known: Calibration, batch: tuple[int, ...]) -> Mismatc
 
     used = found.task.used
     rows, pose, residual = _derivatives(found)
-    variance = of_each(known.pixel_sigma).clamp(min=FINEST_PX).square()
-    freedom = of_each(known.degrees_of_freedom).clamp(min=1)
+    variance, freedom = usual.variance.clamp(min=FINEST_PX**2).unsqueeze(-1), usual.freedom.unsqueeze(-1)
     total = residual.square().sum((-2, -1)) / variance
     spare = (2 * used.sum(-1) - POSE).to(total)
     counted = (spare > 0) & total.isfinite()

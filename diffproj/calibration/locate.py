@@ -6,6 +6,7 @@ from typing import Unpack
 import torch
 from kornia.geometry.camera import PinholeCamera
 
+from diffproj._core.warn import warn_caller
 from diffproj.calibration import closed_form, start
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.data import Data
@@ -68,7 +69,7 @@ def locate(
     if bool(found.ambiguous.any()):
         warnings.warn(f"locate: {found.ambiguity}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
     if text := described(found.mismatch, views.names):
-        warnings.warn(f"locate: {text}", CameraMismatchWarning, stacklevel=2)
+        warn_caller(f"locate: {text}", CameraMismatchWarning)
     return found
 
 

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffproj.calibration import ambiguity as ambiguities
 from diffproj.calibration import mismatch as mismatches
 from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
 from diffproj.calibration.border import border_with_rays
@@ -34,9 +35,6 @@ SENTENCES = {
     Status.DIVERGED: "found no step that lowers the error: look for mixed-up corners, or start closer",
     Status.DEGENERATE: "the views do not determine the camera",
 }
-
-MAX_NAMES = 10
-"""Names of ambiguous views in a message."""
 
 
 class CalibrationError(RuntimeError):
@@ -170,16 +168,7 @@ class Calibration:
     @property
     def ambiguity(self) -> str:
         """Which views are ambiguous, in words; empty where none is, or where other poses are not known."""
-        if not self.has_alternatives:
-            return ""
-        doubtful = [
-            f"{self.views.names[view]}{f' of camera {tuple(camera)}' * bool(camera)}"
-            for *camera, view in self.ambiguous.nonzero().tolist()
-        ]
-        if not doubtful:
-            return ""
-        more = f" and {len(doubtful) - MAX_NAMES} more views" if len(doubtful) > MAX_NAMES else ""
-        return f"two poses fit {', '.join(doubtful[:MAX_NAMES])}{more}, and the one that was kept may be the wrong one"
+        return ambiguities.described(self.ambiguous, self.views.names) if self.has_alternatives else ""
 
     @cached_property
     def mismatch(self) -> Mismatch:

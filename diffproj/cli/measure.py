@@ -128,7 +128,9 @@ def run(command: argparse.ArgumentParser, options: argparse.Namespace) -> int:
         raise ValueError(f"--pixel-sigma: want the noise of the pixels in px, for {options.camera} does not tell it")
     plane = Plane(torch.tensor(options.plane[:3], dtype=torch.float64), options.plane[3])
     pixels = torch.tensor(options.points, dtype=torch.float64)
-    measured = measure(pixels, scene.calibration, plane, scene.view, options.pixel_sigma)
+    measured = measure(
+        pixels, scene.calibration, plane, scene.view, float(sigma) if options.pixel_sigma else "detector"
+    )
     found = document(scene, plane, float(sigma), pixels, measured)
     if options.json:
         result(json.dumps(found, indent=1, allow_nan=False))

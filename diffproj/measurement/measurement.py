@@ -36,6 +36,8 @@ class Measurement:
             and lens. They do for a calibration with its covariance. For a camera alone, or a calibration from a file
             without a covariance, they hold the pixels' noise only; for a pose that `locate` found with a camera alone,
             the pixels' noise and the pose's uncertainty.
+        doubts: what makes the pose that they were measured from doubtful, in words: that the calibration does not fit
+            the photograph, as if it were another camera's, or that two poses fit it. Empty where nothing does.
     """
 
     points: Float[Tensor, "*batch n 3"]
@@ -43,6 +45,7 @@ class Measurement:
     includes_intrinsics: bool
     _noise: Noise = field(repr=False)
     _region: Tensor | None = field(default=None, repr=False)
+    doubts: str = ""
 
     @property
     def degrees_of_freedom(self) -> Float[Tensor, "*batch"]:
@@ -134,7 +137,7 @@ class Measurement:
         Example:
             >>> import diffproj as dp
             >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-            >>> measured = dp.measure(calibration.views.pixels[0, :3], calibration, dp.Plane.z(0.0))
+            >>> measured = dp.measure(calibration.views.pixels[0, :3], calibration, dp.Plane.z(0.0), view=0)
             >>> middle = measured.quantity(lambda p: p.mean(dim=0)[0], [[0, 1, 2]])
             >>> print(f"{middle.value[0]:.1f} mm")  # x of the centroid of three corners in a row
             25.0 mm
@@ -196,6 +199,8 @@ class Measurement:
             lines.append(EXTRAPOLATED)
         if any(bent):
             lines.append(NONLINEAR)
+        if self.doubts:
+            lines.append(f"Doubtful: {self.doubts}.".replace("?.", "?"))
         if not self.includes_intrinsics:
             known = "pixels and the pose" if self._noise.sigma.shape[-1] else "pixels alone"
             lines.append(f"The deviations hold the noise of the {known}: the camera came without a covariance.")
