@@ -101,7 +101,7 @@ def test_new_photograph(capsys: pytest.CaptureFixture[str]) -> None:
     document = parsed(capsys, "photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS)
     board = dp.Chessboard(8, 5, 25.0)
     located = dp.locate(dp.detect("photo.png", board), board, dp.load_calibration("camera.json"))
-    same(document, dp.measure(pixels(*CORNERS), located, dp.Plane.z(0.0)))
+    same(document, dp.measure(pixels(*CORNERS), located, dp.Plane.z(0.0), pixel_sigma="detector"))
     assert document["pixel_sigma"] == float(located.pixel_sigma)  # type: ignore[arg-type]
     assert document["deviations_include"] == ["pixels", "pose", "camera"]
     assert (document["photograph"], document["view"], document["remarks"]) == ("photo.png", "photo.png", [])
@@ -142,7 +142,7 @@ def test_camera_without_covariance(file: str, capsys: pytest.CaptureFixture[str]
     document = parsed(capsys, *options)
     board = dp.Chessboard(8, 5, 25.0)
     located = dp.locate(dp.detect("photo.png", board), board, dp.load_camera(file))
-    same(document, dp.measure(pixels(*CORNERS), located, dp.Plane.z(0.0)))
+    same(document, dp.measure(pixels(*CORNERS), located, dp.Plane.z(0.0), pixel_sigma="detector"))
     assert document["deviations_include"] == ["pixels", "pose"]
     code, out, _ = run(capsys, *options)
     assert code == 0
@@ -171,7 +171,7 @@ def test_a_view_whose_pose_may_be_the_wrong_one_is_told(capsys: pytest.CaptureFi
     try:
         document = parsed(capsys, *options)
         assert document["remarks"][-1].startswith("The board's corners fit two poses, and the one taken is only ")
-        same(document, dp.measure(pixels("320,240", "330,250"), found, dp.Plane.z(0.0)))
+        same(document, dp.measure(pixels("320,240", "330,250"), found, dp.Plane.z(0.0), pixel_sigma="detector"))
         assert "tells them apart" in " ".join(run(capsys, *options)[1].split())
     finally:
         Path("far.json").unlink()

@@ -252,7 +252,7 @@ def test_what_is_not_determined_is_infinite() -> None:
     finite = torch.where(full.isinf(), 0.0, full)
     scale = finite.diagonal().clamp(min=1e-30).rsqrt()
     assert torch.linalg.eigvalsh(finite * scale * scale[:, None])[0] > -1e-6
-    measured = dp.measure(views.pixels[0, [0, 5]], found, Z, pixel_sigma="detector")
+    measured = dp.measure(views.pixels[0, [0, 5]], found, Z, view=0)
     joint = measured.joint()
     assert not joint.isnan().any()
     assert joint.diagonal().isinf()[[0, 1, 3, 4]].all()
