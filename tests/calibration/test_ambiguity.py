@@ -252,7 +252,7 @@ def test_few_corners_alone_claim_no_more_than_they_know() -> None:
 def test_noise_that_contradicts_the_calibration_is_not_its_own(calibration: dp.Calibration) -> None:
     """Ten times the calibration's noise: its level would make every wrong pose certain."""
     pixels, truth = leaning(pinhole(800.0), marker(120.0), 200, 800.0, (20.0, 20.0), noise=10 * SIGMA)
-    with pytest.warns(dp.AmbiguousPoseWarning):
+    with pytest.warns(dp.AmbiguousPoseWarning), pytest.warns(dp.CameraMismatchWarning, match="times the|exceed the"):
         found = dp.locate(dp.Views(pixels), marker(120.0), calibration)
     wrong = tilt_error(found.alternatives, truth) < tilt_error(found.cameras, truth)
     assert int(wrong.sum()) > 10
