@@ -1,5 +1,6 @@
 """`Calibration`: a camera with the poses of its views, what is left over, how it ended, and how sure it is."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffproj.calibration import advice
 from diffproj.calibration import ambiguity as ambiguities
 from diffproj.calibration import mismatch as mismatches
 from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
@@ -293,8 +295,45 @@ class Calibration:
         own = self.knows_intrinsics or not self.has_covariance
         return covered_region(self.views.pixels, self.used) if own else None
 
+    @cached_property
+    def verdict(self) -> str:
+        """Whether one camera is known well, why, and what to photograph next, in plain words.
+
+        `Good: ...`, `Weak: ...` or `Not usable: ...`; for what `locate` found, how its poses compare with the
+        calibration behind them.
+
+        Raises:
+            ValueError: there are many cameras.
+        """
+        if self.views.batch_shape:
+            raise ValueError(f"verdict: want one camera, got batch shape {tuple(self.views.batch_shape)}; see message")
+        if self.status:
+            return f"Not usable: {self._ends()[0]}."
+        if self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics):
+            return f"Poses only, the camera was given: {self.doubts or 'nothing speaks against them'}.".replace(
+                "?.", "?"
+            )
+        used = self.used.any(-1)
+        unsure = None
+        if self.has_covariance:
+            spread = self.covariance_of_kept_poses.shared.diagonal()[:4].sqrt()
+            unsure = float(spread.amax() / self.shared[0])
+        return advice.verdict(
+            advice.Evidence(
+                self.cameras,
+                used,
+                float((used if self.shares is None else self.shares * used).sum()),
+                self.region,
+                unsure,
+                float(self.pixel_sigma) if self.pixel_sigma is not None else float(self.rms) / math.sqrt(2),
+                self.view_rms,
+                self.views.names,
+                self.remarks[0],
+            )
+        )
+
     def summary(self) -> str:
-        """One camera as a text for people: parameters with deviations, RMS of each view, how it ended.
+        """One camera as a text for people: parameters with deviations, RMS of each view, how it ended, the verdict.
 
         Raises:
             ValueError: there are many cameras.
@@ -336,7 +375,7 @@ class Calibration:
                 f"{'image':<16}{100 * (1 - share):.0f} % of its border lies beyond the fold of the lens: no rays"
             )
         remarks = [*self.remarks[0].split("; "), "" if self.status else self.doubts]
-        return "\n".join([*lines, self._ends()[0], *filter(None, remarks)])
+        return "\n".join([*lines, self._ends()[0], *filter(None, remarks), self.verdict])
 
     def _ends(self) -> list[str]:
         """How each camera ended, in a sentence."""
