@@ -16,6 +16,7 @@ import torch.utils._pytree as torch_pytree
 from torch import Tensor
 
 from diffproj._core.numerics import at_least_float32, converted
+from diffproj._core.shown import Shown
 
 T = TypeVar("T")
 B = TypeVar("B", bound="Batched")
@@ -23,7 +24,7 @@ Rearrange = Callable[[Tensor, int], Tensor]
 """Takes a tensor and how many axes it has behind those of the batch to the same in another arrangement."""
 
 
-class Batched:
+class Batched(Shown):
     """Tensors that share batch axes `*B`, parts with the same batch axes, and constants."""
 
     __slots__ = ()

@@ -77,20 +77,20 @@ def verdict(seen: Evidence) -> str:
     covered = _covered(seen)
     faults, remedies = _faults(seen, tilt, covered), []
     one_axis = tilt >= LOW_TILT and seen.different >= 2 and _second_spread(normals) < ONE_AXIS
+    if seen.other_lens:
+        remedies.append("no photograph yet, but the lens model that the remark on the residuals names")
     if seen.different < FEW_VIEWS:
         more = ENOUGH_VIEWS - round(seen.different)
         remedies.append(f"{more} more photographs, the board at other places, distances and tilts")
-    if tilt < LOW_TILT or (seen.unsure is not None and seen.unsure > UNSURE):
+    if tilt < LOW_TILT or (seen.unsure is not None and seen.unsure > UNSURE and not seen.other_lens):
         remedies.append("the board tilted by 20 to 50 degrees, about both axes")
     elif one_axis:
         remedies.append("the board tilted about its other axis too")
     bare = [] if covered is None else _bare(covered)
     if bare:
         remedies.append(f"the board in the {_listed(bare)} of the image, up to the edge")
-    if seen.sigma > COARSE_PX:
+    if seen.sigma > COARSE_PX and not seen.other_lens:
         remedies.append("sharper photographs: more light, a camera at rest, a flat print")
-    if seen.other_lens:
-        remedies.append("no photograph, but another lens model: the remark above names it")
     odd = _odd(seen)
     if odd:
         remedies.append(f"another look at {_listed(odd)}, whose corners fit far worse than the others'")
@@ -117,7 +117,7 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
         faults.append(
             f"its corners cover {100 * float(covered.nanmean()):.0f} % of the image, the lens is a guess beyond"
         )
-    if seen.sigma > COARSE_PX:
+    if seen.sigma > COARSE_PX and not seen.other_lens:
         faults.append(
             f"the corners scatter by {seen.sigma:.2g} px in each coordinate, in sharp photographs by 0.05 to 0.3"
         )

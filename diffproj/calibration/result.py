@@ -1,6 +1,5 @@
 """`Calibration`: a camera with the poses of its views, what is left over, how it ended, and how sure it is."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,17 +9,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from diffproj.calibration import advice
 from diffproj.calibration import ambiguity as ambiguities
 from diffproj.calibration import mismatch as mismatches
+from diffproj.calibration.account import Account
 from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
-from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.bow import bowed
 from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
-from diffproj.calibration.distinct import alike, described
 from diffproj.calibration.mismatch import Mismatch
-from diffproj.calibration.parametrisation import BOW, SKEW, Parametrisation
+from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.region import covered_region
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
@@ -29,14 +26,6 @@ from diffproj.targets.views import Views
 
 Objective = Literal["image", "plane"]
 """What is minimised: the distance on the image in pixels, or on the board in world units."""
-
-SENTENCES = {
-    Status.CONVERGED: "converged: no step lowers the error any more",
-    Status.MAX_ITERATIONS: "was still falling when the iterations ended: raise max_iterations, or look for mixed-up "
-    "corners",
-    Status.DIVERGED: "found no step that lowers the error: look for mixed-up corners, or start closer",
-    Status.DEGENERATE: "the views do not determine the camera",
-}
 
 
 class CalibrationError(RuntimeError):
@@ -51,8 +40,8 @@ class CalibrationError(RuntimeError):
         self.calibration = calibration
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Account):
     """A camera with the poses of the views that it was found from, and those views.
 
     Many cameras side by side have a batch shape `*B`; for one camera it is empty.
@@ -294,96 +283,3 @@ class Calibration:
             return self.lens_region
         own = self.knows_intrinsics or not self.has_covariance
         return covered_region(self.views.pixels, self.used) if own else None
-
-    @cached_property
-    def verdict(self) -> str:
-        """Whether one camera is known well, why, and what to photograph next, in plain words.
-
-        `Good: ...`, `Weak: ...` or `Not usable: ...`; for what `locate` found, how its poses compare with the
-        calibration behind them.
-
-        Raises:
-            ValueError: there are many cameras.
-        """
-        if self.views.batch_shape:
-            raise ValueError(f"verdict: want one camera, got batch shape {tuple(self.views.batch_shape)}; see message")
-        if self.status:
-            return f"Not usable: {self._ends()[0]}."
-        if self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics):
-            return f"Poses only, the camera was given: {self.doubts or 'nothing speaks against them'}.".replace(
-                "?.", "?"
-            )
-        used = self.used.any(-1)
-        unsure = None
-        if self.has_covariance:
-            spread = self.covariance_of_kept_poses.shared.diagonal()[:4].sqrt()
-            unsure = float(spread.amax() / self.shared[0])
-        return advice.verdict(
-            advice.Evidence(
-                self.cameras,
-                used,
-                float((used if self.shares is None else self.shares * used).sum()),
-                self.region,
-                unsure,
-                float(self.pixel_sigma) if self.pixel_sigma is not None else float(self.rms) / math.sqrt(2),
-                self.view_rms,
-                self.views.names,
-                self.remarks[0],
-            )
-        )
-
-    def summary(self) -> str:
-        """One camera as a text for people: parameters with deviations, RMS of each view, how it ended, the verdict.
-
-        Raises:
-            ValueError: there are many cameras.
-        """
-        if self.views.batch_shape:
-            raise ValueError(f"summary: want one camera, got batch shape {tuple(self.views.batch_shape)}; see message")
-        deviations = self.covariance.deviations if self._covariance is not None else {}
-        values = dict(zip(self.parameters.names, self.shared.tolist(), strict=True))
-
-        def line(title: str, names: tuple[str, ...], form: str, unit: str) -> str:
-            texts = (f"{values[name]:{form}}{_spread(deviations.get(name), form)}" for name in names)
-            return f"{title:<16}{'  '.join(texts)}{unit}"
-
-        lines = [
-            line("focal lengths", ("f_x", "f_y"), "10.3f", " px"),
-            line("principal point", ("c_x", "c_y"), "10.3f", " px"),
-            *(line(f"lens {name}", (name,), "10.5f", "") for name in self.parameters.coefficient_names),
-        ]
-        if self.parameters.skew:
-            lines.append(line("skew", (SKEW,), "10.3f", " px"))
-        if self.bow is not None:
-            lines.append(line("bow along x, y", BOW, "10.4f", " world units"))
-        lines.append(f"{'RMS':<16}{self.rms.item():10.4f} px over {int(self.used.sum())} corners")
-        width = max(map(len, self.views.names), default=0)
-        seen, used = self.views.visible.sum(-1).tolist(), self.used.sum(-1).tolist()
-        odds = self.likelihood_ratio.tolist() if self.has_alternatives else [torch.inf] * len(used)
-        for view, (name, rms) in enumerate(zip(self.views.names, self.view_rms.tolist(), strict=True)):
-            out = self.rejected[view].nonzero().flatten().tolist()
-            remark = f"  without corners {', '.join(map(str, out))}" if out and used[view] else ""
-            if odds[view] < SURE:
-                remark += f"  another pose is {odds[view]:.2g} times less likely"
-            text = f"{rms:.4f} px{remark}" if used[view] else f"left out: {seen[view] - len(out)} corners, 4 are needed"
-            lines.append(f"  {name:<{width}}  {text}")
-        if self.shares is not None:
-            same = alike(self.points, self.views.pixels.unsqueeze(0), self.used.unsqueeze(0))[0]
-            lines.append(described(same, self.views.names))
-        if self.camera.size is not None and (share := float(border_with_rays(self.camera, self.camera.size))) < 1:
-            lines.append(
-                f"{'image':<16}{100 * (1 - share):.0f} % of its border lies beyond the fold of the lens: no rays"
-            )
-        remarks = [*self.remarks[0].split("; "), "" if self.status else self.doubts]
-        return "\n".join([*lines, self._ends()[0], *filter(None, remarks), self.verdict])
-
-    def _ends(self) -> list[str]:
-        """How each camera ended, in a sentence."""
-        codes = [Status(code) for code in self.status.flatten().tolist()]
-        return [cause or SENTENCES[code] for code, cause in zip(codes, self.causes or ("",) * len(codes), strict=True)]
-
-
-def _spread(deviation: Tensor | None, form: str) -> str:
-    if deviation is None or not float(deviation) > 0:
-        return ""
-    return " (not determined)" if bool(deviation.isinf()) else f" ± {float(deviation):.{form.split('.')[1]}}"

@@ -39,6 +39,7 @@ from diffproj._core.numerics import (
     linear,
     rounding,
 )
+from diffproj._core.shown import Shown
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.geometry.intrinsics import pixel_to_normalized
@@ -62,7 +63,7 @@ class Reason(enum.IntEnum):
     """The ray meets the plane behind the camera."""
 
 
-class PlaneMap:
+class PlaneMap(Shown):
     """The map from pixels to points of a plane, built once for a camera and a plane and then applied at will.
 
     `back_project` builds one for each call; keep one where camera and plane stay as they are. It is a PyTree.
@@ -128,6 +129,10 @@ class PlaneMap:
         """`Reason` codes `(*B, N)` of pixels `(*B, N, 2)`; see the function `explain`."""
         (reasons,) = in_blocks(self._explain, self._checked(pixels), self.matrix, *self.camera.tensors())
         return reasons.squeeze(-1) if self.is_per_point else reasons
+
+    def _facts(self) -> list[str]:
+        planes = "a plane for each point" if self.is_per_point else ""
+        return [repr(self.camera), planes]
 
     def _to_plane(self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
         sight, seen = self._sight(pixels)

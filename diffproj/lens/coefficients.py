@@ -50,8 +50,8 @@ class CoefficientLens(Batched, ABC):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self).unchecked, (self.coefficients,)
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}(coefficients {tuple(self.coefficients.shape)}, {self.dtype}, {self.device})"
+    def _facts(self) -> list[str]:
+        return [f"coefficients {tuple(self.coefficients.shape)}", str(self.dtype), str(self.device)]
 
     def to(self: L, *args: Any, **kwargs: Any) -> L:
         """The lens in another dtype or on another device; see `Batched.to`. It works its plan out anew."""

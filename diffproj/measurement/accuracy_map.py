@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.shown import Shown, number
 from diffproj.calibration.region import in_region
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import ground_resolution
@@ -25,8 +26,8 @@ from diffproj.measurement.choices import chosen_view
 from diffproj.measurement.measure import measure, view_number
 
 
-@dataclass(frozen=True, eq=False)
-class AccuracyMap:
+@dataclass(frozen=True, eq=False, repr=False)
+class AccuracyMap(Shown):
     """How well points of a plane are measured, on a grid of rows and columns.
 
     Attributes:
@@ -51,6 +52,20 @@ class AccuracyMap:
     def extrapolated(self) -> Bool[Tensor, "h w"]:
         """Where a point is measured outside of the corners `(H, W)`: only its model tells the lens there."""
         return self.valid & ~self.covered
+
+    def _facts(self) -> list[str]:
+        def ranged(values: Tensor) -> str:
+            known = values[values.isfinite()]
+            return number(known, ".3g") if known.numel() else "not known"
+
+        rows, columns = self.valid.shape
+        return [
+            f"{rows} x {columns} places",
+            f"{100 * float(self.valid.double().mean()):.0f} % on the plane",
+            f"{100 * float(self.covered.double().mean()):.0f} % covered",
+            f"deviation {ranged(self.deviation)}",
+            f"resolution {ranged(self.resolution)} a pixel",
+        ]
 
     @classmethod
     def over_image(
