@@ -33,6 +33,7 @@ from diffproj._core.numerics import (
     check_tensor,
     dot,
     entries,
+    has_values,
     in_blocks,
     in_float64,
     interleaved,
@@ -40,6 +41,8 @@ from diffproj._core.numerics import (
     rounding,
 )
 from diffproj._core.shown import Shown
+from diffproj._core.warn import warn_caller
+from diffproj.geometry import description
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.geometry.intrinsics import pixel_to_normalized
@@ -105,6 +108,11 @@ class PlaneMap(Shown):
         broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape)
         self.matrix = _plane_matrix(camera, plane).to(camera.dtype)
         self.camera, self.is_per_point = camera, plane.is_per_point
+        if has_values(self.matrix) and camera.t.device.type == "cpu" and _lacks_pose(camera, self.matrix):
+            warn_caller(
+                "camera: want one with a pose, got one whose world is its own frame (R = I, t = 0) and lies in the "
+                "plane, so that no pixel has a point; calibration.cameras[view] and dp.locate(...).cameras have poses"
+            )
 
     @classmethod
     def unchecked(cls, matrix: Any, camera: Any, is_per_point: bool) -> "PlaneMap":
@@ -190,7 +198,8 @@ def back_project(
     Returns:
         World points `(*B, N, 3)` in the dtype of the camera, and `valid (*B, N)`: false where the pixel is not finite,
         the lens has no inverse, the ray is parallel to the plane or within rounding of it, or meets it behind the
-        camera. Points are (0, 0, 0) there, and their gradient is zero.
+        camera. Points are (0, 0, 0) there, and their gradient is zero. A camera without a pose, whose world is its own
+        frame, lies in planes through the origin: a warning says so.
 
     Raises:
         TypeError: tensors of integers or of mixed dtypes.
@@ -266,6 +275,13 @@ def ground_resolution(
     a, b, c = (by_u * by_u).sum(-1), (by_u * by_v).sum(-1), (by_v * by_v).sum(-1)
     spread = torch.hypot((a - c) / 2, b)
     return ((a + c) / 2 + spread).sqrt(), valid
+
+
+def _lacks_pose(camera: Camera, matrix: Tensor) -> bool:
+    """Whether all cameras are where the world's origin is, in the plane, and look along its axes."""
+    if bool(camera.t.any()) or bool(matrix[..., 3, :].any()):  # nearly always
+        return False
+    return description.without_pose(camera.R, camera.t) and camera.t.numel() > 0
 
 
 def _denominator(b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:

@@ -219,8 +219,8 @@ class Measurement(Shown):
             >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
             >>> corners = calibration.views.pixels[0, :2]
             >>> found = dp.measure(corners, calibration, dp.Plane.z(0.0), view=0).to_dict()
-            >>> found["point"], found["reason"], [round(x, 1) for x in found["x"]]
-            ([0, 1], ['VALID', 'VALID'], [-0.0, 25.0])
+            >>> found["point"], found["reason"], [round(x) for x in found["x"]]
+            ([0, 1], ['VALID', 'VALID'], [0, 25])
         """
         sight, batch = self._noise.sight, self.points.shape[:-2]
         reasons = explain(sight.pixels, sight.camera, sight.plane).expand(self.valid.shape)

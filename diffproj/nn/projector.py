@@ -1,5 +1,7 @@
 """`PlaneProjector`: pixels to points on a plane, as a layer."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
@@ -102,6 +104,14 @@ class PlaneProjector(nn.Module):
                 return self.geometry()(pixels)
             camera = self.camera if warp is None else self.camera.warped(warp)
             return PlaneMap(camera, self.plane if plane is None else plane)(pixels)
+
+    if TYPE_CHECKING:  # PyTorch calls `forward`, but types the call as Any
+
+        def __call__(
+            self, pixels: Tensor, warp: Tensor | None = None, plane: Plane | None = None
+        ) -> tuple[Tensor, Tensor]:
+            """See `forward`."""
+            ...
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""

@@ -214,7 +214,8 @@ def test_few_corners_are_located_with_the_noise_of_the_calibration(corners: int)
     # Corners that are far noisier than the calibration's tell their own noise.
     worse = exact[10:] + 20 * SIGMA * torch.randn(1, 54, 2, generator=generator, dtype=D)
     one = dp.calibrate(dp.Views(noisy[0, :10], size=(640, 480)), BOARD, "brown4")
-    own = dp.locate(dp.Views(worse, size=(640, 480)), BOARD, one)
+    with pytest.warns(dp.CameraMismatchWarning, match="times the calibration's"):
+        own = dp.locate(dp.Views(worse, size=(640, 480)), BOARD, one)
     assert own.pixel_sigma == pytest.approx(20 * SIGMA, rel=0.3)
 
 
