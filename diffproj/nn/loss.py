@@ -1,5 +1,7 @@
 """`PlaneLoss`: a loss in world units over the points that are valid."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -64,3 +66,6 @@ class PlaneLoss(nn.Module):
         value = off.square().sum(-1)
         value = value if self.loss is None else self.loss.value(value)
         return (value if weights is None else value * weights.to(value)).mean()
+
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward

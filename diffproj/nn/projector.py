@@ -105,13 +105,8 @@ class PlaneProjector(nn.Module):
             camera = self.camera if warp is None else self.camera.warped(warp)
             return PlaneMap(camera, self.plane if plane is None else plane)(pixels)
 
-    if TYPE_CHECKING:  # PyTorch calls `forward`, but types the call as Any
-
-        def __call__(
-            self, pixels: Tensor, warp: Tensor | None = None, plane: Plane | None = None
-        ) -> tuple[Tensor, Tensor]:
-            """See `forward`."""
-            ...
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""
