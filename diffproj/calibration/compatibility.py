@@ -38,8 +38,6 @@ FEWEST_VIEWS = 3
 """Views of a calibration below which nothing is known of how far views contradict each other."""
 SINGULAR = 1e-9
 """Eigenvalue of S, relative to the largest, below which the view says nothing in this direction."""
-GROWTH, STEPS = 1.25, 62
-"""The scale of the calibration's variances is looked for in steps of this factor, up to a million."""
 
 
 def mismatch(found: Fit, known: Calibration, batch: Sequence[int]) -> Mismatch:
@@ -85,7 +83,7 @@ def _compared(found: Fit, known: Calibration, usual: Noise, batch: tuple[int, ..
         elsewhere = f_deviations(pull, rank.clamp(min=1).to(pull), contradictions) > CHANCE
         elsewhere &= (ratio > NOTABLE) & (f_deviations(total / spare, spare, freedom) > RARE)
         elsewhere &= (rank > 0) & (views >= FEWEST_VIEWS)
-        scale = scale.maximum(_scale(squares, open_, rank * noise))
+        scale = scale.maximum((pull * noise).sqrt())
     beside = beside.clamp(min=0) / spare
     large = (beside > LARGE**2) & (f_deviations(beside, spare, freedom) > RARE)
     doubtful = counted & (large | elsewhere)
@@ -125,12 +123,3 @@ def _pulls(A: Tensor, Z: Tensor, r: Tensor, variance: Tensor, Sigma: Tensor) -> 
     squares = (turn.mT @ (white @ u)).squeeze(-1).square()
     noise = variance.unsqueeze(-1)
     return squares / noise, open_.clamp(min=0) / noise, told.sum(-1)
-
-
-def _scale(squares: Tensor, open_: Tensor, expected: Tensor) -> Tensor:
-    """The factor on the calibration's deviations `(P, V)` by which the pulls become what is expected, 1000 at most."""
-    factor = torch.ones_like(expected)
-    for _ in range(STEPS):
-        over = (squares / (1 + factor.unsqueeze(-1) * open_)).sum(-1) > expected
-        factor = torch.where(over, GROWTH * factor, factor)
-    return factor.sqrt()

@@ -25,8 +25,7 @@ class Mismatch(NamedTuple):
         ratio: the residuals of a view, in times those of the calibration `(*B, V)`: about 1 if all is well. Each is a
             root mean square over degrees of freedom.
         doubtful: whether that is no chance, and none of what the calibration leaves open `(*B, V)`.
-        scale: the factor on the calibration's deviations that it takes to explain a doubtful view `(*B, V)`; 1 for
-            others.
+        scale: the factor on deviations that makes the residuals of a doubtful view usual ones `(*B, V)`; 1 for others.
     """
 
     ratio: Tensor
