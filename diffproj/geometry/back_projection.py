@@ -108,11 +108,6 @@ class PlaneMap(Shown):
         broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape)
         self.matrix = _plane_matrix(camera, plane).to(camera.dtype)
         self.camera, self.is_per_point = camera, plane.is_per_point
-        if has_values(self.matrix) and camera.t.device.type == "cpu" and _lacks_pose(camera, self.matrix):
-            warn_caller(
-                "camera: want one with a pose, got one whose world is its own frame (R = I, t = 0) and lies in the "
-                "plane, so that no pixel has a point; calibration.cameras[view] and dp.locate(...).cameras have poses"
-            )
 
     @classmethod
     def unchecked(cls, matrix: Any, camera: Any, is_per_point: bool) -> "PlaneMap":
@@ -216,7 +211,13 @@ def back_project(
         >>> K.grad[0, 0].item()  # millimetres for one pixel more of focal length
         -0.2
     """
-    return PlaneMap(camera, plane)(pixels)
+    to_plane = PlaneMap(camera, plane)
+    if _lacks_pose(to_plane):
+        warn_caller(
+            "camera: want one with a pose, got one whose world is its own frame (R = I, t = 0) and lies in the plane, so "
+            "that no pixel has a point; calibration.cameras[view] and dp.locate(...).cameras have poses"
+        )
+    return to_plane(pixels)
 
 
 def explain(
@@ -277,11 +278,12 @@ def ground_resolution(
     return ((a + c) / 2 + spread).sqrt(), valid
 
 
-def _lacks_pose(camera: Camera, matrix: Tensor) -> bool:
-    """Whether all cameras are where the world's origin is, in the plane, and look along its axes."""
-    if bool(camera.t.any()) or bool(matrix[..., 3, :].any()):  # nearly always
+def _lacks_pose(to_plane: PlaneMap) -> bool:
+    """Whether all cameras are where the world's origin is, in the plane, and look along its axes; false if not told."""
+    R, t = to_plane.camera.R, to_plane.camera.t
+    if t.device.type != "cpu" or not has_values(t, to_plane.matrix) or bool(t.any()) or t.numel() == 0:
         return False
-    return description.without_pose(camera.R, camera.t) and camera.t.numel() > 0
+    return not bool(to_plane.matrix[..., 3, :].any()) and description.without_pose(R, t)
 
 
 def _denominator(b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
