@@ -26,8 +26,9 @@ from diffproj.calibration.noise import Noise, noise_of
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.result import Calibration
 
-FINEST_PX = 0.02
-"""Noise of a corner's coordinate below which a calibration's is not believed: exact corners come from simulation."""
+FINEST_PX = 0.05
+"""Noise of a corner's coordinate below which a calibration's is not counted on in another photograph: there, what a
+detector does at another distance or blur, or that the corners are simulated, makes more of a difference."""
 LARGE = 1.7
 """Times the calibration's residuals from which on those of a view are doubtful, whatever they look like."""
 NOTABLE = 1.25
@@ -62,26 +63,28 @@ def _compared(found: Fit, known: Calibration, usual: Noise, batch: tuple[int, ..
     used = found.task.used
     rows, pose, residual = _derivatives(found)
     variance, freedom = usual.variance.clamp(min=FINEST_PX**2).unsqueeze(-1), usual.freedom.unsqueeze(-1)
-    total = residual.square().sum((-2, -1)) / variance
+    squares = residual.square().sum((-2, -1))
+    total = squares / variance
     spare = (2 * used.sum(-1) - POSE).to(total)
     counted = (spare > 0) & total.isfinite()
     spare = spare.clamp(min=1)
-    ratio = torch.where(counted, (total / spare).sqrt(), torch.nan)
-    beside, elsewhere, scale = total, torch.zeros_like(counted), ratio
+    ratio = torch.where(counted, (squares / spare / usual.variance.unsqueeze(-1)).sqrt(), torch.nan)
+    notable = total / spare
+    beside, elsewhere, scale = total, torch.zeros_like(counted), notable.sqrt()
     if known.has_covariance:
         covariance = known.covariance_of_kept_poses
         s = rows.shape[2]
         Sigma, phi = of_each(covariance.shared[..., :s, :s], 2), of_each(covariance.dispersion)
         Sigma = zero_where_infinite(Sigma)
-        squares, open_, rank = _pulls(rows, pose, residual, variance, Sigma)
-        beside = total - (squares - squares / (1 + open_)).sum(-1)
-        noise = ((total - squares.sum(-1)) / (spare - rank).clamp(min=1)).clamp(min=1)
-        squares, open_ = (part / phi.unsqueeze(-1) for part in (squares, open_))
-        pull = (squares / (1 + open_)).sum(-1) / (rank.clamp(min=1) * noise)
+        pulls, open_, rank = _pulls(rows, pose, residual, variance, Sigma)
+        beside = total - (pulls - pulls / (1 + open_)).sum(-1)
+        noise = ((total - pulls.sum(-1)) / (spare - rank).clamp(min=1)).clamp(min=1)
+        pulls, open_ = (part / phi.unsqueeze(-1) for part in (pulls, open_))
+        pull = (pulls / (1 + open_)).sum(-1) / (rank.clamp(min=1) * noise)
         views = of_each(known.used.any(-1).sum(-1))
         contradictions = ((views - 1) * (Sigma.diagonal(dim1=-2, dim2=-1) > 0).sum(-1)).clamp(min=1)
         elsewhere = f_deviations(pull, rank.clamp(min=1).to(pull), contradictions) > CHANCE
-        elsewhere &= (ratio > NOTABLE) & (f_deviations(total / spare, spare, freedom) > RARE)
+        elsewhere &= (notable > NOTABLE**2) & (f_deviations(notable, spare, freedom) > RARE)
         elsewhere &= (rank > 0) & (views >= FEWEST_VIEWS)
         scale = scale.maximum((pull * noise).sqrt())
     beside = beside.clamp(min=0) / spare

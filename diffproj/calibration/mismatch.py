@@ -51,7 +51,9 @@ def described(found: Mismatch, names: tuple[str, ...]) -> str:
 
 
 def _times(ratio: float) -> str:
-    return f"{ratio:.1f} times" if ratio < 10 else f"{ratio:.0f} times" if ratio < 1000 else "1000 times and more"
+    if ratio >= 1000:
+        return "1000 times and more"
+    return f"{ratio:.1f} times" if ratio < 10 else f"{ratio:.0f} times"
 
 
 def none_at_all(used: Bool[Tensor, "*batch v n"]) -> Mismatch:

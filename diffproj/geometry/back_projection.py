@@ -214,8 +214,8 @@ def back_project(
     to_plane = PlaneMap(camera, plane)
     if _lacks_pose(to_plane):
         warn_caller(
-            "camera: want one with a pose, got one whose world is its own frame (R = I, t = 0) and lies in the plane, so "
-            "that no pixel has a point; calibration.cameras[view] and dp.locate(...).cameras have poses"
+            "camera: want one with a pose, got one whose world is its own frame (R = I, t = 0) and lies in the plane, "
+            "so that no pixel has a point; calibration.cameras[view] and dp.locate(...).cameras have poses"
         )
     return to_plane(pixels)
 
