@@ -29,8 +29,9 @@ from diffproj.calibration.result import Calibration
 FINEST_PX = 0.05
 """Noise of a corner's coordinate below which a calibration's is not counted on in another photograph: there, what a
 detector does at another distance or blur, or that the corners are simulated, makes more of a difference."""
-LARGE = 1.7
-"""Times the calibration's residuals from which on those of a view are doubtful, whatever they look like."""
+LARGE, VARIED = 1.7, 1.4
+"""Times the calibration's residuals from which on those of a view are doubtful, whatever they look like; and up to
+which the noise of photographs by one camera varies, so that chance alone has to be beyond that."""
 NOTABLE = 1.25
 """The same for residuals that other intrinsics would explain."""
 CHANCE, RARE = 2.33, 3.09
@@ -88,7 +89,7 @@ def _compared(found: Fit, known: Calibration, usual: Noise, batch: tuple[int, ..
         elsewhere &= (rank > 0) & (views >= FEWEST_VIEWS)
         scale = scale.maximum((pull * noise).sqrt())
     beside = beside.clamp(min=0) / spare
-    large = (beside > LARGE**2) & (f_deviations(beside, spare, freedom) > RARE)
+    large = (beside > LARGE**2) & (f_deviations(beside / VARIED**2, spare, freedom) > CHANCE)
     doubtful = counted & (large | elsewhere)
     return Mismatch(ratio, doubtful, torch.where(doubtful, scale, 1.0))
 

