@@ -11,6 +11,7 @@ JSON has neither NaN nor infinity: `null` stands for NaN.
 import json
 import math
 import re
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,6 +21,7 @@ from torch import Tensor
 
 from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.mismatch import Mismatch
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import KINDS, coefficients_of
@@ -96,6 +98,7 @@ def read_calibration(path: Path) -> Calibration | None:
             _covariance=None if covariance is None else partial(_same, covariance),
             _others=None if others is None else partial(_same, others),
             _remarks=partial(_same, tuple(found["remarks"])) if "remarks" in found else None,
+            _mismatch=_known_mismatch(found.get("mismatch")),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: the calibration in this file is damaged ({error})") from error
@@ -141,6 +144,7 @@ def _calibration_fields(item: Calibration) -> dict[str, Any]:
         "covariance": item.covariance_of_kept_poses.to_fields() if item.has_covariance else None,
         "other_poses": _other_fields(item.other_poses) if item.has_alternatives else None,
         "degrees_of_freedom": None if item.degrees_of_freedom is None else item.degrees_of_freedom.tolist(),
+        "mismatch": None if item.mismatch.ratio.isnan().all() else _mismatch_fields(item.mismatch),
         "lens_region": None if item.lens_region is None else item.lens_region.tolist(),
     }
 
@@ -155,6 +159,17 @@ def _other_poses(fields: dict[str, Any] | None) -> OtherPoses | None:
         return None
     R, t, ratio = (_tensor(_with_nan(fields[key]), torch.float64) for key in ("R", "t", "likelihood_ratio"))
     return OtherPoses(R, t, torch.where(ratio.isnan(), torch.inf, ratio))
+
+
+def _mismatch_fields(found: Mismatch) -> dict[str, Any]:
+    return {name: part.tolist() for name, part in found._asdict().items()}
+
+
+def _known_mismatch(fields: dict[str, Any] | None) -> Callable[[], Mismatch] | None:
+    if fields is None:
+        return None
+    ratio, scale = (_tensor(_with_nan(fields[key]), torch.float64) for key in ("ratio", "scale"))
+    return partial(_same, Mismatch(ratio, torch.tensor(fields["doubtful"], dtype=torch.bool), scale))
 
 
 def _later(values: Any) -> Tensor | None:

@@ -1,5 +1,7 @@
 """The verdict on a calibration, in words that a newcomer understands."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -70,6 +72,6 @@ def test_what_is_no_calibration(calibration: dp.Calibration) -> None:
         _ = both.verdict
 
 
-def test_a_file_keeps_it(calibration: dp.Calibration, tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_a_file_keeps_it(calibration: dp.Calibration, tmp_path: Path) -> None:
     dp.save_camera(tmp_path / "camera.json", calibration)
     assert dp.load_calibration(tmp_path / "camera.json").verdict == calibration.verdict

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
@@ -154,3 +155,11 @@ def test_exact_corners_fit() -> None:
     found, warned = located(test, setup.board, dp.calibrate(fit, setup.board))
     assert warned == 0
     assert not found.doubts
+
+
+def test_a_file_keeps_the_doubt(calibration: dp.Calibration, tmp_path: Path) -> None:
+    found, _ = located(RIGHT[2:4], BOARD, calibration)
+    dp.save_camera(tmp_path / "located.json", found)
+    again = dp.load_calibration(tmp_path / "located.json")
+    assert again.doubts == found.doubts
+    assert torch.equal(again.mismatch.scale, found.mismatch.scale)
