@@ -120,7 +120,7 @@ def accuracy(found: AccuracyMap, unit: str = "world units") -> Figure:
     Example:
         >>> import diffproj as dp
         >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-        >>> figure = accuracy(dp.AccuracyMap.over_image(calibration, step=80), unit="mm")
+        >>> figure = accuracy(dp.AccuracyMap.over_image(calibration, view=0, step=80), unit="mm")
         >>> figure.axes[2].get_title()  # the right panel; each is followed by its colour bar
         'standard deviation of a point, mm'
     """

@@ -83,6 +83,8 @@ def inputs(example: dict[str, Any]) -> dict[str, Any]:
         "corners": torch.stack([calibration.views.pixels, right.pixels]),
         "visible": torch.stack([calibration.views.visible, right.visible]),
         "plane": plane,
+        "located": dp.locate(example["views"], example["board"], calibration),
+        "measured": dp.measure(example["pixels"].detach(), calibration, plane, view=0, pixel_sigma=0.5),
         "extent": (0.0, 0.0, 200.0, 125.0),
         "resolution": 2.5,
         "image": image,

@@ -19,6 +19,7 @@ from torch import Tensor
 from diffproj._core.arguments import called, listing, whole_number
 from diffproj._core.copying import Copied
 from diffproj._core.numerics import at_least_float32, converted
+from diffproj._core.shown import Shown
 
 T = TypeVar("T")
 B = TypeVar("B", bound="Batched")
@@ -26,7 +27,7 @@ Rearrange = Callable[[Tensor, int], Tensor]
 """Takes a tensor and how many axes it has behind those of the batch to the same in another arrangement."""
 
 
-class Batched(Copied):
+class Batched(Copied, Shown):
     """Tensors that share batch axes `*B`, parts with the same batch axes, and constants."""
 
     __slots__ = ()

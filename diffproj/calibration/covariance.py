@@ -31,6 +31,7 @@ from torch import Tensor
 from diffproj._core.arguments import instance, position
 from diffproj._core.copying import Copied
 from diffproj._core.numerics import broadcast_batches
+from diffproj._core.shown import Shown, counted, number
 from diffproj.calibration.fields import mask, tensor
 from diffproj.calibration.solver import Equations
 
@@ -38,8 +39,8 @@ SINGULAR = 2e-15
 """Eigenvalue of S, scaled by the diagonal of U, at and below which it is rounding error."""
 
 
-@dataclass(frozen=True, eq=False)
-class Covariance(Copied):
+@dataclass(frozen=True, eq=False, repr=False)
+class Covariance(Copied, Shown):
     """Joint covariance of shared parameters and poses, for batch shape `*B`.
 
     A pose is perturbed by `R <- exp(omega) R`, `t <- t + tau`: its six coordinates are omega in radians (about the
@@ -78,6 +79,18 @@ class Covariance(Copied):
         """The standard deviation of each shared parameter, by name."""
         spread = self.shared.diagonal(dim1=-2, dim2=-1).sqrt()
         return dict(zip(self.names, spread.unbind(-1), strict=True))
+
+    def _facts(self) -> list[str]:
+        return [
+            counted(self.shared.shape[:-2], "camera"),
+            f"{len(self.names)} shared parameters",
+            f"{self.undetermined_views.shape[-1]} poses",
+            f"dispersion {number(self.dispersion)}",
+        ]
+
+    def _columns(self) -> dict[str, list[Any]]:
+        texts = [number(deviation, ".4g") for deviation in self.deviations.values()]
+        return {"parameter": list(self.names), "standard deviation": texts}
 
     def between(self, view: int, other: int) -> Float[Tensor, "*batch 6 6"]:
         """The cross-covariance of the poses of two views; the covariance of the pose where they are the same."""

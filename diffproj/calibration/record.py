@@ -1,5 +1,6 @@
 """`Recorded`: a calibration as a dictionary for a file and back, with all that it says checked on the way in."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
@@ -9,6 +10,7 @@ from torch import Tensor
 from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.fields import codes, mask, present, tensor
+from diffproj.calibration.mismatch import Mismatch
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
 from diffproj.targets.views import Views
@@ -56,6 +58,9 @@ class Recorded:
             "covariance": self.covariance_of_kept_poses.to_fields() if self.has_covariance else None,
             "other_poses": others
             and {"likelihood_ratio": others.ratio.tolist(), "R": others.R.tolist(), "t": others.t.tolist()},
+            "mismatch": None
+            if bool(self.mismatch.ratio.isnan().all())
+            else {name: part.tolist() for name, part in self.mismatch._asdict().items()},
         }
 
     @classmethod
@@ -113,6 +118,7 @@ class Recorded:
             _covariance=None if covariance is None else partial(_same, covariance),
             _others=None if others is None else partial(_same, others),
             _remarks=partial(_same, _texts("remarks", fields["remarks"])) if "remarks" in fields else None,
+            _mismatch=_mismatch(fields.get("mismatch"), (*batch, V)),
         )
         _check_rms(fields, found.rms)
         return found
@@ -149,6 +155,13 @@ def _others(fields: dict[str, Any] | None, batch: tuple[int, ...], views: int) -
     ratio = tensor(fields, "likelihood_ratio", (*batch, views), least=1, gaps=True)
     R, t = tensor(fields, "R", (*batch, views, 3, 3), gaps=True), tensor(fields, "t", (*batch, views, 3), gaps=True)
     return OtherPoses(R, t, torch.where(ratio.isnan(), torch.inf, ratio))
+
+
+def _mismatch(fields: dict[str, Any] | None, shape: tuple[int, ...]) -> Callable[[], Mismatch] | None:
+    if fields is None:
+        return None
+    ratio, scale = (tensor(fields, name, shape, least=0, gaps=True) for name in ("ratio", "scale"))
+    return partial(_same, Mismatch(ratio, mask(fields, "doubtful", shape), scale))
 
 
 def _later(fields: dict[str, Any], name: str, shape: tuple[int, ...]) -> Tensor | None:

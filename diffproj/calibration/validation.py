@@ -6,26 +6,28 @@ resampled with replacement (Efron 1979). Both solve all refits as one batch.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Unpack
+from typing import Any, Unpack
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from diffproj._core.arguments import checked_seed, whole_number
+from diffproj._core.shown import Shown
 from diffproj.calibration.data import Data
 from diffproj.calibration.distinct import alike
 from diffproj.calibration.held_out import errors_of, folds_of, repeated, without_views
 from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.options import CalibrationOptions, calibration_options
 from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.calibration.solver import Status
 from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views, as_views
 
 
-@dataclass(frozen=True, eq=False)
-class CrossValidation:
+@dataclass(frozen=True, eq=False, repr=False)
+class CrossValidation(Shown):
     """Errors of k refits on the views that they were fitted to, and on those held out.
 
     Attributes:
@@ -44,6 +46,20 @@ class CrossValidation:
     in_sample_world: Float[Tensor, " k"]
     held_out_world: Float[Tensor, " k"]
     lost: Int[Tensor, " k"]
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """The folds as columns of Python's own numbers and words: `pandas.DataFrame` takes it."""
+        names = "in_sample_px", "held_out_px", "in_sample_world", "held_out_world", "lost"
+        columns: dict[str, list[Any]] = {"fold": list(range(1, len(self.lost) + 1))}
+        columns["status"] = [Status(code).name for code in self.fits.status.tolist()]
+        return columns | {name: getattr(self, name).tolist() for name in names}
+
+    def _facts(self) -> list[str]:
+        held_out, fitted = (float(part.square().mean().sqrt()) for part in (self.held_out_px, self.in_sample_px))
+        return [f"{len(self.lost)} folds", f"held out RMS {held_out:.4f} px", f"fitted {fitted:.4f} px"]
+
+    def _columns(self) -> dict[str, list[Any]]:
+        return self.to_dict()
 
     def summary(self) -> str:
         """A table of text: each fold, and the root mean square over the folds."""

@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         plane = Plane(torch.tensor(options.plane[:3], dtype=torch.float64, device="cpu"), options.plane[3])
     pixels = torch.tensor([[pixel.u, pixel.v] for pixel in given], dtype=torch.float64, device="cpu")
-    sigma = None if noise.source == DETECTOR else noise.sigma
+    sigma = DETECTOR if noise.source == DETECTOR else noise.sigma
     measured = measure(pixels, scene.calibration, plane, scene.view, sigma)
     found = document(scene, plane, noise, given, measured)
     found["warnings"] = options.warned

@@ -40,7 +40,7 @@ def load_camera(path: PathLike, format: FormatName | None = None, camera: str | 
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     dp.save_camera(f"{folder}/camera.yaml", dp.Camera(torch.eye(3), size=(640, 480)))
         ...     dp.load_camera(f"{folder}/camera.yaml")
-        Camera(batch_shape=(), pinhole, size=(640, 480), torch.float64, cpu)
+        Camera(f 1.0, 1.0 px, c 0.0, 0.0 px, pinhole, 640 x 480 px, no pose, torch.float64)
     """
     document = Document.read(file_path("path", path))
     found = found_in(document, format)

@@ -34,12 +34,16 @@ from diffproj._core.numerics import (
     check_same_kind,
     dot,
     entries,
+    has_values,
     in_blocks,
     in_float64,
     interleaved,
     linear,
     rounding,
 )
+from diffproj._core.shown import Shown
+from diffproj._core.warn import warn_caller
+from diffproj.geometry import description
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.geometry.intrinsics import pixel_to_normalized
@@ -64,7 +68,7 @@ class Reason(enum.IntEnum):
     """The ray meets the plane behind the camera."""
 
 
-class PlaneMap(Copied):
+class PlaneMap(Copied, Shown):
     """The map from pixels to points of a plane, built once for a camera and a plane and then applied at will.
 
     `back_project` builds one for each call; keep one where camera and plane stay as they are. It is a PyTree.
@@ -150,6 +154,10 @@ class PlaneMap(Copied):
         """`Reason` codes `(*B, N)` of pixels `(*B, N, 2)`; see the function `explain`."""
         (reasons,) = in_blocks(self._explain, self._checked(pixels), self.matrix, *self.camera.tensors())
         return reasons.squeeze(-1) if self.is_per_point else reasons
+
+    def _facts(self) -> list[str]:
+        planes = "a plane for each point" if self.is_per_point else ""
+        return [repr(self.camera), planes]
 
     def _to_plane(self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
         _, points, _, valid = self._intersection(pixels, rows)
@@ -242,7 +250,8 @@ def back_project(
     Returns:
         World points `(*B, N, 3)` in the dtype of the camera, and `valid (*B, N)`: false where the pixel is not finite,
         the lens has no inverse, the ray is parallel to the plane or within rounding of it, or meets it behind the
-        camera. Points are (0, 0, 0) there, and their gradient is zero.
+        camera. Points are (0, 0, 0) there, and their gradient is zero. A camera without a pose, whose world is its own
+        frame, lies in planes through the origin: a warning says so.
 
     Raises:
         TypeError: not pixels, a camera and a plane in this order, or tensors of integers or of mixed dtypes.
@@ -259,7 +268,13 @@ def back_project(
         >>> K.grad[0, 0].item()  # millimetres for one pixel more of focal length
         -0.2
     """
-    return PlaneMap(camera, plane)(pixels)
+    to_plane = PlaneMap(camera, plane)
+    if _lacks_pose(to_plane):
+        warn_caller(
+            "camera: want one with a pose, got one whose world is its own frame (R = I, t = 0) and lies in the plane, "
+            "so that no pixel has a point; calibration.cameras[view] and dp.locate(...).cameras have poses"
+        )
+    return to_plane(pixels)
 
 
 def explain(
@@ -326,6 +341,14 @@ def warn_if_rounded(camera: Camera, plane: Plane) -> None:
             length = plane.length
             height = (dot(plane.normal, camera.center) - plane.offset).abs()
             warn_of_rounding(plane.offset.abs() + length * vector_norm(camera.t, dim=-1), height)
+
+
+def _lacks_pose(to_plane: PlaneMap) -> bool:
+    """Whether all cameras are where the world's origin is, in the plane, and look along its axes; false if not told."""
+    R, t = to_plane.camera.R, to_plane.camera.t
+    if t.device.type != "cpu" or not has_values(t, to_plane.matrix) or bool(t.any()) or t.numel() == 0:
+        return False
+    return not bool(to_plane.matrix[..., 3, :].any()) and description.without_pose(R, t)
 
 
 def _largest_singular_value(by_u: Tensor, by_v: Tensor) -> Tensor:

@@ -33,6 +33,7 @@ from diffproj._core.numerics import (
     linear,
     transform,
 )
+from diffproj.geometry import description
 from diffproj.geometry.exchange import Exchange
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounded_pixels
 from diffproj.geometry.grid import checked_size, inside
@@ -136,9 +137,11 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         camera._assign(**({name: getattr(self, name) for name in self.__slots__} | changes))
         return camera
 
-    def __repr__(self) -> str:
-        lens = "pinhole" if self.distortion is None else type(self.distortion).__name__
-        return f"Camera(batch_shape={tuple(self.batch_shape)}, {lens}, size={self.size}, {self.dtype}, {self.device})"
+    def _facts(self) -> list[str]:
+        return description.facts(self.K, self.R, self.t, self.distortion, self.size)
+
+    def _columns(self) -> dict[str, list[Any]]:
+        return description.columns(self.K, self.distortion)
 
     # ------------------------------------------------------------------------------------------------ other cameras
 

@@ -64,7 +64,7 @@ class Exchange:
             >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
             >>> import diffproj as dp
             >>> dp.Camera.from_opencv(K, [-0.2, 0.1, 0, 0, 0], np.zeros(3), [0, 0, 800], size=(640, 480))
-            Camera(batch_shape=(), BrownConrady, size=(640, 480), torch.float64, cpu)
+            Camera(f 500.0, 500.0 px, c 320.0, 240.0 px, BrownConrady, 640 x 480 px, torch.float64)
         """
         fisheye = flag("fisheye", fisheye)
         K, coefficients, R, t = interop.tensors_from_opencv(K, dist, rvec, tvec)

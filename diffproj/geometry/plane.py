@@ -190,10 +190,10 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
             raise IndexError("plane: want a batch of planes to index, got planes per point; index normal and offset")
         return super().__getitem__(index)
 
-    def __repr__(self) -> str:
+    def _facts(self) -> list[str]:
         if self.batch_shape or not has_values(self.normal):
-            return f"Plane(batch_shape={tuple(self.batch_shape)}, per_point={self.is_per_point}, {self.dtype})"
-        return f"Plane(normal={self.normal.tolist()}, offset={self.offset.item():g})"
+            return [f"batch_shape={tuple(self.batch_shape)}", f"per_point={self.is_per_point}", str(self.dtype)]
+        return [f"normal={self.normal.tolist()}", f"offset={self.offset.item():g}"]
 
     # ---------------------------------------------------------------------------------------------------- geometry
 

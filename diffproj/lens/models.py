@@ -163,4 +163,6 @@ def register_lens(kind: type[T], tensors: Sequence[str], constants: Sequence[str
     return register_pytree(kind, children=tensors, constants=constants, build=build)
 
 
-_MEMBERS = (*(name for name in vars(Lens) if not name.startswith("_")), "__getitem__")
+_BROUGHT_ALONG = ("distort", "undistort")
+"""What a lens may leave out, for no camera calls it: see `Lens`."""
+_MEMBERS = (*(name for name in vars(Lens) if not name.startswith("_") and name not in _BROUGHT_ALONG), "__getitem__")

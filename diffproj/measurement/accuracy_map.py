@@ -10,23 +10,26 @@ standard deviation grows there with what a lens of that model may do, and is inf
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj._core.arguments import called, number, numbers, whole_number
+from diffproj._core.arguments import called, numbers, whole_number
+from diffproj._core.shown import Shown, number
 from diffproj.calibration.region import in_region
 from diffproj.calibration.result import Calibration, as_calibration
 from diffproj.geometry.back_projection import ground_resolution
 from diffproj.geometry.grid import pixel_grid
 from diffproj.geometry.plane import Plane, as_plane
+from diffproj.measurement.choices import chosen_view
 from diffproj.measurement.measure import measure
 from diffproj.targets.views import view_number
 
 
-@dataclass(frozen=True, eq=False)
-class AccuracyMap:
+@dataclass(frozen=True, eq=False, repr=False)
+class AccuracyMap(Shown):
     """How well points of a plane are measured, on a grid of rows and columns.
 
     Attributes:
@@ -52,25 +55,39 @@ class AccuracyMap:
         """Where a point is measured outside of the corners `(H, W)`: only its model tells the lens there."""
         return self.valid & ~self.covered
 
+    def _facts(self) -> list[str]:
+        def ranged(values: Tensor) -> str:
+            known = values[values.isfinite()]
+            return number(known, ".3g") if known.numel() else "not known"
+
+        rows, columns = self.valid.shape
+        return [
+            f"{rows} x {columns} places",
+            f"{100 * float(self.valid.double().mean()):.0f} % on the plane",
+            f"{100 * float(self.covered.double().mean()):.0f} % covered",
+            f"deviation {ranged(self.deviation)}",
+            f"resolution {ranged(self.resolution)} a pixel",
+        ]
+
     @classmethod
     def over_image(
         cls,
         calibration: Calibration,
         plane: Plane | None = None,
-        view: int | str = 0,
+        view: int | str | None = None,
         step: float = 8.0,
-        pixel_sigma: float | None = None,
+        pixel_sigma: float | Literal["detector"] = "detector",
     ) -> "AccuracyMap":
         """The map over the whole image.
 
         Args:
             calibration: of one camera, with its covariance.
             plane: in the frame of the board that the view saw; the board's own, z = 0, if left out.
-            view: the number or the name of the view whose pose holds.
+            view: the number or the name of the view whose pose holds; may be left out where there is one only.
             step: about how far apart the places are in px; the first and the last row and column lie on the image's
                 edge.
-            pixel_sigma: standard deviation of each coordinate of a measured pixel; the calibration's residual level if
-                left out.
+            pixel_sigma: standard deviation of each coordinate of a measured pixel in px; that of the calibration's
+                corners, `"detector"`, if left out.
 
         Raises:
             TypeError: it is no calibration, or another argument is of the wrong kind.
@@ -79,7 +96,7 @@ class AccuracyMap:
         Example:
             >>> import diffproj as dp
             >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-            >>> accuracy = dp.AccuracyMap.over_image(calibration, step=40)
+            >>> accuracy = dp.AccuracyMap.over_image(calibration, view=0, step=40)
             >>> accuracy.deviation.shape, bool(accuracy.covered[6, 8])
             (torch.Size([13, 17]), True)
         """
@@ -99,9 +116,9 @@ class AccuracyMap:
         calibration: Calibration,
         extent: Sequence[float],
         plane: Plane | None = None,
-        view: int | str = 0,
+        view: int | str | None = None,
         shape: Sequence[int] = (60, 80),
-        pixel_sigma: float | None = None,
+        pixel_sigma: float | Literal["detector"] = "detector",
     ) -> "AccuracyMap":
         """The map over a rectangle of the board's x and y, on a plane that is a height over them.
 
@@ -109,10 +126,10 @@ class AccuracyMap:
             calibration: of one camera, with its covariance.
             extent: `(x_min, y_min, x_max, y_max)` in world units of the board's frame.
             plane: in that frame, not at right angles to the board; the board's own, z = 0, if left out.
-            view: the number or the name of the view whose pose holds.
+            view: the number or the name of the view whose pose holds; may be left out where there is one only.
             shape: rows, along y, and columns, along x.
-            pixel_sigma: standard deviation of each coordinate of a measured pixel; the calibration's residual level if
-                left out.
+            pixel_sigma: standard deviation of each coordinate of a measured pixel in px; that of the calibration's
+                corners, `"detector"`, if left out.
 
         Raises:
             TypeError: it is no calibration, or another argument is of the wrong kind.
@@ -121,7 +138,7 @@ class AccuracyMap:
         Example:
             >>> import diffproj as dp
             >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-            >>> accuracy = dp.AccuracyMap.over_plane(calibration, (0, 0, 200, 125), shape=(6, 9))
+            >>> accuracy = dp.AccuracyMap.over_plane(calibration, (0, 0, 200, 125), view=0, shape=(6, 9))
             >>> bool(accuracy.valid.all()), bool((accuracy.deviation < 0.2).all())  # millimetres
             (True, True)
         """
@@ -138,7 +155,7 @@ class AccuracyMap:
         xy = _grid(rows, columns, (x_min, y_min, x_max, y_max), calibration.points)
         z = (plane.offset - (plane.normal[:2] * xy).sum(-1)) / plane.normal[2]
         points = torch.cat([xy, z.unsqueeze(-1)], dim=-1)
-        camera = calibration.cameras[view_number(view, calibration.views.names)]
+        camera = calibration.cameras[view_number(chosen_view(calibration, view), calibration.views.names)]
         pixels, seen = camera.project(points.flatten(0, 1))
         if camera.size is not None:
             seen = seen & camera.in_image(pixels)
@@ -180,13 +197,18 @@ def _grid(rows: int, columns: int, extent: tuple[float, float, float, float], li
 
 
 def _mapped(
-    pixels: Tensor, calibration: Calibration, plane: Plane, view: int | str, pixel_sigma: float | None
+    pixels: Tensor,
+    calibration: Calibration,
+    plane: Plane,
+    view: int | str | None,
+    pixel_sigma: float | Literal["detector"],
 ) -> AccuracyMap:
     """The map at pixels `(H, W, 2)`; NaN stands for a place without a pixel."""
     shape = pixels.shape[:2]
     flat = pixels.flatten(0, 1)
     measured = measure(flat, calibration, plane, view, pixel_sigma)
-    resolution, valid = ground_resolution(flat, calibration.cameras[view_number(view, calibration.views.names)], plane)
+    number_ = view_number(chosen_view(calibration, view), calibration.views.names)
+    resolution, valid = ground_resolution(flat, calibration.cameras[number_], plane)
 
     def shown(values: Tensor) -> Tensor:
         return torch.where(valid, values, torch.nan).reshape(shape)

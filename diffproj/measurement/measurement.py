@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,8 +12,10 @@ from torch import Tensor
 
 from diffproj._core import arguments
 from diffproj._core.copying import Copied
+from diffproj._core.shown import Shown, counted, rounded
 from diffproj.calibration.covariance import zero_where_infinite
 from diffproj.calibration.region import in_region
+from diffproj.geometry.back_projection import Reason, explain
 from diffproj.measurement.folded import longest_first, norm_variance
 from diffproj.measurement.intervals import angle_interval, curved_interval, norm_interval
 from diffproj.measurement.propagation import Noise, Propagated, kink_variance
@@ -27,8 +30,8 @@ NONLINEAR = "Nonlinear: close to the horizon or to zero, where the deviation mis
 """What the summary says of points and lengths that it marks so."""
 
 
-@dataclass(frozen=True, eq=False)
-class Measurement(Copied):
+@dataclass(frozen=True, eq=False, repr=False)
+class Measurement(Copied, Shown):
     """Points measured on a plane, with their joint covariance.
 
     Attributes:
@@ -38,6 +41,8 @@ class Measurement(Copied):
             and lens. They do for a calibration with its covariance. For a camera alone, or a calibration from a file
             without a covariance, they hold the pixels' noise only; for a pose that `locate` found with a camera alone,
             the pixels' noise and the pose's uncertainty.
+        doubts: what makes the pose that they were measured from doubtful, in words: that the calibration does not fit
+            the photograph, as if it were another camera's, or that two poses fit it. Empty where nothing does.
     """
 
     points: Float[Tensor, "*batch n 3"]
@@ -45,6 +50,7 @@ class Measurement(Copied):
     includes_intrinsics: bool
     _noise: Noise = field(repr=False)
     _region: Tensor | None = field(default=None, repr=False)
+    doubts: str = ""
 
     @property
     def degrees_of_freedom(self) -> Float[Tensor, "*batch"]:
@@ -138,7 +144,7 @@ class Measurement(Copied):
         Example:
             >>> import diffproj as dp
             >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-            >>> measured = dp.measure(calibration.views.pixels[0, :3], calibration, dp.Plane.z(0.0))
+            >>> measured = dp.measure(calibration.views.pixels[0, :3], calibration, dp.Plane.z(0.0), view=0)
             >>> middle = measured.quantity(lambda p: p.mean(dim=0)[0], [[0, 1, 2]])
             >>> print(f"{middle.value[0]:.1f} mm")  # x of the centroid of three corners in a row
             25.0 mm
@@ -219,10 +225,64 @@ class Measurement(Copied):
             lines.append(EXTRAPOLATED)
         if any(bent):
             lines.append(NONLINEAR)
+        if self.doubts:
+            lines.append(f"Doubtful: {self.doubts}.".replace("?.", "?"))
         if not self.includes_intrinsics:
             known = "pixels and the pose" if self._noise.sigma.shape[-1] else "pixels alone"
             lines.append(f"The deviations hold the noise of the {known}: the camera came without a covariance.")
         return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """The points as columns of Python's own numbers, of many cameras with theirs: `pandas.DataFrame` takes it.
+
+        `reason` is the name of a `Reason`; where a point is not `valid`, its numbers are NaN.
+
+        Example:
+            >>> import diffproj as dp
+            >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+            >>> corners = calibration.views.pixels[0, :2]
+            >>> found = dp.measure(corners, calibration, dp.Plane.z(0.0), view=0).to_dict()
+            >>> found["point"], found["reason"], [round(x) for x in found["x"]]
+            ([0, 1], ['VALID', 'VALID'], [0, 25])
+        """
+        sight, batch = self._noise.sight, self.points.shape[:-2]
+        reasons = explain(sight.pixels, sight.camera, sight.plane).expand(self.valid.shape)
+        places = torch.where(self.valid.unsqueeze(-1), self.points, torch.nan)
+        beyond = self.extrapolated
+        columns: dict[str, Tensor] = {}
+        if batch:
+            cameras = torch.arange(batch.numel()).reshape(*batch, 1)
+            columns["camera"] = cameras.expand(self.valid.shape)
+        columns["point"] = torch.arange(self.valid.shape[-1]).expand(self.valid.shape)
+        columns |= dict(zip("uv", sight.pixels.unbind(-1), strict=True)) | {"valid": self.valid}
+        columns |= dict(zip("xyz", places.unbind(-1), strict=True))
+        columns |= {f"{axis}_deviation": part for axis, part in zip("xyz", self.deviations.unbind(-1), strict=True)}
+        columns |= {"nonlinear": self.nonlinear} | ({} if beyond is None else {"extrapolated": beyond})
+        found: dict[str, list[Any]] = {name: values.detach().flatten().tolist() for name, values in columns.items()}
+        return found | {"reason": [Reason(code).name for code in reasons.flatten().tolist()]}
+
+    def _facts(self) -> list[str]:
+        count = self.valid.shape[-1]
+        lost = int((~self.valid).sum())
+        return [
+            counted(self.valid.shape[:-1], "camera"),
+            f"{count} point{'s' * (count != 1)}",
+            f"{lost} not on the plane" if lost else "",
+            "doubtful" if self.doubts else "",
+        ]
+
+    def _columns(self) -> dict[str, Sequence[Any]]:
+        found = self.to_dict()
+        shown: dict[str, Sequence[Any]] = {name: found[name] for name in ("camera", "point", "u", "v") if name in found}
+        for axis in "xyz":
+            pairs = [rounded(*pair) for pair in zip(found[axis], found[f"{axis}_deviation"], strict=True)]
+            shown[axis], shown[f"\u00b1 {axis}"] = ([pair[side] for pair in pairs] for side in (0, 1))
+        flags = [name for name in ("nonlinear", "extrapolated") if any(found.get(name, []))]
+        flags += [] if all(found["valid"]) else ["reason"]
+        return shown | {name: found[name] for name in flags}
+
+    def _note(self) -> str:
+        return self.doubts
 
     def _norms(
         self,

@@ -13,7 +13,7 @@ All parameters are zero at first, which gives the camera that the module was mad
 buffers, which are saved and moved along.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -122,6 +122,9 @@ class LearnableCamera(GeometryModule):
             coefficients = self.coefficients_0 + learned(self, "distortion")
             lens = self._model.kind.unchecked(coefficients).expand(*self.batch_shape)
         return Camera.unchecked(K, R, t, lens, self.size)
+
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""

@@ -1,6 +1,7 @@
 """`PlaneLoss`: a loss in world units over the points that are valid."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float
@@ -78,6 +79,9 @@ class PlaneLoss(nn.Module):
             weights = _fitting("weights", check_tensor("weights", weights, like=points), points, each)
             value = value * torch.where(counts, weights, 0.0).to(value)
         return value.sum() / max(value.numel(), 1)
+
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward
 
 
 def _fitting(name: str, tensor: Tensor, points: Tensor, shape: Sequence[int]) -> Tensor:

@@ -1,6 +1,6 @@
 """`LearnablePlane`: a plane that a PyTorch optimiser moves."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -64,6 +64,9 @@ class LearnablePlane(GeometryModule):
         normal = tilted * (self.length_0 / torch.linalg.vector_norm(tilted, dim=-1)).unsqueeze(-1)
         distance = self.distance_0 + self.scale * learned(self, "shift").squeeze(-1)
         return Plane.unchecked(normal, self.length_0 * distance)
+
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward
 
 
 def check_one_plane(plane: Plane) -> None:

@@ -1,6 +1,7 @@
 """`CalibrationPrior`: how far a camera may move from its calibration, given the calibration's covariance."""
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -96,6 +97,9 @@ class CalibrationPrior(GeometryModule):
             raise ValueError(f"camera: want device {self.center.device} as the prior has, got {camera.device}")
         off = self._vector(camera) - self.center
         return (off * (self.precision * off.unsqueeze(-2)).sum(-1)).sum(-1) / 2
+
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward
 
     def _vector(self, camera: Camera) -> Tensor:
         """The parameters of a camera `(*B, p)`: intrinsics and lens, with a pose its turn from R_0 and its place."""

@@ -1,5 +1,7 @@
 """`PlaneProjector`: pixels to points on a plane, as a layer."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
@@ -104,6 +106,9 @@ class PlaneProjector(nn.Module):
                 return self.geometry()(pixels)
             camera = self.camera if warp is None else self.camera.warped_by("warp", warp)
             return PlaneMap(camera, self.plane if plane is None else plane)(pixels)
+
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""

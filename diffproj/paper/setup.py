@@ -70,7 +70,7 @@ def paper_setup(distortion: Lens | None = None) -> PaperSetup:
 
     Example:
         >>> paper_setup().test
-        Camera(batch_shape=(5,), pinhole, size=(640, 480), torch.float64, cpu)
+        Camera(5 cameras, f 700.0, 702.0 px, c 322.0, 238.0 px, pinhole, 640 x 480 px, torch.float64)
     """
     if distortion is not None:
         check_lens(distortion)

@@ -11,6 +11,7 @@ from torch import Tensor
 from diffproj._core.arguments import Array, booleans, called, instance, position
 from diffproj._core.batched import Batched, check_index
 from diffproj._core.numerics import broadcast_batches, check_tensor, has_values
+from diffproj._core.shown import counted, in_pixels
 from diffproj.geometry.grid import checked_size
 
 ArrayLike = Tensor | Array
@@ -87,14 +88,18 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
         views.pixels, views.visible, views.names, views.size = pixels, visible, names, size
         return views
 
-    def __repr__(self) -> str:
-        batch = f"{' x '.join(map(str, self.batch_shape))} cameras, " if self.batch_shape else ""
+    def _facts(self) -> list[str]:
         views = f"{len(self)} view{'' if len(self) == 1 else 's'} of {self.pixels.shape[-2]} corners"
         hidden = ""
         if has_values(self.visible) and not self.visible.all():
             hidden = f" ({int((~self.visible).sum())} hidden)"
-        size = f", {self.size[0]} x {self.size[1]} px" if self.size is not None else ""
-        return f"Views({batch}{views}{hidden}{size}, {self.dtype})"
+        return [counted(self.batch_shape, "camera"), views + hidden, in_pixels(self.size), str(self.dtype)]
+
+    def _columns(self) -> dict[str, list[Any]]:
+        seen = self.visible.sum(-1)
+        if self.batch_shape or not has_values(self.visible):
+            return {}
+        return {"view": list(self.names), "corners": seen.tolist()}
 
     # ----------------------------------------------------------------------------------------------- what it is
 

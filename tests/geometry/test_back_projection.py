@@ -377,3 +377,12 @@ def test_bad_input_is_refused_by_name(camera: dp.Camera, pixels: Tensor) -> None
     for kind, message, call in cases:
         with pytest.raises(kind, match=message):
             call()
+
+
+def test_a_camera_without_a_pose_is_warned_of(camera: dp.Camera, pixels: Tensor) -> None:
+    for lost in (camera.without_pose(), dp.Camera.stack([camera.without_pose()] * 2)):
+        with pytest.warns(UserWarning, match=r"camera: want one with a pose.*calibration.cameras\[view\]"):
+            _, valid = dp.back_project(pixels, lost, dp.Plane.z(0.0))
+        assert not valid.any()
+    dp.back_project(pixels, camera.without_pose(), dp.Plane.z(900.0))  # a wall in front of it
+    dp.back_project(pixels, camera, dp.Plane.z(0.0))
