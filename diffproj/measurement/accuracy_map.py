@@ -103,7 +103,7 @@ class AccuracyMap(Shown):
         size = as_calibration(calibration).camera.size
         if calibration.views.batch_shape or size is None:
             raise ValueError("calibration: want one camera of known size; index the views, or give them a size")
-        step = number("step", step, "a positive distance in px", above=0)
+        step = arguments.number("step", step, "a positive distance in px", above=0)
         if (size[0] / step) * (size[1] / step) > MOST_PLACES:
             raise ValueError(f"step: want a positive distance in px that gives at most 10^8 places, got {step:g}")
         columns, rows = (math.ceil((side - 1) / step) + 1 for side in size)
@@ -207,8 +207,8 @@ def _mapped(
     shape = pixels.shape[:2]
     flat = pixels.flatten(0, 1)
     measured = measure(flat, calibration, plane, view, pixel_sigma)
-    number_ = view_number(chosen_view(calibration, view), calibration.views.names)
-    resolution, valid = ground_resolution(flat, calibration.cameras[number_], plane)
+    seen_in = view_number(chosen_view(calibration, view), calibration.views.names)
+    resolution, valid = ground_resolution(flat, calibration.cameras[seen_in], plane)
 
     def shown(values: Tensor) -> Tensor:
         return torch.where(valid, values, torch.nan).reshape(shape)
