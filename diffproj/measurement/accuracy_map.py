@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core import arguments
 from diffproj._core.arguments import called, numbers, whole_number
 from diffproj._core.shown import Shown, number
 from diffproj.calibration.region import in_region
