@@ -13,7 +13,7 @@ experiment = replace(experiment, fit=replace(experiment.fit, unit="mm"))
 calibration = dp.calibrate(views, dp.Chessboard())
 pictures = {
     "fig7.png": figures.png(figures.fig7(experiment), dpi=80),
-    "accuracy.png": figures.png(figures.accuracy(dp.AccuracyMap.over_image(calibration), unit="mm"), dpi=90),
+    "accuracy.png": figures.png(figures.accuracy(dp.AccuracyMap.over_image(calibration, view=0), unit="mm"), dpi=90),
 }
 folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
 for name, content in pictures.items():

@@ -14,7 +14,12 @@ Conventions, which hold everywhere:
 * Shapes: `K (*B, 3, 3)`, pixels `(*B, N, 2)`, points `(*B, N, 3)`; a camera or plane has batch shape `*B`, which
   broadcasts. dtype and device of the input are kept and must agree; half and bfloat16 pixels are lifted. A caller's
   tensor is never written.
-* What fails for one element is reported in `valid`; a mistake of the caller raises `TypeError` or `ValueError`.
+* NumPy arrays and lists of numbers are taken wherever a tensor is, images excepted. They are copied, and take the dtype
+  and device of the camera, lens or tensors that they meet; alone, an array of floats keeps its dtype, and all else
+  becomes float64.
+* What fails for one element is reported in `valid`; a mistake of the caller raises `TypeError` (the wrong kind) or
+  `ValueError` (a value or shape that cannot be; `IndexError` where something is indexed) whose message names the
+  argument, what it wants, and what it got.
 * The world's unit is whatever the board's square is given in. RMS is OpenCV's: `sqrt(sum |e|^2 / number of points)`.
 
 Glossary:
@@ -60,6 +65,7 @@ __all__ = [
     "CalibrationOptions",
     "CalibrationPrior",
     "Camera",
+    "CameraMismatchWarning",
     "Cauchy",
     "Chessboard",
     "Covariance",
@@ -75,6 +81,7 @@ __all__ = [
     "Loss",
     "Measurement",
     "PaperSetup",
+    "PixelNoiseWarning",
     "Plane",
     "PlaneLoss",
     "PlaneMap",
@@ -94,6 +101,7 @@ __all__ = [
     "explain",
     "ground_resolution",
     "image_residuals",
+    "load",
     "load_calibration",
     "load_camera",
     "locate",

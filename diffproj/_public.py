@@ -13,6 +13,7 @@ from diffproj.calibration.losses import Cauchy as Cauchy
 from diffproj.calibration.losses import Huber as Huber
 from diffproj.calibration.losses import Loss as Loss
 from diffproj.calibration.losses import SoftL1 as SoftL1
+from diffproj.calibration.mismatch import CameraMismatchWarning as CameraMismatchWarning
 from diffproj.calibration.options import CalibrationOptions as CalibrationOptions
 from diffproj.calibration.options import LocateOptions as LocateOptions
 from diffproj.calibration.refine import refine as refine
@@ -22,6 +23,7 @@ from diffproj.calibration.solver import Status as Status
 from diffproj.calibration.validation import CrossValidation as CrossValidation
 from diffproj.calibration.validation import bootstrap as bootstrap
 from diffproj.calibration.validation import cross_validate as cross_validate
+from diffproj.files.load import load as load
 from diffproj.files.load import load_calibration as load_calibration
 from diffproj.files.load import load_camera as load_camera
 from diffproj.files.save import save_camera as save_camera
@@ -42,6 +44,7 @@ from diffproj.lens.kannala_brandt import KannalaBrandt as KannalaBrandt
 from diffproj.lens.models import register_lens as register_lens
 from diffproj.lens.protocol import Lens as Lens
 from diffproj.measurement.accuracy_map import AccuracyMap as AccuracyMap
+from diffproj.measurement.choices import PixelNoiseWarning as PixelNoiseWarning
 from diffproj.measurement.measure import measure as measure
 from diffproj.measurement.measurement import Measurement as Measurement
 from diffproj.measurement.quantity import Quantity as Quantity

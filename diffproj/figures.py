@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
+from diffproj._core.arguments import instance, number
 from diffproj.calibration.result import Calibration
 from diffproj.measurement.accuracy_map import AccuracyMap
 from diffproj.paper.experiment import Experiment
@@ -51,6 +52,10 @@ def fig7(experiment: Experiment, magnification: float = 50.0) -> Figure:
         experiment: what to draw.
         magnification: how many times as long as they are the errors are drawn.
 
+    Raises:
+        TypeError: it is no experiment, or the magnification no number.
+        ValueError: the magnification is not positive.
+
     Example:
         >>> import diffproj as dp
         >>> views = dp.example_views("left")
@@ -58,6 +63,8 @@ def fig7(experiment: Experiment, magnification: float = 50.0) -> Figure:
         >>> figure.axes[0].get_title()
         'left09.jpg: mean $E_x$ 0.047, $E_y$ 0.089'
     """
+    instance("experiment", experiment, Experiment, "a dp.Experiment", "dp.run_experiment gives one")
+    magnification = number("magnification", magnification, "a factor above 0", above=0)
     views = experiment.test.views.names
     columns = min(3, len(views))
     lines = -(-len(views) // columns)
@@ -106,13 +113,24 @@ def accuracy(found: AccuracyMap, unit: str = "world units") -> Figure:
         found: the map, from `AccuracyMap.over_image`.
         unit: of the world, for the labels.
 
+    Raises:
+        TypeError: it is no map, or the unit no string.
+        ValueError: no place of the map is in the image.
+
     Example:
         >>> import diffproj as dp
         >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-        >>> figure = accuracy(dp.AccuracyMap.over_image(calibration, step=80), unit="mm")
+        >>> figure = accuracy(dp.AccuracyMap.over_image(calibration, view=0, step=80), unit="mm")
         >>> figure.axes[2].get_title()  # the right panel; each is followed by its colour bar
         'standard deviation of a point, mm'
     """
+    instance("found", found, AccuracyMap, "a dp.AccuracyMap", "dp.AccuracyMap.over_image(calibration) gives one")
+    instance("unit", unit, str, "a string")
+    if min(found.pixels.shape[:2]) < 2 or not bool(found.pixels.isfinite().all()):
+        raise ValueError(
+            f"found: want a map of at least 2 x 2 places that all are in the image, got {_places(found)}; "
+            "AccuracyMap.over_image(calibration) gives one, AccuracyMap.over_plane with an extent that is in view"
+        )
     figure = Figure(figsize=(9.6, 3.9), layout="constrained")
     u, v = (part.numpy() for part in found.pixels.cpu().unbind(-1))
     panels = (
@@ -339,6 +357,11 @@ def _as_image(axes: Axes, size: tuple[int, int]) -> None:
 def _hull(pixels: torch.Tensor) -> np.ndarray:
     """The convex outline `(M, 2)` of pixels `(N, 2)`."""
     return cv2.convexHull(pixels.numpy().astype(np.float32)).reshape(-1, 2)
+
+
+def _places(found: AccuracyMap) -> str:
+    rows, columns = found.pixels.shape[:2]
+    return f"{int(found.pixels.isfinite().all(-1).sum())} of {rows} x {columns} in the image"
 
 
 def _as_seen(experiment: Experiment, points: torch.Tensor) -> torch.Tensor:

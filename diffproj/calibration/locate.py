@@ -6,10 +6,12 @@ from typing import Unpack
 import torch
 from kornia.geometry.camera import PinholeCamera
 
+from diffproj._core.warn import warn_caller
 from diffproj.calibration import closed_form, start
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, fit
+from diffproj.calibration.mismatch import CameraMismatchWarning, described
 from diffproj.calibration.options import LocateOptions, locate_options
 from diffproj.calibration.outcome import outcome
 from diffproj.calibration.result import Calibration
@@ -34,6 +36,8 @@ def locate(
     A plane seen from afar has two poses that explain it almost equally well; both are refined and the better kept. The
     other is in `alternatives`, and the covariance holds the doubt; where it may well be the right one, the view is
     `ambiguous`, and an `AmbiguousPoseWarning` names it.
+    With a calibration in the place of a camera a `CameraMismatchWarning` names the views whose corners are not where it
+    sees them, as photographs of another camera, zoom or focus: see `mismatch`.
     The board is taken to be flat, also where a calibration found a bow.
 
     Args:
@@ -63,7 +67,9 @@ def locate(
     """
     found = located(views, target, camera, **options)
     if bool(found.ambiguous.any()):
-        warnings.warn(f"locate: {found.doubts}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
+        warnings.warn(f"locate: {found.ambiguity}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
+    if text := described(found.mismatch, views.names):
+        warn_caller(f"locate: {text}", CameraMismatchWarning)
     return found
 
 

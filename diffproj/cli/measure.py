@@ -4,7 +4,7 @@ import argparse
 import functools
 
 from diffproj.cli.drawing import drawing
-from diffproj.cli.inputs import DETECTOR, HAND, LARGEST_NUMBER, board_size, camera_file, numbers, some_path
+from diffproj.cli.inputs import DETECTOR, HAND, LARGEST_NUMBER, board_size, numbers, some_path
 from diffproj.cli.units import Length, height, square_side
 
 DESCRIPTION = """\
@@ -67,11 +67,11 @@ def add_options(command: argparse.ArgumentParser) -> None:
     photograph.required = False
     command.add_argument(
         "--camera",
-        type=camera_file,
+        type=some_path,
         required=True,
         metavar="FILE",
-        help="the camera file. A .json from 'diffproj calibrate' brings the camera's own uncertainty along; .yaml, "
-        ".yml or .xml as OpenCV writes them do not (required)",
+        help="the camera file, in any format that 'diffproj info' reads. A .json from 'diffproj calibrate' brings the "
+        "camera's own uncertainty along; other programs' files do not (required)",
     )
     pixels = command.add_mutually_exclusive_group(required=True)
     pixels.add_argument(

@@ -85,6 +85,7 @@ def document(
         "points": points,
         "lengths": lengths,
         "area": area,
+        "doubts": measured.doubts or None,
         "remarks": remarks,
     }
 

@@ -18,6 +18,7 @@ from diffproj.cli.points_file import Pixel, read_points
 from diffproj.cli.scene import Scene, new_photograph, stored_view
 from diffproj.cli.terminal import result
 from diffproj.geometry.plane import Plane
+from diffproj.measurement.choices import detector_noise
 from diffproj.measurement.measure import measure
 from diffproj.targets.images import grey, listed
 
@@ -35,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         plane = Plane(torch.tensor(options.plane[:3], dtype=torch.float64, device="cpu"), options.plane[3])
     pixels = torch.tensor([[pixel.u, pixel.v] for pixel in given], dtype=torch.float64, device="cpu")
-    sigma = None if noise.source == DETECTOR else noise.sigma
+    sigma = DETECTOR if noise.source == DETECTOR else noise.sigma
     measured = measure(pixels, scene.calibration, plane, scene.view, sigma)
     found = document(scene, plane, noise, given, measured)
     found["warnings"] = options.warned
@@ -65,7 +66,7 @@ def _noise(options: argparse.Namespace, scene: Scene) -> PixelNoise:
         return PixelNoise(HAND, "hand")
     if options.pixel_sigma != DETECTOR:
         return PixelNoise(options.pixel_sigma, "option")
-    known = scene.calibration.pixel_sigma
+    known = detector_noise(scene.calibration, scene.view)
     if known is None or not math.isfinite(known):
         raise ValueError(f"--pixel-sigma: want a number of px, for {options.camera} does not tell the detector's noise")
     return PixelNoise(float(known), DETECTOR)

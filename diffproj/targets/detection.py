@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, Shaped, UInt8
 
-from diffproj.targets.chessboard import Chessboard
+from diffproj._core.arguments import function
+from diffproj.targets.chessboard import Chessboard, as_board
 from diffproj.targets.images import Photograph, Source, as_8_bit, grey, listed
 from diffproj.targets.views import Views
 
@@ -20,6 +21,9 @@ SMALLEST_WINDOW = 2
 
 LARGE = 1600
 """Longer side in px above which detection that fails is repeated at half the size."""
+
+SMALLEST = 16
+"""Shorter side in px of an image that is searched: less has no room for four squares, and OpenCV refuses it."""
 
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
@@ -96,8 +100,8 @@ def detect(
         [[70.0, 70.0], [110.0, 70.0]]
     """
     _check_board(board)
-    if progress is not None and not callable(progress):
-        raise TypeError(f"progress: want a function of (done, total), got {type(progress).__name__}")
+    if progress is not None:
+        function("progress", progress, "a function of (done, total)")
     listing = listed(photographs)
     size = _common_size(listing)
     corners = []
@@ -130,6 +134,8 @@ def find_corners(image: Shaped[np.ndarray, "h w"], board: Chessboard) -> Float[n
 
 def _rough_corners(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Float32[np.ndarray, "n 2"] | None:
     """OpenCV's detector; where it fails on a large photograph, again at half the size, and so on."""
+    if min(image.shape) < SMALLEST:
+        return None
     found, corners = cv2.findChessboardCorners(image, board.size)
     if found:
         return corners.reshape(-1, 2)  # OpenCV 4 gives (N, 1, 2), OpenCV 5 (N, 2)
@@ -208,9 +214,8 @@ def _starts_dark(grid: Float[np.ndarray, "rows columns 2"], image: Shaped[np.nda
     return bool(values[same].mean() < values[~same].mean())
 
 
-def _check_board(board: object) -> None:
-    if not isinstance(board, Chessboard):
-        raise TypeError(f"board: want a Chessboard, got {type(board).__name__}")
+def _check_board(board: Chessboard) -> None:
+    as_board(board)
     if min(board.size) < 3:
         got = f"{board.columns} x {board.rows}"
         raise ValueError(f"board: want at least 3 x 3 inner corners for OpenCV's detector, got {got}")
