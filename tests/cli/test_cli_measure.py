@@ -299,7 +299,6 @@ def test_corners_that_no_pose_explains(capsys: pytest.CaptureFixture[str], monke
         (["--view", "1.png", "--points", "1,2", "--plane", "-1,0,5"], "got '-1,0,5'"),
         (["--view", "1.png", "--points", "1,2", "--pixel-sigma", "0"], "want a positive number of pixels"),
         (["--view", "1.png", "--points", "1,2", "--pixel-sigma", "-1"], "want a positive number of pixels"),
-        (["--view", "1.png", "--points", "1,2", "--camera", "camera.txt"], "want a file ending in .json"),
     ],
 )
 def test_options_are_checked_first(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -488,10 +487,10 @@ def test_warnings_are_in_the_document(capsys: pytest.CaptureFixture[str], monkey
 
 
 def test_the_photograph_of_another_camera_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Of a camera whose focal length is 3 % longer, on the screen and in the document, once."""
+    """Of a camera whose focal length is 10 % longer, on the screen and in the document, once."""
     calibration = dp.load_calibration("camera.json")
     K = calibration.camera.K.clone()
-    K[:2, :2] *= 1.03
+    K[:2, :2] *= 1.1
     seen = dp.paper_setup().test[3]
     other = dp.Camera(K, seen.R, seen.t, size=(640, 480))
     image = synthetic.photograph(other, dp.Chessboard(8, 5, 25.0, axes="paper")).numpy()
