@@ -115,7 +115,7 @@ def _simpler(found: Fit, numbers: list[int], groups: list[tuple[str, ...]]) -> d
 def _free_groups(found: Fit) -> list[tuple[str, ...]]:
     """The groups that are free, and of which nothing is known beforehand."""
     names = found.task.names
-    free = torch.ones(len(names), dtype=torch.bool)
+    free = torch.ones(len(names), dtype=torch.bool, device="cpu")
     if found.task.basis is not None:
         free &= (found.task.basis != 0).any(-1).any(0).cpu()
     if (known := found.measured_precision()) is not None:

@@ -44,7 +44,7 @@ from diffproj._core.numerics import (
 from diffproj._core.shown import Shown
 from diffproj._core.warn import warn_caller
 from diffproj.geometry import description
-from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.camera import Camera, as_camera, meeting_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.geometry.intrinsics import pixel_to_normalized
 from diffproj.geometry.plane import Plane, as_plane
@@ -228,7 +228,7 @@ class PlaneMap(Copied, Shown):
         if self.is_per_point:
             pixels = tensor_of("pixels", pixels, self.camera.K)
             pixels = pixels.unsqueeze(-2) if pixels.ndim >= 2 else pixels
-        pixels = self.camera._checked("pixels", pixels, 2)
+        pixels = meeting_camera(self.camera, "pixels", pixels, 2)
         batch = broadcast_batches(map=self.matrix.shape[:-2], pixels=pixels.shape[:-2])
         return pixels.expand(*batch, *pixels.shape[-2:])
 

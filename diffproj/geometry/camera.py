@@ -19,7 +19,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from diffproj._core.arguments import Array, flag, instance, meeting, number, whole_number
+from diffproj._core.arguments import Array, instance, meeting
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
     broadcast_batches,
@@ -34,22 +34,23 @@ from diffproj._core.numerics import (
     transform,
 )
 from diffproj.geometry import description
+from diffproj.geometry.changed_images import ChangedImages
 from diffproj.geometry.exchange import Exchange
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounded_pixels
 from diffproj.geometry.grid import checked_size, inside
-from diffproj.geometry.intrinsics import check_intrinsics, check_warp, pixel_to_normalized, warped
+from diffproj.geometry.intrinsics import check_intrinsics, pixel_to_normalized
 from diffproj.lens.protocol import Lens
 
 ROTATION_TOLERANCE = 1e-5
 """How far `R^T R` may be from the identity, entry by entry, where a user hands a camera in."""
-ROUNDED_ASPECT = 1.1
-"""Factor by which rounding to whole pixels may change the aspect of an image."""
 
 SQUARED = 0.45
 """The power of the largest number up to which a pixel counts as finite: its square, and what is left of it, are."""
 
 
-class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distortion",), constants=("size",)):
+class Camera(
+    ChangedImages, Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distortion",), constants=("size",)
+):
     """A calibrated camera, or a batch of them with batch shape `*B`; the parts broadcast to it.
 
     The camera is immutable in spirit: methods return new cameras that share tensors, and gradients flow to whatever
@@ -171,107 +172,6 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         identity = torch.eye(3, dtype=self.dtype, device=self.device)
         return self._with(R=identity, t=torch.zeros_like(identity[0]))
 
-    def resized(self, size: tuple[int, int], stretched: bool = False) -> "Camera":
-        """The camera of the same image resized to `size = (width, height)`: `c -> s c + (s - 1) / 2`.
-
-        Each axis has its own scale, so that sides rounded to whole pixels stay exact.
-
-        Args:
-            size: `(width, height)` of the resized image, its aspect that of the camera's to within a pixel, and a
-                tenth.
-            stretched: whether the whole image was stretched to another aspect, as networks of a fixed input size do.
-
-        Raises:
-            TypeError: the size is not two whole numbers.
-            ValueError: the camera does not know its own size, or another aspect. A camera's video mode of another
-                aspect shows a part of the sensor: crop first.
-
-        Example:
-            >>> camera = Camera(torch.tensor([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]]), size=(640, 480))
-            >>> wide = camera.cropped(0, 60, 640, 360).resized((1280, 720))  # 16 : 9, cut from 4 : 3
-            >>> wide.K.tolist()
-            [[1000.0, 0.0, 639.5], [0.0, 1000.0, 359.5], [0.0, 0.0, 1.0]]
-        """
-        stretched = flag("stretched", stretched)
-        if self.size is None:
-            raise ValueError(
-                "resized: want a camera with a size, got size=None; give Camera(..., size=(width, height))"
-            )
-        if size is None:
-            raise TypeError("size: want (width, height) of the resized image, got None")
-        width, height = checked_size(size) or self.size
-        scale = (width / self.size[0], height / self.size[1])
-        # Rounding moves each side by a pixel at most: is there one scale that both may have been rounded from?
-        # Of a few pixels it would leave no aspect at all: there is a limit to what it may change.
-        rounded = abs(scale[0] - scale[1]) <= 1 / self.size[0] + 1 / self.size[1]
-        if not (rounded and max(scale) <= ROUNDED_ASPECT * min(scale)) and not stretched:
-            raise ValueError(
-                f"resized: want the aspect of {self.size[0]} x {self.size[1]} px, got {width} x {height}; where the "
-                "image shows a part of the camera's, use cropped(left, top, width, height) first; where all of it was "
-                "stretched, resized(size, stretched=True)"
-            )
-        factors = self.K.new_tensor([[scale[0]], [scale[1]], [1.0]])
-        shift = self.K.new_tensor([[0, 0, (scale[0] - 1) / 2], [0, 0, (scale[1] - 1) / 2], [0, 0, 0]])
-        return self._with(K=self.K * factors + shift, size=(width, height))
-
-    def cropped(self, left: float, top: float, width: int, height: int) -> "Camera":
-        """The camera of the crop whose first pixel was pixel `(left, top)`: the principal point moves along.
-
-        Raises:
-            TypeError: `left` or `top` is no number, or width and height are not whole.
-            ValueError: `left` or `top` is not finite, or width or height is not positive.
-        """
-        left, top = (number(name, side, "a finite number of px") for name, side in (("left", left), ("top", top)))
-        width, height = (whole_number(name, side, least=1) for name, side in (("width", width), ("height", height)))
-        shift = self.K.new_tensor([[0, 0, left], [0, 0, top], [0, 0, 0]])
-        return self._with(K=self.K - shift, size=checked_size((width, height)))
-
-    def warped(self, matrix: Float[Tensor, "*#batch 3 3"] | Array, size: tuple[int, int] | None = None) -> "Camera":
-        """The camera of the same image warped, as a geometric augmentation does: pixels `p` go to `matrix p`.
-
-        An affine matrix changes K alone: turned, mirrored, sheared, scaled and shifted images stay exact, behind a lens
-        too. A projective one also turns a pinhole, so that the middle of the image (the principal point, where the
-        camera has no size) stays in front of it. Gradients flow to the matrix.
-
-        Args:
-            matrix: `(*B, 3, 3)`, from pixels `(u, v, 1)` of this image to those of the warped one, up to a factor;
-                what Kornia's augmentations keep as `transform_matrix`.
-            size: `(width, height)` of the warped image; that of this one if left out.
-
-        Raises:
-            TypeError: no floating-point tensor, or another dtype than the camera's.
-            ValueError: wrong shape or device, no inverse, or a projective matrix for a camera with a lens, for which
-                no lens model describes the warped image. Values are checked where they can be read, not while
-                compiling or under `vmap`.
-
-        Example:
-            >>> from kornia.augmentation import RandomHorizontalFlip
-            >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
-            >>> camera = Camera(K, t=torch.tensor([0.0, 0, 1000]), size=(640, 480))
-            >>> flip = RandomHorizontalFlip(p=1.0)
-            >>> image = flip(torch.rand(1, 3, 480, 640))
-            >>> pixels, _ = camera.warped(flip.transform_matrix).project(torch.tensor([[100.0, 0, 0]]))
-            >>> pixels.tolist()  # 639 - 370
-            [[[269.0, 240.0]]]
-        """
-        return self.warped_by("matrix", matrix, size)
-
-    def warped_by(
-        self, name: str, matrix: Float[Tensor, "*#batch 3 3"] | Array, size: tuple[int, int] | None = None
-    ) -> "Camera":
-        """The same, for an argument of that name."""
-        matrix = check_tensor(name, matrix, 3, 3, like=self.K)
-        check_same_kind(**{"camera": self.K, name: matrix})
-        broadcast_batches(**{"camera": self.batch_shape, name: matrix.shape[:-2]})
-        if has_values(matrix):
-            check_warp(name, matrix, self.K, behind_lens=self.distortion is not None)
-        ahead = self.K[..., :2, 2]
-        if self.size is not None:
-            ahead = self.K.new_tensor([(side - 1) / 2 for side in self.size])
-        K, turn = warped(self.K, matrix, ahead)
-        R, t = (turn.unsqueeze(-1) * self.R.unsqueeze(-3)).sum(-2), dot(turn, self.t.unsqueeze(-2))
-        return self._with(K=K, R=R, t=t, size=checked_size(size) or self.size)
-
     # ------------------------------------------------------------------------------------------- points and pixels
 
     def in_image(self, pixels: Float[Tensor, "*shape 2"] | Array) -> Bool[Tensor, "*shape"]:
@@ -309,7 +209,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             TypeError: no floating-point tensor, or another dtype than the camera's.
             ValueError: wrong shape or device, or batch shapes that do not broadcast.
         """
-        points = self._checked("points", points, 3)
+        points = meeting_camera(self, "points", points, 3)
         if looks_at_rounding(self.t):
             warn_of_rounded_pixels(self.K, self.R, self.t, points)
         return self._project(points)
@@ -350,7 +250,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             TypeError: no floating-point tensor, or another dtype than the camera's.
             ValueError: wrong shape or device, or batch shapes that do not broadcast.
         """
-        pixels = self._checked("pixels", pixels, 2)
+        pixels = meeting_camera(self, "pixels", pixels, 2)
         finite = (pixels.abs() < torch.finfo(pixels.dtype).max ** SQUARED).all(dim=-1)
         offset = torch.where(finite.unsqueeze(-1), pixels - self.K[..., None, :2, 2], 0.0)
         xy = transform(pixel_to_normalized(self.K), offset)
@@ -380,15 +280,6 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         direction = direction / direction.norm(dim=-1, keepdim=True)
         return self.center.unsqueeze(-2).expand_as(direction), direction, valid
 
-    def _checked(self, name: str, value: object, length: int) -> Tensor:
-        """Check points or pixels against the camera, lift half precision, expand to the common batch shape."""
-        tensor = check_tensor(name, value, "N", length, like=self.K)
-        if tensor is not value:  # lifted: any precision of the camera holds a half exactly
-            tensor = tensor.to(self.dtype)
-        check_same_kind(**{"camera": self.K, name: tensor})
-        batch = broadcast_batches(**{"camera": self.batch_shape, name: tensor.shape[:-2]})
-        return tensor.expand(*batch, *tensor.shape[-2:])
-
     def tensors(self) -> list[Tensor]:
         """All tensors of the camera, the lens's included."""
         lens = [leaf for leaf in tree_leaves(self.distortion) if isinstance(leaf, Tensor)]
@@ -409,6 +300,16 @@ def as_camera(camera: Camera | PinholeCamera, name: str = "camera") -> Camera:
     elif not isinstance(camera, type) and isinstance(getattr(camera, "cameras", None), Camera):
         remedy = "give its .camera, or its .cameras for the poses"
     return Camera.from_kornia(instance(name, camera, PinholeCamera, "dp.Camera or kornia's PinholeCamera", remedy))
+
+
+def meeting_camera(camera: Camera, name: str, value: object, length: int) -> Tensor:
+    """Check points or pixels against a camera, lift half precision, expand to the common batch shape."""
+    tensor = check_tensor(name, value, "N", length, like=camera.K)
+    if tensor is not value:  # lifted: any precision of the camera holds a half exactly
+        tensor = tensor.to(camera.dtype)
+    check_same_kind(**{"camera": camera.K, name: tensor})
+    batch = broadcast_batches(**{"camera": camera.batch_shape, name: tensor.shape[:-2]})
+    return tensor.expand(*batch, *tensor.shape[-2:])
 
 
 def check_lens(distortion: object) -> None:

@@ -24,7 +24,7 @@ from torch.nn.functional import grid_sample
 from diffproj._core.arguments import called, number, numbers
 from diffproj._core.numerics import BLOCK_POINTS, broadcast_batches, check_same_kind, check_tensor
 from diffproj.geometry.back_projection import back_project, warn_if_rounded
-from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.camera import Camera, as_camera, meeting_camera
 from diffproj.geometry.grid import checked_size, inside, pixel_grid
 from diffproj.geometry.plane import Plane, as_plane
 
@@ -115,7 +115,7 @@ def rectify(
         points = (
             origin.unsqueeze(-2) + s.unsqueeze(-1) * along_s.unsqueeze(-2) + t.unsqueeze(-1) * along_t.unsqueeze(-2)
         )
-        return camera._project(camera._checked("points", points, 3))
+        return camera._project(meeting_camera(camera, "points", points, 3))
 
     return _resampled(image, look_up, (rows, columns), (W, H), camera.K)
 

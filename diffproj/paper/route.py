@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffproj._core.arguments import Array, number
 from diffproj._core.numerics import broadcast_batches, check_same_kind, transform
-from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.camera import Camera, as_camera, meeting_camera
 from diffproj.geometry.plane import Plane, as_plane
 
 
@@ -50,7 +50,7 @@ def paper_route(
         raise ValueError("camera: want a pinhole, for the paper neglects the lens; undistort the pixels first")
     plane = as_plane(plane).like(camera.K)
     check_same_kind(camera=camera.K, plane=plane.normal)
-    pixels = camera._checked("pixels", pixels, 2)
+    pixels = meeting_camera(camera, "pixels", pixels, 2)
     broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape, pixels=pixels.shape[:-2])
     focal_length = number("focal_length", focal_length, "a length in world units, above 0", above=0)
     n, d = plane.normal.unsqueeze(-2), plane.offset.unsqueeze(-1)
