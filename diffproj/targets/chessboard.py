@@ -69,6 +69,20 @@ class Chessboard:
         return self.columns, self.rows
 
     @property
+    def turns(self) -> int:
+        """The number of turns in its plane after which the board looks the same: 1, 2 or 4.
+
+        1 where columns + rows is odd: only such a board shows which corner is the first.
+
+        Example:
+            >>> Chessboard(9, 6).turns, Chessboard(8, 6).turns, Chessboard(7, 7).turns, Chessboard(6, 6).turns
+            (1, 2, 2, 4)
+        """
+        if (self.columns + self.rows) % 2:
+            return 1
+        return 4 if self.columns == self.rows and self.columns % 2 == 0 else 2
+
+    @property
     def points(self) -> Float[Tensor, "n 3"]:
         """The inner corners in the world, row by row, in the unit of `square`: a new float64 tensor on each access."""
         row, column = torch.meshgrid(

@@ -4,7 +4,7 @@ import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,6 +16,12 @@ Source = str | os.PathLike[str] | np.ndarray | Tensor
 
 SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".jp2", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
 """Suffixes of the files in a folder that count as photographs."""
+
+VIDEO_SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4"})
+"""Suffixes of files that count as videos."""
+
+Orientation = Literal["sensor", "upright"]
+"""How a photograph's pixels are counted: as the sensor recorded them, or turned as its EXIF data ask."""
 
 LAYOUTS = "an array (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA, or a tensor (1 | 3 | 4, H, W) RGB"
 
@@ -71,9 +77,9 @@ def _entries(photographs: Any) -> list[Any]:
     if isinstance(photographs, str | os.PathLike):
         path = Path(photographs)
         if path.is_dir():
-            return sorted((file for file in path.iterdir() if file.suffix.lower() in SUFFIXES), key=_natural)
+            return sorted(filter(_is_photograph, path.iterdir()), key=_natural)
         if not path.exists() and re.search(r"[*?\[]", path.name):
-            return sorted(path.parent.glob(path.name), key=_natural)
+            return sorted((file for file in path.parent.glob(path.name) if not file.name.startswith("._")), key=_natural)
         return [path]
     if isinstance(photographs, Iterable):
         return list(photographs)
@@ -86,11 +92,21 @@ def _natural(path: Path) -> list[Any]:
     return [int(part) if place % 2 else part for place, part in enumerate(parts)]
 
 
-def grey(photograph: Photograph) -> Shaped[np.ndarray, "h w"]:
+def skipped_in(folder: Path) -> list[str]:
+    """The names of the files in a folder that are no photographs: hidden, or of another kind."""
+    return sorted(file.name for file in folder.iterdir() if file.is_file() and not _is_photograph(file))
+
+
+def _is_photograph(file: Path) -> bool:
+    """Whether a file in a folder counts as a photograph: macOS adds `._left1.jpg` to `left1.jpg`, which is none."""
+    return file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
+
+
+def grey(photograph: Photograph, orientation: Orientation = "sensor") -> Shaped[np.ndarray, "h w"]:
     """Convert a photograph to grey, `(H, W)`, from 0 to 255: uint8 for 8-bit input, float32 otherwise.
 
-    Files are read as `cv2.imread` reads them, which applies the EXIF orientation. The contrast of 16-bit images is
-    stretched from their 0.1st to their 99.9th percentile, since cameras of 10, 12 or 14 bits use a part of the range.
+    Files are read as the sensor recorded them, or upright. The contrast of 16-bit images is stretched from their 0.1st
+    to their 99.9th percentile, since cameras of 10, 12 or 14 bits use a part of the range.
 
     Raises:
         ValueError: the file is no image, the shape is none of the layouts, or floats are not in 0..1.
@@ -99,7 +115,7 @@ def grey(photograph: Photograph) -> Shaped[np.ndarray, "h w"]:
     """
     label, source = photograph.label, photograph.source
     if isinstance(source, Path):
-        return _scaled(label, _read(source))
+        return _scaled(label, _read(source, orientation))
     image = _channels_last(label, source) if isinstance(source, Tensor) else source
     if image.size == 0 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (1,), (3,), (4,)):
         raise ValueError(f"{label}: want {LAYOUTS}, got shape {tuple(source.shape)}")
@@ -114,10 +130,13 @@ def as_8_bit(image: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     return image if image.dtype == np.uint8 else np.rint(image).astype(np.uint8)
 
 
-def _read(path: Path) -> np.ndarray:
+def _read(path: Path, orientation: Orientation) -> np.ndarray:
     # cv2.imread does not distinguish a missing file from a broken one, and fails on some file names.
     data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if data.size else None
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+    if orientation == "sensor":
+        flags |= cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(data, flags) if data.size else None
     if image is None:
         raise ValueError(f"{path}: want an image, got {data.size} bytes that OpenCV cannot read as one")
     return image

@@ -12,6 +12,7 @@ import torch
 from diffproj.targets import detection
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.detection import BoardNotFoundError, BoardNotFoundWarning, detect
+from diffproj.targets.search import Pattern
 
 BOARD = Chessboard(columns=9, rows=6)
 SIZE = (400, 300)
@@ -93,68 +94,6 @@ def test_corners_are_where_they_are(pose):
     assert error.max() < 0.2
 
 
-def test_the_window_follows_the_spacing():
-    """Within one strongly tilted view, each corner gets 0.30 of the distance to its own nearest neighbour."""
-    image, corners = photograph(quadrilateral=((150, 60), (250, 60), (380, 270), (20, 270)))
-    distance = detection.nearest_distance(corners)
-    assert distance[0] == pytest.approx(np.linalg.norm(corners[1] - corners[0]))
-    half_sides = []
-    original = cv2.cornerSubPix
-
-    def spy(image, start, window, *rest):
-        half_sides.append((window[0], len(start)))
-        return original(image, start, window, *rest)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cv2, "cornerSubPix", spy)
-        refined = detection.refine_corners(image, corners.astype(np.float32))
-    expected = np.floor(0.30 * distance).astype(int)
-    assert sorted(half_sides) == sorted(zip(*np.unique(expected, return_counts=True), strict=True))
-    assert len(half_sides) > 3
-    assert np.linalg.norm(refined - corners, axis=1).max() < 0.2
-
-
-def test_a_tiny_window_is_never_used():
-    corners = np.array([[10.0, 10], [14, 10], [10, 14], [14, 14]], dtype=np.float32)
-    with pytest.MonkeyPatch.context() as patch:
-        windows = []
-        patch.setattr(cv2, "cornerSubPix", lambda image, start, window, *rest: windows.append(window) or start)
-        detection.refine_corners(np.zeros((30, 30), dtype=np.uint8), corners)
-    assert windows == [(2, 2)]
-
-
-def test_large_photographs_are_searched_at_half_their_size(monkeypatch):
-    """Where the detector fails on a large photograph, a smaller copy gives the start, the full size the corners."""
-    image, corners = photograph(size=(401, 301))
-    original, widths = cv2.findChessboardCorners, []
-
-    def only_small(image, size):
-        widths.append(image.shape[1])
-        return original(image, size) if image.shape[1] < 300 else (False, None)
-
-    monkeypatch.setattr(cv2, "findChessboardCorners", only_small)
-    monkeypatch.setattr(detection, "LARGE", 350)
-    assert farthest(detect(image, BOARD), corners) < 0.2
-    assert widths == [401, 200]
-    monkeypatch.setattr(detection, "LARGE", 500)
-    with pytest.raises(BoardNotFoundError):
-        detect(image, BOARD)
-    monkeypatch.setattr(detection, "LARGE", 50)
-    with pytest.raises(BoardNotFoundError):
-        detect(np.zeros_like(image), BOARD)
-    assert widths[3:] == [401, 200, 100, 50]
-
-
-def test_corners_of_a_smaller_copy_are_carried_back_exactly(monkeypatch):
-    """Edges map to edges: with pixel centres at whole numbers, `c -> s c + (s - 1) / 2` along each side."""
-    _, small = photograph(size=(200, 150), quadrilateral=((35, 30), (165, 25), (170, 120), (30, 125)))
-    small = small.astype(np.float32)
-    monkeypatch.setattr(cv2, "findChessboardCorners", lambda image, size: (image.shape == (150, 200), small))
-    monkeypatch.setattr(detection, "LARGE", 350)
-    rough = detection._rough_corners(np.zeros((301, 401), dtype=np.uint8), BOARD)
-    assert np.abs(rough - ((small + 0.5) * (401 / 200, 301 / 150) - 0.5)).max() < 1e-4
-
-
 # ------------------------------------------------------------------------------------------------------- in order
 
 
@@ -202,23 +141,22 @@ REORDERED = {
 }
 
 
-@pytest.mark.parametrize("shape", [(-1, 2), (-1, 1, 2)], ids=["OpenCV 5", "OpenCV 4"])
 @pytest.mark.parametrize("order", REORDERED)
-def test_whatever_the_detector_returns(monkeypatch, order, shape):
+def test_whatever_the_search_returns(monkeypatch, order):
     image, corners = photograph()
-    reordered = REORDERED[order](corners.reshape(6, 9, 2)).reshape(shape).astype(np.float32)
-    monkeypatch.setattr(cv2, "findChessboardCorners", lambda image, size: (True, reordered))
+    reordered = REORDERED[order](corners.reshape(6, 9, 2))
+    monkeypatch.setattr(detection, "find_pattern", lambda image, board: Pattern(reordered))
     assert farthest(detect(image, BOARD), corners) < 0.2
 
 
 @pytest.mark.parametrize("order", REORDERED)
 @pytest.mark.parametrize("transposed", [False, True])
-def test_whatever_the_detector_returns_on_a_square_board(monkeypatch, order, transposed):
+def test_whatever_the_search_returns_on_a_square_board(monkeypatch, order, transposed):
     board = Chessboard(4, 4)
     image, corners = photograph(board)
     grid = REORDERED[order](corners.reshape(4, 4, 2))
-    reordered = (grid.swapaxes(0, 1) if transposed else grid).reshape(-1, 2).astype(np.float32)
-    monkeypatch.setattr(cv2, "findChessboardCorners", lambda image, size: (True, reordered))
+    reordered = np.ascontiguousarray(grid.swapaxes(0, 1) if transposed else grid)
+    monkeypatch.setattr(detection, "find_pattern", lambda image, board: Pattern(reordered))
     assert farthest(detect(image, board), corners) < 0.2
 
 
@@ -457,7 +395,7 @@ def test_an_empty_folder_and_an_empty_pattern(tmp_path):
 
 def test_bad_files_are_named_before_the_search(tmp_path, monkeypatch):
     """A missing or a broken file stops the run before the first photograph is searched."""
-    monkeypatch.setattr(cv2, "findChessboardCorners", lambda *_: pytest.fail("searched before all files were checked"))
+    monkeypatch.setattr(detection, "find_pattern", lambda *_: pytest.fail("searched before all files were checked"))
     image, _ = photograph()
     good, broken, empty = tmp_path / "good.png", tmp_path / "broken.png", tmp_path / "empty.png"
     assert cv2.imwrite(str(good), image)
