@@ -6,6 +6,7 @@ from typing import Unpack
 import torch
 from kornia.geometry.camera import PinholeCamera
 
+from diffproj._core.warn import warn_caller
 from diffproj.calibration import closed_form, start
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.data import Data
@@ -16,6 +17,7 @@ from diffproj.calibration.result import Calibration
 from diffproj.calibration.solver import Solution, Status, select
 from diffproj.calibration.task import Task
 from diffproj.geometry.camera import Camera, as_camera
+from diffproj.targets.chessboard import Chessboard, origin_doubt
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
@@ -34,7 +36,8 @@ def locate(
     A plane seen from afar has two poses that explain it almost equally well; both are refined and the better kept. The
     other is in `alternatives`, and the covariance holds the doubt; where it may well be the right one, the view is
     `ambiguous`, and an `AmbiguousPoseWarning` names it.
-    The board is taken to be flat, also where a calibration found a bow.
+    A chessboard that looks the same when turned (`Chessboard.turns`) leaves open which corner is the origin: a warning
+    says so. The board is taken to be flat, also where a calibration found a bow.
 
     Args:
         views: corners `(*B, V, N, 2)`.
@@ -62,6 +65,8 @@ def locate(
         0.18
     """
     found = located(views, target, camera, **options)
+    if isinstance(target, Chessboard) and target.turns > 1:
+        warn_caller(f"locate: {origin_doubt(target)}")
     if bool(found.ambiguous.any()):
         warnings.warn(f"locate: {found.doubts}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
     return found

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.result import Calibration
-from diffproj.cli.inputs import board_size, camera_file, find_corners, photographs, square_side
+from diffproj.cli.inputs import add_orientation, board_size, camera_file, find_corners, photographs, square_side
 from diffproj.cli.terminal import RESULTS, aligned, in_options, progress_bars, result, rounded
 from diffproj.files.save import save_camera
 from diffproj.lens.models import LensModel
@@ -85,6 +85,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         action="store_true",
         help="leave out corners that lie more than 5 standard deviations off, and name them",
     )
+    add_orientation(lens)
     file = command.add_argument_group("the file")
     file.add_argument(
         "-o",
@@ -104,7 +105,7 @@ def run(options: argparse.Namespace) -> int:
     columns, rows = options.board
     board = Chessboard(columns, rows, options.square)
     with progress_bars() as bars:
-        views = find_corners(photographs(options.photographs), board, bars)
+        views = find_corners(photographs(options.photographs), board, bars, orientation=options.orientation)
         task = bars.add_task("Solving", total=None)
         calibration = calibrate(
             views,

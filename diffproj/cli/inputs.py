@@ -2,15 +2,17 @@
 
 import argparse
 import math
+import os
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from rich.progress import Progress
 
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.detection import detect
-from diffproj.targets.images import SUFFIXES, Source, listed
+from diffproj.targets.images import SUFFIXES, Orientation, Source, listed
 from diffproj.targets.views import Views
 
 CAMERA_SUFFIXES = (".json", ".yaml", ".yml", ".xml")
@@ -76,7 +78,27 @@ def photographs(paths: Iterable[Path]) -> list[Source]:
     return list(found.values())
 
 
-def find_corners(sources: list[Any], board: Chessboard, bars: Progress, title: str = "Finding corners") -> Views:
-    """The board's corners in photographs, under a progress bar."""
+def find_corners(
+    sources: list[Any], board: Chessboard, bars: Progress, title: str = "Finding corners", orientation: str = "sensor"
+) -> Views:
+    """The board's corners in photographs, on all cores, under a progress bar."""
     task = bars.add_task(title, total=None)
-    return detect(sources, board, lambda done, total: bars.update(task, completed=done, total=total))
+    with ThreadPoolExecutor(min(len(sources), os.cpu_count() or 1)) as cores:
+        return detect(
+            sources,
+            board,
+            lambda done, total: bars.update(task, completed=done, total=total),
+            orientation=orientation,
+            executor=cores,
+        )
+
+
+def add_orientation(group: argparse._ArgumentGroup | argparse.ArgumentParser) -> None:
+    """Give a command the option that says how the pixels of photographs are counted."""
+    group.add_argument(
+        "--orientation",
+        choices=get_args(Orientation),
+        default="sensor",
+        help="how pixels are counted: as the sensor recorded them, or with the photograph turned upright as its EXIF "
+        "data ask, which is what most programs show (default: sensor)",
+    )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from diffproj.cli.inputs import board_size, camera_file, numbers, square_side
+from diffproj.cli.inputs import add_orientation, board_size, camera_file, numbers, square_side
 from diffproj.cli.measure_document import document
 from diffproj.cli.measure_tables import say
 from diffproj.cli.scene import new_photograph, stored_view
@@ -115,6 +115,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         help="standard deviation of u and of v of each point, in px. The default is that of the board's corners, which "
         "a program found to a fraction of a pixel: for points picked by hand, give 0.5 to 1",
     )
+    add_orientation(more)
     more.add_argument("--json", action="store_true", help="print one JSON document, with null for what is not known")
     command.set_defaults(run=functools.partial(run, command))
 

@@ -4,13 +4,14 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
+from diffproj._core.warn import warn_caller
 from diffproj.calibration.locate import located
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.inputs import find_corners, photographs
 from diffproj.cli.terminal import progress_bars
 from diffproj.files.load import load
 from diffproj.geometry.camera import Camera
-from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.chessboard import Chessboard, origin_doubt
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,9 @@ def new_photograph(options: argparse.Namespace) -> Scene:
     columns, rows = options.board
     board = Chessboard(columns, rows, options.square)
     with progress_bars() as bars:
-        views = find_corners(sources, board, bars)
+        views = find_corners(sources, board, bars, orientation=options.orientation)
+    if board.turns > 1:
+        warn_caller(f"--board: {origin_doubt(board)}")
     if camera.size is not None and camera.size != views.size:
         (w, h), (width, height) = views.size or (0, 0), camera.size
         raise ValueError(

@@ -8,7 +8,8 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 SMALLEST, LARGEST = 3.5, 12.0
-"""Limits in px of the radius of the disc whose pixels are fitted: fewer pixels say too little; farther ones see the lens bend the edges."""
+"""Limits in px of the radius of the disc whose pixels are fitted: fewer pixels say too little; farther ones see the
+lens bend the edges."""
 
 STEPS = 12
 """Most steps of the fit."""
@@ -150,7 +151,20 @@ def _edges(unknowns: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
         cosine, sine = angle.cos(), angle.sin()
         parts.append((cosine * y - sine * x, cosine * x + sine * y, cosine, sine))
     (d1, l1, c1, s1), (d2, l2, c2, s2) = parts
-    return torch.erf(d1 * (_ROOT_HALF / blur)), torch.erf(d2 * (_ROOT_HALF / blur)), d1, d2, l1, l2, c1, s1, c2, s2, x, y
+    return (
+        torch.erf(d1 * (_ROOT_HALF / blur)),
+        torch.erf(d2 * (_ROOT_HALF / blur)),
+        d1,
+        d2,
+        l1,
+        l2,
+        c1,
+        s1,
+        c2,
+        s2,
+        x,
+        y,
+    )
 
 
 def _residuals(unknowns: Tensor, grey: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

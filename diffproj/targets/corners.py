@@ -219,6 +219,12 @@ def spacing_of(grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "
     rows, columns = grid.shape[:2]
     down = np.linalg.norm(np.diff(grid, axis=0), axis=-1)
     along = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
-    padded = [np.pad(down, ((1, 0), (0, 0)), constant_values=np.inf), np.pad(down, ((0, 1), (0, 0)), constant_values=np.inf)]
-    padded += [np.pad(along, ((0, 0), (1, 0)), constant_values=np.inf), np.pad(along, ((0, 0), (0, 1)), constant_values=np.inf)]
+    padded = [
+        np.pad(down, ((1, 0), (0, 0)), constant_values=np.inf),
+        np.pad(down, ((0, 1), (0, 0)), constant_values=np.inf),
+    ]
+    padded += [
+        np.pad(along, ((0, 0), (1, 0)), constant_values=np.inf),
+        np.pad(along, ((0, 0), (0, 1)), constant_values=np.inf),
+    ]
     return np.min(padded, axis=0).reshape(rows, columns)

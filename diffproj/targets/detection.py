@@ -202,10 +202,12 @@ def _advice(labels: list[str], found: list[_Found], board: Chessboard) -> str:
     there = ""
     if seen:
         usual = max(set(seen), key=seen.count)
-        there = f" There is a pattern with {usual[0]} x {usual[1]} inner corners in {seen.count(usual)} of them: if that "
+        there = (
+            f" There is a pattern with {usual[0]} x {usual[1]} inner corners in {seen.count(usual)} of them: if that "
+        )
         there += f"is the board, give Chessboard({usual[0]}, {usual[1]}, ...)."
     return (
         f"photographs: want a board with {board.columns} x {board.rows} inner corners, found none in "
-        f"{_named(labels)}.{there} Check that the numbers count inner corners (one less than the squares each way), that "
-        "the whole board is in view with a margin around it, and that the photographs are sharp and evenly lit"
+        f"{_named(labels)}.{there} Check that the numbers count inner corners (one less than the squares each way), "
+        "that the whole board is in view with a margin around it, and that the photographs are sharp and evenly lit"
     )

@@ -17,9 +17,6 @@ Source = str | os.PathLike[str] | np.ndarray | Tensor
 SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".jp2", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
 """Suffixes of the files in a folder that count as photographs."""
 
-VIDEO_SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4"})
-"""Suffixes of files that count as videos."""
-
 Orientation = Literal["sensor", "upright"]
 """How a photograph's pixels are counted: as the sensor recorded them, or turned as its EXIF data ask."""
 
@@ -44,8 +41,8 @@ def listed(photographs: Source | Iterable[Source]) -> list[Photograph]:
     """List the input photographs one by one.
 
     Args:
-        photographs: a file, a folder (its photographs in natural order: `view2` before `view10`), a pattern such as
-            `photos/left*.jpg`, an array, a tensor, or a list of files, arrays and tensors.
+        photographs: a file, a folder (its photographs in natural order: `view2` before `view10`; hidden files are
+            none), a pattern such as `photos/left*.jpg`, an array, a tensor, or a list of files, arrays and tensors.
 
     Raises:
         TypeError: an entry is none of these.
@@ -77,29 +74,30 @@ def _entries(photographs: Any) -> list[Any]:
     if isinstance(photographs, str | os.PathLike):
         path = Path(photographs)
         if path.is_dir():
-            return sorted(filter(_is_photograph, path.iterdir()), key=_natural)
+            return sorted((file for file in path.iterdir() if _is_photograph(file)), key=_natural)
         if not path.exists() and re.search(r"[*?\[]", path.name):
-            return sorted((file for file in path.parent.glob(path.name) if not file.name.startswith("._")), key=_natural)
+            hidden = path.name.startswith(".")
+            return sorted((file for file in path.parent.glob(path.name) if hidden or not _hidden(file)), key=_natural)
         return [path]
     if isinstance(photographs, Iterable):
         return list(photographs)
     raise TypeError(f"photographs: want file names, arrays or tensors, got {type(photographs).__name__}")
 
 
+def _is_photograph(file: Path) -> bool:
+    """Whether a file in a folder counts as a photograph."""
+    return file.suffix.lower() in SUFFIXES and not _hidden(file) and file.is_file()
+
+
+def _hidden(file: Path) -> bool:
+    """Hidden files beside photographs are none: macOS keeps what it knows of `left1.jpg` in `._left1.jpg`."""
+    return file.name.startswith(".")
+
+
 def _natural(path: Path) -> list[Any]:
     """Key for natural order: numbers in a name are compared as numbers."""
     parts = re.split(r"([0-9]+)", path.name.lower())  # text at even places, numbers at odd ones
     return [int(part) if place % 2 else part for place, part in enumerate(parts)]
-
-
-def skipped_in(folder: Path) -> list[str]:
-    """The names of the files in a folder that are no photographs: hidden, or of another kind."""
-    return sorted(file.name for file in folder.iterdir() if file.is_file() and not _is_photograph(file))
-
-
-def _is_photograph(file: Path) -> bool:
-    """Whether a file in a folder counts as a photograph: macOS adds `._left1.jpg` to `left1.jpg`, which is none."""
-    return file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
 
 
 def grey(photograph: Photograph, orientation: Orientation = "sensor") -> Shaped[np.ndarray, "h w"]:

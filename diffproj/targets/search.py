@@ -41,8 +41,8 @@ class Pattern(NamedTuple):
 def find_pattern(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Pattern:
     """Find the board's corners in one grey image, in any of the orders that fit rows and columns.
 
-    Copies of several sizes are searched for patterns of saddle points: first that of at most 1100 px, then a half and
-    a quarter of that for blurred photographs, then larger ones for small boards. This takes a fraction of a second where
+    Copies of several sizes are searched for patterns of saddle points: first one of at most 1100 px, then a half and a
+    quarter of that for blurred photographs, then larger ones for small boards. This takes a fraction of a second where
     nothing is found. Where a part of a pattern is found, but no board, OpenCV's two detectors are asked as well.
     """
     seen, partial = (0, 0), None

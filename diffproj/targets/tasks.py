@@ -34,13 +34,13 @@ def results_of(
         ...     results_of(abs, [-3, 1, -2], pool)
         [3, 1, 2]
     """
-    tell = progress or (lambda done, total: None)
     total = len(items)
     if executor is None:
         results = []
         for done, item in enumerate(items, start=1):
             results.append(work(item))
-            tell(done, total)
+            if progress is not None:
+                progress(done, total)
         return results
     found: dict[int, Any] = {}
     places: dict[Future[Any], int] = {}
@@ -53,7 +53,8 @@ def results_of(
             done, _ = wait(places, return_when=FIRST_COMPLETED)
             for future in sorted(done, key=places.__getitem__):
                 found[places.pop(future)] = future.result()
-                tell(len(found), total)
+                if progress is not None:
+                    progress(len(found), total)
     finally:
         for future in places:
             future.cancel()
