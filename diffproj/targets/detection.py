@@ -16,6 +16,7 @@ from diffproj.targets.images import Orientation, Photograph, Source, as_8_bit, g
 from diffproj.targets.numbering import follow, in_order
 from diffproj.targets.search import find_pattern
 from diffproj.targets.tasks import results_of
+from diffproj.targets.videos import Frame, moved
 from diffproj.targets.views import Views
 
 LEAST_VISIBLE = 0.5
@@ -51,6 +52,7 @@ def detect(
     progress: Callable[[int, int], object] | None = None,
     *,
     orientation: Orientation | str = "sensor",
+    frames: int | None = None,
     executor: Executor | None = None,
 ) -> Views:
     """Detect the board's inner corners in photographs of one camera.
@@ -73,11 +75,13 @@ def detect(
             images. An image is an array as OpenCV has it, `(H, W)`, `(H, W, 1)`, `(H, W, 3)` in BGR or `(H, W, 4)` in
             BGRA, of 8-bit or 16-bit integers (16 bits: contrast-stretched) or floats from 0 to 1; or a tensor as
             Kornia has it, `(C, H, W)` in RGB, of the same types, or `(B, C, H, W)`. All of one size. Of a folder,
-            hidden files and those of other kinds are left out.
+            hidden files and those of other kinds are left out. A video (`.mp4`, `.avi`, `.mov`, `.mkv`) gives sharp
+            frames, at most 60 from all its parts, without those in which the board hardly moved.
         board: the board to look for, with at least 3 x 3 inner corners.
         progress: called with `(done, total)` after each photograph.
         orientation: `"sensor"` counts a file's pixels as the sensor recorded them, whichever way up the camera was
             held: one lens has one principal point. `"upright"` turns each file as its EXIF data ask, as viewers do.
+        frames: of a video, take each so-manieth frame instead, sharp or not.
         executor: does the work on several cores or machines: any `concurrent.futures.Executor`, such as a
             `ProcessPoolExecutor`, Dask's `client.get_executor()` or `mpi4py.futures`. Each worker reads its own files.
 
@@ -110,19 +114,26 @@ def detect(
         raise ValueError(f"orientation: want 'sensor' or 'upright', got {orientation!r}")
     if executor is not None and not callable(getattr(executor, "submit", None)):
         raise TypeError(f"executor: want a concurrent.futures.Executor, got {type(executor).__name__}")
-    listing = listed(photographs)
+    if frames is not None and (isinstance(frames, bool) or not isinstance(frames, int) or frames < 1):
+        raise ValueError(f"frames: want a whole number from 1 on, got {frames!r}")
+    listing = listed(photographs, frames)
     size = _common_size(listing, results_of(functools.partial(_size, orientation=orientation), listing, executor))
     find = functools.partial(_find, board=board, orientation=orientation)
     found = results_of(find, listing, executor, progress)
-    pairs = list(zip(listing, found, strict=True))
-    missed = [_miss(photograph, one.seen, board) for photograph, one in pairs if one.grid is None]
-    grids = follow([one.grid for one in found if one.grid is not None], board)
-    if not grids:
+    pairs = [(photograph, one.grid) for photograph, one in zip(listing, found, strict=True) if one.grid is not None]
+    if not pairs:
         raise BoardNotFoundError(_advice([photograph.label for photograph in listing], found, board))
-    for text in missed:
-        warnings.warn(f"{text}; photograph skipped", BoardNotFoundWarning, stacklevel=2)
-    pixels = torch.from_numpy(np.stack(grids)).reshape(len(grids), len(board), 2)
-    names = [photograph.name for photograph, one in pairs if one.grid is not None]
+    for photograph, one in zip(listing, found, strict=True):
+        if one.grid is None and not _chosen(photograph):
+            text = f"{_miss(photograph, one.seen, board)}; photograph skipped"
+            warnings.warn(text, BoardNotFoundWarning, stacklevel=2)
+    seen, grids = zip(*pairs, strict=True)
+    grids = follow(list(grids), board)
+    # Of a video, one view of each place: copies of a view make error bars too small.
+    new = iter(moved([grid for photograph, grid in zip(seen, grids, strict=True) if _chosen(photograph)], size))
+    kept = [k for k, photograph in enumerate(seen) if not _chosen(photograph) or next(new)]
+    pixels = torch.from_numpy(np.stack([grids[k] for k in kept])).reshape(len(kept), len(board), 2)
+    names = [seen[k].name for k in kept]
     return Views(pixels, pixels.isfinite().all(dim=-1), names=names, size=size)
 
 
@@ -159,6 +170,11 @@ def _check_board(board: object) -> None:
     if min(board.size) < 3:
         got = f"{board.columns} x {board.rows}"
         raise ValueError(f"board: want at least 3 x 3 inner corners for OpenCV's detector, got {got}")
+
+
+def _chosen(photograph: Photograph) -> bool:
+    """Whether it is a frame of a video that was chosen by itself, so that it need not show the board, nor anew."""
+    return isinstance(photograph.source, Frame) and photograph.source.chosen
 
 
 def _size(photograph: Photograph, orientation: Orientation) -> tuple[int, int]:

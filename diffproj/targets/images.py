@@ -11,6 +11,9 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 from torch import Tensor
 
+from diffproj.targets import videos
+from diffproj.targets.videos import Frame
+
 Source = str | os.PathLike[str] | np.ndarray | Tensor
 """A photograph, or several: a file, folder or pattern; an array or tensor."""
 
@@ -29,20 +32,22 @@ class Photograph(NamedTuple):
     Attributes:
         name: the name of its view: the file's name, or `image 3` for the third of several arrays.
         label: its name in messages: the file with its folder, or the same as `name`.
-        source: the file or the pixels.
+        source: the file, the pixels, or a frame of a video.
     """
 
     name: str
     label: str
-    source: Path | np.ndarray | Tensor
+    source: Path | np.ndarray | Tensor | Frame
 
 
-def listed(photographs: Source | Iterable[Source]) -> list[Photograph]:
+def listed(photographs: Source | Iterable[Source], frames: int | None = None) -> list[Photograph]:
     """List the input photographs one by one.
 
     Args:
         photographs: a file, a folder (its photographs in natural order: `view2` before `view10`; hidden files are
             none), a pattern such as `photos/left*.jpg`, an array, a tensor, or a list of files, arrays and tensors.
+
+        frames: of a video, each so-manieth frame; by default sharp ones from all its parts.
 
     Raises:
         TypeError: an entry is none of these.
@@ -52,17 +57,20 @@ def listed(photographs: Source | Iterable[Source]) -> list[Photograph]:
     entries = _entries(photographs)
     if not entries:
         raise ValueError(f"photographs: want at least one, got none in {photographs!r}")
-    return [_named(number, entry) for number, entry in enumerate(entries, start=1)]
+    return [photograph for n, entry in enumerate(entries, start=1) for photograph in _named(n, entry, frames)]
 
 
-def _named(number: int, entry: Any) -> Photograph:
+def _named(number: int, entry: Any, frames: int | None) -> list[Photograph]:
     if isinstance(entry, np.ndarray | Tensor):
-        return Photograph(f"image {number}", f"image {number}", entry)
+        return [Photograph(f"image {number}", f"image {number}", entry)]
     if isinstance(entry, str | os.PathLike):
         path = Path(entry)
         if not path.is_file():
             raise FileNotFoundError(f"photographs: no such file: {path}")
-        return Photograph(path.name, str(path), path)
+        if path.suffix.lower() in videos.SUFFIXES:
+            taken = videos.frames_of(path, frames)
+            return [Photograph(f"{path.name} frame {f.number}", f"{path} frame {f.number}", f) for f in taken]
+        return [Photograph(path.name, str(path), path)]
     raise TypeError(f"photographs: want file names, arrays or tensors, got {type(entry).__name__}")
 
 
@@ -114,6 +122,8 @@ def grey(photograph: Photograph, orientation: Orientation = "sensor") -> Shaped[
     label, source = photograph.label, photograph.source
     if isinstance(source, Path):
         return _scaled(label, _read(source, orientation))
+    if isinstance(source, Frame):
+        return source.image
     image = _channels_last(label, source) if isinstance(source, Tensor) else source
     if image.size == 0 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (1,), (3,), (4,)):
         raise ValueError(f"{label}: want {LAYOUTS}, got shape {tuple(source.shape)}")

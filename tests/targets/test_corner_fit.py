@@ -30,7 +30,14 @@ def cameras(side, count, board=BOARD, seed=0):
 
 # Root mean square distances in px, measured 0.020 .028 .042 .12 / .015 .020 .032 .071 / ... ; a tenth to a half of what
 # cv2.cornerSubPix reaches with the best window for each size.
-ERRORS = {8: (0.03, 0.06), 10: (0.026, 0.045), 12: (0.024, 0.035), 16: (0.02, 0.03), 30: (0.016, 0.02), 60: (0.014, 0.019)}
+ERRORS = {
+    8: (0.03, 0.06),
+    10: (0.026, 0.045),
+    12: (0.024, 0.035),
+    16: (0.02, 0.03),
+    30: (0.016, 0.02),
+    60: (0.014, 0.019),
+}
 
 
 @pytest.mark.parametrize("side", ERRORS)
@@ -81,7 +88,7 @@ def test_a_surface_of_third_degree_is_predicted_exactly_and_the_corner_itself_do
 def covered(image, where, side, grey):
     """The photograph with a disc of one grey value before the board."""
     mask = np.zeros(image.shape, np.float32)
-    cv2.circle(mask, tuple(int(round(x)) for x in where), int(0.45 * side), 1.0, -1, cv2.LINE_AA)
+    cv2.circle(mask, tuple(round(float(x)) for x in where), int(0.45 * side), 1.0, -1, cv2.LINE_AA)
     mask = cv2.GaussianBlur(mask, (0, 0), 0.8)
     return np.clip(image * (1 - mask) + grey * mask, 0, 255).astype(np.uint8)
 

@@ -319,6 +319,75 @@ def test_a_name_outside_ascii(tmp_path):
     assert detect(str(bracketed), BOARD).names == ("a[1].png",)
 
 
+def test_hidden_files_and_folders_are_no_photographs(folder):
+    (folder / "._b1.PNG").write_bytes(b"what macOS keeps of b1.PNG")
+    (folder / "album.png").mkdir()
+    assert detect(folder, BOARD).names == ALL
+    assert detect(str(folder / "*b10.*"), BOARD).names == ("b10.png",)
+
+
+def with_orientation(jpeg, orientation):
+    """The bytes of a JPEG file with an EXIF segment that holds nothing but an orientation."""
+    tiff = b"MM\0*\0\0\0\x08" + b"\0\x01" + b"\x01\x12\0\x03\0\0\0\x01" + bytes([0, orientation, 0, 0]) + b"\0\0\0\0"
+    body = b"Exif\0\0" + tiff
+    return jpeg[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + jpeg[2:]
+
+
+def test_pixels_are_those_of_the_sensor_whichever_way_up_the_camera_was_held(tmp_path):
+    """One lens has one principal point: files that differ in their EXIF orientation alone give the same corners."""
+    image, corners = photograph()
+    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
+    for orientation in (1, 3, 6):
+        (tmp_path / f"{orientation}.jpg").write_bytes(with_orientation(jpeg, orientation))
+    views = detect(tmp_path, BOARD)
+    assert views.size == SIZE
+    for view in views:
+        assert farthest(view, corners) < 0.1
+    upright = detect(tmp_path / "3.jpg", BOARD, orientation="upright")
+    assert farthest(upright, turned(image, corners, 2)[1]) < 0.1
+    assert detect(tmp_path / "6.jpg", BOARD, orientation="upright").size == SIZE[::-1]
+    with pytest.raises(ValueError, match="orientation: want 'sensor' or 'upright', got 'exif'"):
+        detect(tmp_path, BOARD, orientation="exif")
+
+
+def test_sizes_that_differ_are_told_by_groups():
+    image, _ = photograph()
+    small = image[:, 1:]
+    message = (
+        r"one size, got 400 x 300 px in image 1, image 3, image 4 and 1 more and 399 x 300 px in image 2; .* those of "
+        "400 x 300 px"
+    )
+    with pytest.raises(ValueError, match=message):
+        detect([image, small, image, image, image], BOARD)
+
+
+def test_a_video_gives_sharp_frames_that_differ(tmp_path):
+    """A board that stands still, then jumps; every third frame is sharp, and some show no board."""
+    path = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, SIZE)
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no video")
+    image, corners = photograph()
+    for number in range(90):
+        shown = np.roll(image, 20 if number >= 45 else 0, axis=1)
+        shown = shown if number % 3 == 1 else cv2.GaussianBlur(shown, (0, 0), 3)
+        writer.write(cv2.cvtColor(np.full_like(image, 128) if number < 6 else shown, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    views = detect(path, BOARD)
+    assert len(views) == 2
+    assert all(int(name.removeprefix("walk.avi frame ")) % 3 == 1 for name in views.names)
+    assert np.linalg.norm(views.pixels[0].numpy() - corners, axis=1).max() < 0.2
+    assert np.linalg.norm(views.pixels[1].numpy() - corners - (20, 0), axis=1).max() < 0.2
+    with pytest.warns(BoardNotFoundWarning, match="frame 0: found no board"):
+        strided = detect(path, BOARD, frames=30)
+    assert strided.names == ("walk.avi frame 30", "walk.avi frame 60")
+    (tmp_path / "broken.mp4").write_bytes(b"text")
+    with pytest.raises(ValueError, match=r"broken\.mp4: want a video"):
+        detect(tmp_path / "broken.mp4", BOARD)
+    with pytest.raises(ValueError, match="frames: want a whole number from 1 on, got 0"):
+        detect(path, BOARD, frames=0)
+
+
 # ------------------------------------------------------------------------------------------- progress and misses
 
 
@@ -345,7 +414,9 @@ def test_a_photograph_without_a_board_is_skipped_and_named(tmp_path):
 def test_no_board_anywhere():
     """One error that says what to check, and no warnings before it."""
     image, _ = photograph()
-    with pytest.raises(BoardNotFoundError, match=r"10 x 7 .* image 1, image 2, image 3 and 1 more\. Check .* squares"):
+    with pytest.raises(
+        BoardNotFoundError, match=r"10 x 7 .* image 1, image 2, image 3 and 1 more\. .* Check .* squares"
+    ):
         detect([image] * 4, Chessboard(10, 7))
     assert issubclass(BoardNotFoundError, ValueError)
 

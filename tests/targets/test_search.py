@@ -61,7 +61,7 @@ def test_a_small_board_in_a_large_photograph_and_a_large_one():
     image[900 : 900 + small.shape[0], 1700 : 1700 + small.shape[1]] = small
     found = detect(image, board).pixels[0].numpy() - (1700, 900)
     assert np.linalg.norm(found - corners, axis=-1).max() < 0.2
-    image, corners = seen(board, scene(board, 170, size=(2600, 2000)), blur_px=3.0)
+    image, corners = seen(board, scene(board, 150, size=(2600, 2000)), blur_px=3.0)
     assert np.linalg.norm(detect(image, board).pixels[0].numpy() - corners, axis=-1).max() < 0.15
 
 
