@@ -46,11 +46,18 @@ class Corners(NamedTuple):
         grid: `(rows, columns, 2)` px; NaN where not visible.
         sigma: `(rows, columns)` px, standard deviation of a coordinate that the noise of the grey values implies.
         visible: `(rows, columns)`, false where something hides the corner.
+        misfit: the median over the corners; above a third, it is no chessboard.
     """
 
     grid: Float[np.ndarray, "rows columns 2"]
     sigma: Float[np.ndarray, "rows columns"]
     visible: Bool[np.ndarray, "rows columns"]
+    misfit: float
+
+    def is_board(self) -> bool:
+        """Whether enough of it proves to be a board: half of all corners, and half of those along each side."""
+        sides = self.visible[0], self.visible[-1], self.visible[:, 0], self.visible[:, -1]
+        return self.misfit < 0.35 and min(float(part.mean()) for part in (self.visible, *sides)) >= 0.5
 
 
 def refine_grid(image: Shaped[np.ndarray, "h w"], rough: Float[np.ndarray, "rows columns 2"]) -> Corners:
@@ -78,7 +85,7 @@ def refine_grid(image: Shaped[np.ndarray, "h w"], rough: Float[np.ndarray, "rows
             *(np.where(good, old, new) for old, new in zip(fit[1:], tried[1:], strict=True)),
         )
         good = _trusted(image, fit, everywhere)
-    return Corners(np.where(good[..., None], fit.grid, np.nan), fit.sigma, good)
+    return Corners(np.where(good[..., None], fit.grid, np.nan), fit.sigma, good, float(np.median(fit.misfit)))
 
 
 class _Fit(NamedTuple):
@@ -173,6 +180,8 @@ def _trusted(
         off = np.linalg.norm(np.where(use[..., None], grid - surface.grid, 0.0), axis=-1) / surface.spread
         scale = DEVIATIONS * float(np.median(off[use]))
         limit = np.maximum(scale, np.where(misfit < 1.5 * usual + 0.03, LOOSE * spacing, TIGHT * spacing + LEAST))
+        if (off[use] < 0.5 * limit[use]).all():
+            break
         weight = use / (1 + (off / (0.5 * limit)) ** 4)
     return use & (off < limit)
 

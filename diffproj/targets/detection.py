@@ -19,9 +19,6 @@ from diffproj.targets.tasks import results_of
 from diffproj.targets.videos import Frame, moved
 from diffproj.targets.views import Views
 
-LEAST_VISIBLE = 0.5
-"""Share of a board's corners that must prove to be corners."""
-
 
 class BoardNotFoundWarning(UserWarning):
     """A photograph was skipped because no board was found in it.
@@ -61,7 +58,8 @@ def detect(
     it is found so, by OpenCV's detectors. Its dark and light may be exchanged, as in thermal images. Each corner is
     then placed by fitting its neighbourhood with two crossing edges, their blur and the light. Corners that do not look
     like corners, or lie off the surface through their neighbours, are sought once more, and hidden (`Views.visible`) if
-    they stay so: behind a hand or a clip, in glare, beyond the photograph's border. At least half must be visible.
+    they stay so: behind a hand or a clip, in glare, beyond the photograph's border. Half of all corners, and of those along each
+    side, must be visible.
 
     The order is that of `Chessboard.points`. It is never mirrored: along a row, then down a column, is clockwise in the
     image. It starts at a dark corner of the board: the square between the first four corners is dark, and so is the one
@@ -157,7 +155,7 @@ def _find(photograph: Photograph, board: Chessboard, orientation: Orientation) -
         if pattern.grid is None:
             return _Found(None, pattern.seen)
         refined = refine_grid(image, pattern.grid)
-        if refined.visible.sum() < LEAST_VISIBLE * len(board):
+        if not refined.is_board():
             return _Found(None, (0, 0))
         return _Found(in_order(refined.grid, image, board), board.size)
     except Exception as error:

@@ -23,6 +23,12 @@ WHOLE = 0.75
 HINT = 0.3
 """Share of a board's corners in a pattern from which OpenCV's detectors are asked, too."""
 
+FINEST = 5.5
+"""Least mean step in px of a pattern: finer ones are cloth, grilles and screens, whose corners nobody could place."""
+
+SMALLEST = 12
+"""Corners of the smallest whole pattern that is taken for a board of its own."""
+
 _ACCURATE = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 
 
@@ -45,19 +51,24 @@ def find_pattern(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Pattern:
     quarter of that for blurred photographs, then larger ones for small boards. This takes a fraction of a second where
     nothing is found. Where a part of a pattern is found, but no board, OpenCV's two detectors are asked as well.
     """
-    seen, partial = (0, 0), None
+    seen, partial, other_boards = (0, 0), None, []
     for small in _copies(image):
         for cells in lattices(saddles := saddle_points(small)):
             grid = as_grid(cells, saddles.points)
-            found = matched(grid, board)
-            if found is not None:
+            found, whole = matched(grid, board), _carried(grid, small, image)
+            if _spacing(whole) < FINEST:
+                continue
+            # Of another board, another copy may show no more, or no less, than what looks like this one.
+            if found is not None and not any(_overlap(whole, other) for other in other_boards):
                 return Pattern(_carried(found, small, image))
             extent = extent_of(grid)
+            if _larger(extent, board):
+                other_boards.append(whole)
             if extent[0] * extent[1] > seen[0] * seen[1]:
-                seen, partial = extent, _carried(grid, small, image)
-    if partial is not None and np.isfinite(partial[..., 0]).sum() >= HINT * len(board) and not _larger(seen, board):
-        return Pattern(_by_opencv(image, partial, board), seen)
-    return Pattern(None, seen)
+                seen, partial = extent, whole
+    if partial is None or np.isfinite(partial[..., 0]).sum() < HINT * len(board) or _is_other(seen, partial, board):
+        return Pattern(None, seen)
+    return Pattern(_by_opencv(image, partial, board), seen)
 
 
 def matched(grid: Float[np.ndarray, "r c 2"], board: Chessboard) -> Float[np.ndarray, "rows columns 2"] | None:
@@ -108,6 +119,24 @@ def _larger(seen: tuple[int, int], board: Chessboard) -> bool:
     """Whether a pattern has more corners than the board one way, so that another board is in view."""
     short, long = sorted(board.size)
     return seen[0] > long or seen[1] > short
+
+
+def _is_other(seen: tuple[int, int], grid: Float[np.ndarray, "r c 2"], board: Chessboard) -> bool:
+    """Whether a pattern is a board of its own: larger than the one sought one way, or whole and smaller."""
+    whole = seen[0] * seen[1] >= SMALLEST and np.isfinite(grid[..., 0]).sum() >= 0.95 * seen[0] * seen[1]
+    return _larger(seen, board) or bool(whole)
+
+
+def _spacing(grid: Float[np.ndarray, "r c 2"]) -> float:
+    """The mean step of a pattern along its denser direction, in px."""
+    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1) for axis in (0, 1)]
+    return min((float(np.nanmean(step)) for step in steps if np.isfinite(step).any()), default=0.0)
+
+
+def _overlap(one: Float[np.ndarray, "_r _c 2"], other: Float[np.ndarray, "_R _C 2"]) -> bool:
+    """Whether the middle of one pattern lies within the box around the other."""
+    middle = np.nanmean(one, axis=(0, 1))
+    return bool((middle > np.nanmin(other, axis=(0, 1))).all() and (middle < np.nanmax(other, axis=(0, 1))).all())
 
 
 def _copies(image: UInt8[np.ndarray, "h w"]) -> Iterator[UInt8[np.ndarray, "_h _w"]]:
