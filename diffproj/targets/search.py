@@ -53,13 +53,14 @@ def find_pattern(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Pattern:
     """
     seen, partial, other_boards = (0, 0), None, []
     for small in _copies(image):
-        for cells in lattices(saddles := saddle_points(small)):
-            grid = as_grid(cells, saddles.points)
+        saddles = saddle_points(small)
+        grids = [as_grid(cells, saddles.points) for cells in lattices(saddles)]
+        for grid in sorted(grids, key=_area, reverse=True):
             found, whole = matched(grid, board), _carried(grid, small, image)
             if _spacing(whole) < FINEST:
                 continue
             # Of another board, another copy may show no more, or no less, than what looks like this one.
-            if found is not None and not any(_overlap(whole, other) for other in other_boards):
+            if found is not None and not any(_shadows(other, whole) for other in other_boards):
                 return Pattern(_carried(found, small, image))
             extent = extent_of(grid)
             if _larger(extent, board):
@@ -133,8 +134,15 @@ def _spacing(grid: Float[np.ndarray, "r c 2"]) -> float:
     return min((float(np.nanmean(step)) for step in steps if np.isfinite(step).any()), default=0.0)
 
 
-def _overlap(one: Float[np.ndarray, "_r _c 2"], other: Float[np.ndarray, "_R _C 2"]) -> bool:
-    """Whether the middle of one pattern lies within the box around the other."""
+def _area(grid: Float[np.ndarray, "r c 2"]) -> float:
+    """The area in px of the box around a pattern."""
+    return float(np.prod(np.nanmax(grid, axis=(0, 1)) - np.nanmin(grid, axis=(0, 1))))
+
+
+def _shadows(other: Float[np.ndarray, "_r _c 2"], one: Float[np.ndarray, "_R _C 2"]) -> bool:
+    """Whether another board is in the same place, or so much larger that the one is likely a grille or a print."""
+    if _area(other) > 16 * _area(one):
+        return True
     middle = np.nanmean(one, axis=(0, 1))
     return bool((middle > np.nanmin(other, axis=(0, 1))).all() and (middle < np.nanmax(other, axis=(0, 1))).all())
 
