@@ -15,6 +15,7 @@ import torch
 import torch.utils._pytree as torch_pytree
 from torch import Tensor
 
+from diffproj._core.copying import Copied
 from diffproj._core.numerics import at_least_float32, converted
 
 T = TypeVar("T")
@@ -23,7 +24,7 @@ Rearrange = Callable[[Tensor, int], Tensor]
 """Takes a tensor and how many axes it has behind those of the batch to the same in another arrangement."""
 
 
-class Batched:
+class Batched(Copied):
     """Tensors that share batch axes `*B`, parts with the same batch axes, and constants."""
 
     __slots__ = ()
@@ -91,13 +92,32 @@ class Batched:
         """The same cut off from the graph."""
         return self._rearranged(lambda tensor, _: tensor.detach(), lambda part: part.detach())
 
-    def expand(self: B, *batch_shape: int) -> B:
-        """The same with its batch axes broadcast to `batch_shape`, as `torch.Tensor.expand`: nothing is copied."""
+    def expand(self: B, *batch_shape: int | Sequence[int]) -> B:
+        """The same with its batch axes broadcast to `batch_shape`, as `torch.Tensor.expand`: nothing is copied.
+
+        Raises:
+            TypeError: the shape is not whole numbers.
+            ValueError: the batch axes do not broadcast to it.
+        """
+        first = batch_shape[0] if len(batch_shape) == 1 else None
+        shape = self._stretched(first if isinstance(first, tuple | list) else batch_shape)
 
         def stretch(tensor: Tensor, behind: int) -> Tensor:
-            return tensor.expand((*batch_shape, *tensor.shape[tensor.ndim - behind :]))
+            return tensor.expand((*shape, *tensor.shape[tensor.ndim - behind :]))
 
-        return self._rearranged(stretch, lambda part: part.expand(*batch_shape))
+        return self._rearranged(stretch, lambda part: part.expand(*shape))
+
+    def _stretched(self, shape: Sequence[Any]) -> torch.Size:
+        """The shape that the batch is asked to take on, with -1 for the length that an axis has already."""
+        own = self.batch_shape
+        if not all(isinstance(length, int | torch.SymInt) for length in shape):
+            raise TypeError(f"batch_shape: want whole numbers, got {tuple(shape)}")
+        new = len(shape) - len(own)
+        wanted = [own[k - new] if length == -1 and k >= new else length for k, length in enumerate(shape)]
+        fits = new >= 0 and all(length >= 0 for length in wanted[:new])
+        if not fits or any(length not in (1, want) for length, want in zip(own, wanted[new:], strict=True)):
+            raise ValueError(f"batch_shape: want one that {tuple(own)} broadcasts to, got {tuple(shape)}")
+        return torch.Size(wanted)
 
     def __getitem__(self: B, index: Any) -> B:
         """Some of the batch, chosen as one indexes a tensor of shape `*B`.
@@ -193,26 +213,58 @@ def _stacked(name: str, parts: list[Any], dim: int) -> Any:
 # -------------------------------------------------------------------------------------------------------- indexing
 
 
-INDEX = (int, slice, list, Tensor, np.ndarray, np.integer)
-
-
 def check_index(index: Any) -> None:
     """Check that an index is one that tensors take.
 
     Raises:
-        TypeError: it is not. (PyTorch itself would read any object with a length, number by number.)
+        TypeError: it is not. (PyTorch itself would read any object with a length, number by number, also one inside of
+            a list, and crashes where that never ends.)
     """
     for part in index if isinstance(index, tuple) else (index,):
-        if not (part is None or part is Ellipsis or isinstance(part, INDEX)):
-            raise TypeError(f"index: want numbers, slices, lists or masks, got {type(part).__name__}")
+        if not (part is None or part is Ellipsis or _is_index(part)):
+            raise TypeError(
+                f"index: want numbers, slices, lists or masks, got {_described(part)}; "
+                "some of a batch is batch[3], batch[2:5], batch[[0, 4]] or batch[mask]"
+            )
+
+
+def _is_index(part: Any) -> bool:
+    if isinstance(part, list):
+        return all(_is_index(element) and not isinstance(element, slice) for element in part)
+    if isinstance(part, slice):
+        return all(end is None or isinstance(end, int | np.integer) for end in (part.start, part.stop, part.step))
+    if isinstance(part, Tensor):
+        return not (part.is_floating_point() or part.is_complex())
+    if isinstance(part, np.ndarray):
+        return part.dtype.kind in "biu"
+    return isinstance(part, int | np.integer | np.bool_)
+
+
+def _described(part: Any) -> str:
+    """The kind of a thing that is no index; of a list, that of what does not belong there."""
+    if isinstance(part, list):
+        return f"a list with {_described(next(element for element in part if not _is_index(element)))}"
+    if isinstance(part, Tensor | np.ndarray):
+        return f"{type(part).__name__} of {part.dtype}"
+    return type(part).__name__
 
 
 def index_batch(tensor: Tensor, index: Any, behind: int) -> Tensor:
     """Index the batch axes of a tensor and keep the `behind` axes behind them whole, also with an ellipsis."""
-    index = index if isinstance(index, tuple) else (index,)
+    index = tuple(_for_tensors(part) for part in (index if isinstance(index, tuple) else (index,)))
     if not any(part is Ellipsis for part in index):
         index = (*index, Ellipsis)
-    return tensor[(*index, *(slice(None),) * behind)]
+    try:
+        return tensor[(*index, *(slice(None),) * behind)]
+    except (ValueError, OverflowError) as error:  # numbers beyond 64 bits
+        raise IndexError(f"index: want numbers of the batch, got others ({error})") from None
+
+
+def _for_tensors(part: Any) -> Any:
+    """Arrays as what every release of PyTorch takes."""
+    if isinstance(part, np.ndarray) and part.dtype.kind in "iu":
+        return torch.from_numpy(part.astype(np.int64))
+    return part.copy() if isinstance(part, np.ndarray) else part
 
 
 # ---------------------------------------------------------------------------------------------------------- PyTrees

@@ -11,6 +11,7 @@ Three rules live here because they are easy to break one call at a time:
 * **Work in blocks changes no result.** `in_blocks` cuts long inputs only when no derivative of any kind is asked.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -73,6 +74,27 @@ def check_tensor(name: str, value: object, *shape: int | str) -> Tensor:
     return at_least_float32(value)
 
 
+def check_number(name: str, value: object) -> None:
+    """Check that `value` is a finite number, or a tensor of one.
+
+    Raises:
+        TypeError: it is neither.
+        ValueError: it is NaN or infinite, where its value can be read.
+    """
+    if isinstance(value, Tensor):
+        if value.numel() != 1 or value.dtype == torch.bool or value.is_complex():
+            raise TypeError(f"{name}: want a number, got a tensor of shape {tuple(value.shape)} and {value.dtype}")
+        if not has_values(value):
+            return
+        value = value.item()
+    try:
+        finite = math.isfinite(value)  # type: ignore[arg-type]
+    except TypeError:
+        raise TypeError(f"{name}: want a number, got {type(value).__name__}") from None
+    if not finite:
+        raise ValueError(f"{name}: want a finite number, got {value}")
+
+
 def check_same_kind(**tensors: Kind | None) -> None:
     """Check that all tensors share one dtype and one device, naming the first that does not.
 
@@ -109,6 +131,21 @@ def has_values(*tensors: Tensor) -> bool:
     """Whether the values of these tensors can be read here: not while compiling, exporting or under `vmap`."""
     tracing = torch.compiler.is_compiling() or in_functional_transform()
     return not (tracing or any(tensor.is_meta for tensor in tensors))
+
+
+def as_values(value: Any, like: Tensor) -> Tensor:
+    """A tensor as it is; numbers, nested lists and arrays in float64 on the device of `like`.
+
+    Python's numbers would take on PyTorch's default dtype, with 7 digits, and its default device.
+    """
+    if isinstance(value, Tensor):
+        return value
+    return torch.as_tensor(value, dtype=torch.float64 if like.device.type != "mps" else None, device=like.device)
+
+
+def spread_evenly(total: int, count: int, device: torch.device) -> Tensor:
+    """`count` of the numbers from 0 to `total - 1`, evenly apart, with the first and the last."""
+    return torch.arange(count, device=device) * (total - 1) // max(count - 1, 1)
 
 
 def converted(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
@@ -180,6 +217,11 @@ def in_float64(tensor: Tensor) -> Tensor:
 def rounding(dtype: torch.dtype) -> float:
     """The relative size below which a sum of a few products is rounding: 8 units in the last place."""
     return 8 * torch.finfo(dtype).eps
+
+
+def least_depth(dtype: torch.dtype) -> float:
+    """The depth from which on points are projected: what is divided by it, and its slope, are finite."""
+    return math.sqrt(torch.finfo(dtype).tiny)
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:

@@ -1,11 +1,9 @@
-"""What is to be known of a calibration that converged, and how far its model may be off before it counts as none."""
+"""How far the model of a calibration may be off before it counts as none, and which model would be better."""
 
-import torch
 from torch import Tensor
 
 from diffproj.calibration.fit import Fit
-from diffproj.calibration.leftover import Effect, Leftover, leftover
-from diffproj.calibration.solver import Status
+from diffproj.calibration.leftover import leftover
 from diffproj.calibration.task import Task
 from diffproj.lens.models import MODELS
 
@@ -14,6 +12,8 @@ SIGNIFICANT = 6.0
 RADIAL_SHARE, SMOOTH_SHARE, SHAPE_SHARE = 0.05, 0.15, 0.15
 """Part of the residuals' sum of squares that an effect must explain to be worth a word. (The board of the bundled views
 passes for 1 % along the radius and up to 10 % over the image, as far as its own shape is known.)"""
+SKEW_PART = 0.5
+"""Part of what a smooth field explains from which on skew, if it explains as much, is the word for it."""
 SHAPE_VIEWS = 4
 """Views below which what repeats on the board is not told from what repeats in the image."""
 BOW_PART = 0.5
@@ -28,25 +28,6 @@ GRAVE_SHARE = 0.5
 fit is no calibration: its error bars, which take the model for right, would say nothing."""
 LENS_WORDS = "change smoothly"
 """What is said of residuals that another lens would explain."""
-
-
-def remarks(found: Fit, status: Tensor) -> tuple[str, ...]:
-    """The remarks on each of P cameras, in one text; empty where there are none, or it did not converge."""
-    task = found.task
-    converged = status == Status.CONVERGED
-    held = torch.zeros_like(converged)
-    if task.prior is not None and task.prior.known is not None:
-        held = (task.prior.precision != task.prior.known).any(-1).any(-1)
-    texts: list[list[str]] = [[] for _ in status]
-    for p in (converged & held).nonzero().flatten().tolist():
-        texts[p].append("k4, k5 and k6 are drawn towards 0, for without that the lens folds inside the image")
-    sigma = found.pixel_sigma().detach()
-    which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
-    if len(which):
-        left = leftover(found, which, SIGNIFICANT)
-        for i, p in enumerate(which.tolist()):
-            texts[p].extend(filter(None, [_left_over(task, left, i, p, float(sigma[p]))]))
-    return tuple("; ".join(text) for text in texts)
 
 
 def gravely_inadequate(found: Fit) -> Tensor:
@@ -73,36 +54,8 @@ def other_lens(task: Task, p: int, radial: bool) -> str:
         return "let the lens's coefficients free"
     if not radial and model.count and model.perspective:
         better = {"brown12": "'brown14'", "brown14": "'fisheye'"}.get(task.lens, "'brown12'")
-        better += "" if task.skew else ", or skew=True"
     elif model.count <= 5 and model.perspective:
         better = {0: "'brown5'", 4: "'brown5', 'brown8'"}.get(model.count, "'brown8'") + " or 'fisheye'"
     else:
         better = "'fisheye'" if model.perspective else "'brown5' or 'brown8'"
     return f"try distortion={better} ('auto' compares the lenses)"
-
-
-def _left_over(task: Task, left: Leftover, i: int, p: int, sigma: float) -> str:
-    """The sentence on the residuals of camera `p`, number `i` of those that were tested; empty where they are noise."""
-
-    def counts(effect: Effect, share: float) -> bool:
-        return float(effect.deviations[i]) > SIGNIFICANT and float(effect.least_share[i]) > share
-
-    for radial, effect, share in ((True, left.radial, RADIAL_SHARE), (False, left.smooth, SMOOTH_SHARE)):
-        if counts(effect, share):
-            where = "with the distance from the principal point" if radial else "over the image"
-            part = f"{100 * float(effect.share[i]):.0f} % of their sum of squares"
-            remedy = other_lens(task, p, radial)
-            return f"the residuals {LENS_WORDS} {where}, as through another lens ({part}): {remedy}"
-    if int(task.used[p].any(-1).sum()) >= SHAPE_VIEWS and counts(left.shape, SHAPE_SHARE):
-        if counts(left.bow, BOW_PART * float(left.shape.share[i])):
-            return "the residuals repeat on the board, as if it were bent: take bow=True"
-        return (
-            f"the residuals repeat on the board, whose corners lie {float(left.moved[i]):.2g} world units (RMS) "
-            "off the target's: a flatter or better print would tell more"
-        )
-    if sigma > NOISY_PX:
-        return (
-            f"the corners scatter by {sigma:.1f} px in each coordinate, in sharp photographs by 0.1 to 0.3: "
-            "look for blur and for wrong corners"
-        )
-    return ""

@@ -7,8 +7,9 @@ residuals; where it is estimated from n degrees of freedom, sigma is averaged ov
 
     ratio = (1 + (S2 - S1) / (n sigma^2)) ^ (n / 2)
 
-so that few corners claim no more than they know. Either pose has an error bar of its own, which tells nothing of the
-other: with p the other's probability and d the step that leads to it, the mean square of the kept pose's error is
+so that few corners claim no more than they know. Under a robust loss some corners may be wrong: the likelihood of each
+is then Student's of few degrees of freedom. Either pose has an error bar of its own, which tells nothing of the other:
+with p the other's probability and d the step that leads to it, the mean square of the kept pose's error is
 
     C + p d d^T
 """

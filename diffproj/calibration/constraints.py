@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffproj._core.numerics import as_values
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.solver import Prior
 
@@ -90,7 +91,7 @@ def make_prior(
 
 def _written(into: Tensor, where: list[int], value: Any, name: str, batch: Sequence[int]) -> Tensor:
     """A copy with `value`, which broadcasts to `(*B, len(where))`, at some columns."""
-    tensor = value if isinstance(value, Tensor) else torch.as_tensor(value)
+    tensor = as_values(value, into)
     try:
         tensor = tensor.to(into).expand(*batch, len(where)).reshape(-1, len(where))
     except RuntimeError:

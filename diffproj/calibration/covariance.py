@@ -28,6 +28,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.copying import Copied
 from diffproj.calibration.solver import Equations
 
 SINGULAR = 2e-15
@@ -35,7 +36,7 @@ SINGULAR = 2e-15
 
 
 @dataclass(frozen=True, eq=False)
-class Covariance:
+class Covariance(Copied):
     """Joint covariance of shared parameters and poses, for batch shape `*B`.
 
     A pose is perturbed by `R <- exp(omega) R`, `t <- t + tau`: its six coordinates are omega in radians (about the
@@ -161,16 +162,19 @@ class Covariance:
             True
         """
         undetermined, undetermined_views = (
-            torch.tensor(fields[key], dtype=torch.bool) for key in ("undetermined", "undetermined_views")
+            torch.tensor(fields[key], dtype=torch.bool, device="cpu") for key in ("undetermined", "undetermined_views")
         )
         shared, *blocks = (
-            torch.tensor(fields[key], dtype=torch.float64) for key in ("shared", "follow", "mixed", "alone")
+            torch.tensor(fields[key], dtype=torch.float64, device="cpu")
+            for key in ("shared", "follow", "mixed", "alone")
         )
         dispersion = torch.ones_like(shared[..., 0, 0])  # a file of an earlier version has none
         if "dispersion" in fields:
-            dispersion = torch.tensor(fields["dispersion"], dtype=torch.float64)
+            dispersion = torch.tensor(fields["dispersion"], dtype=torch.float64, device="cpu")
         infinite = torch.diag_embed(torch.where(undetermined, torch.inf, 0.0).to(shared))
-        middle = [torch.tensor(fields[key], dtype=torch.float64) for key in ("middle", "arm") if key in fields]
+        middle = [
+            torch.tensor(fields[key], dtype=torch.float64, device="cpu") for key in ("middle", "arm") if key in fields
+        ]
         known = undetermined, undetermined_views, dispersion
         return cls(tuple(fields["names"]), shared + infinite, *known, *blocks, *middle)
 

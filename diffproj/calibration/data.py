@@ -6,8 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._core.numerics import in_float64
+from diffproj._core.numerics import as_values, in_float64
 from diffproj.calibration.distinct import shares
+from diffproj.calibration.losses import SMALLEST
 from diffproj.calibration.task import Task
 from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target
@@ -60,7 +61,7 @@ class Data:
         visible = views.visible
         self.given_weights, self.weights = None, None
         if weights is not None:
-            given = torch.as_tensor(weights).to(views.device)
+            given = as_values(weights, views.pixels).to(views.device)
             try:
                 given = in_float64(given).expand(visible.shape)
             except RuntimeError:
@@ -69,6 +70,8 @@ class Data:
             counted = given.detach()[visible]
             if not bool(((counted >= 0) & counted.isfinite()).all()):
                 raise ValueError("weights: want finite numbers of at least 0, got others at corners that were seen")
+            if not bool(((counted == 0) | ((counted >= SMALLEST) & (counted <= 1 / SMALLEST))).all()):
+                raise ValueError(f"weights: want 0 or numbers from {SMALLEST:g} to {1 / SMALLEST:g}, got others")
             self.given_weights = torch.where(visible, given, 0.0)
             self.weights = self.given_weights.detach().reshape(self.pixels.shape[:-1])
             visible = visible & (self.given_weights.detach() > 0)

@@ -18,6 +18,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.numerics import spread_evenly
+
 ALIKE_PX = 2.0
 """Displacement between two views, in pixels, below which they show the board alike. (Of 13 bundled views the closest
 two are 15 px apart, of 1000 random ones 9 px.)"""
@@ -123,7 +125,8 @@ def one_view(
             return ~far
     products = _Products(points, pixels, used, FEWEST, NEIGHBOURS)
     most = used.sum(-1).argmax(-1)
-    left, mask = (whole[torch.arange(len(used)), most].unsqueeze(1) for whole in (products.left, products.mask))
+    problems = torch.arange(len(used), device=used.device)
+    left, mask = (whole[problems, most].unsqueeze(1) for whole in (products.left, products.mask))
     moved, common = left @ products.right.mT, mask @ products.mask.mT
     unused = ~used.any(-1)
     itself = torch.nn.functional.one_hot(most, used.shape[1]) > 0
@@ -144,9 +147,9 @@ class _Products:
         N = len(seen)
         corner = neighbour = seen
         if N > MARKER:
-            some = torch.linspace(0, N - 1, min(N, corners), device=points.device).long()
+            some = spread_evenly(N, min(N, corners), points.device)
             apart = torch.cdist(points[seen[some]], points[seen])
-            apart[torch.arange(len(some)), some] = torch.inf
+            apart[torch.arange(len(some), device=some.device), some] = torch.inf
             corner = seen[some].repeat_interleave(neighbours)
             neighbour = seen[apart.topk(neighbours, largest=False).indices.flatten()]
         both = used[..., corner] & used[..., neighbour]

@@ -49,15 +49,21 @@ def folds_of(views: Views, folds: int) -> Tensor:
 
 
 def without_views(
-    views: Views, target: Target, distortion: LensModel, out: Tensor, chosen: Options, measure: Loss | None = None
+    views: Views,
+    target: Target,
+    distortion: LensModel,
+    out: Tensor,
+    chosen: Options,
+    measure: Loss | None = None,
+    who: str = "calibrate",
 ) -> tuple[Calibration, Errors]:
     """Refits without the views of each fold `(k, V)`, and their errors there.
 
     The pose of a view held out is estimated from every second corner and evaluated on the others, then with the roles
-    exchanged. With a robust `measure` the squares in pixels are its values.
+    exchanged. With a robust `measure` the squares in pixels are its values. Errors name `who` was asked.
     """
     every = repeated(views, len(out))
-    fits = calibrated(every.hiding(_corners(out, every)), target, distortion, chosen)
+    fits = calibrated(every.hiding(_corners(out, every)), target, distortion, chosen, who)
     held_out = every.hiding(_corners(~out, every))
     second = _second(views)
     errors = []
@@ -65,7 +71,7 @@ def without_views(
     for hidden in (second, ~second):
         located = located_without_warning(held_out.hiding(hidden), target, fits.camera, **posing)
         if bool((located.covariance.undetermined_views & located.used.any(-1)).any()):
-            raise CalibrationError(f"a view that was held out has no pose: {located.message}", located)
+            raise CalibrationError(f"{who}: a view that was held out has no pose: {located.message}", located)
         posed = located.used.any(-1, keepdim=True)
         errors.append(errors_of(located, every.pixels, held_out.hiding(~hidden).visible & posed, measure))
     return fits, errors[0].plus(errors[1])

@@ -58,6 +58,7 @@ class Leftover:
     Attributes:
         radial: fields along the radius.
         smooth: smooth fields, the radial ones among them.
+        skew: the skew of K alone; nothing where it is among the parameters.
         shape: points of the board moved, alike in all views.
         bow: the same by a paraboloid alone.
         moved: how far the points lie off the board within its plane, `(n,)`, RMS in world units, without the noise.
@@ -65,6 +66,7 @@ class Leftover:
 
     radial: Effect
     smooth: Effect
+    skew: Effect
     shape: Effect
     bow: Effect
     moved: Tensor
@@ -112,18 +114,18 @@ class _Scores:
 
     def leftover(self, shape_deviations: float) -> Leftover:
         explained, points, moves = self._moved_points()
-        shape = _effect(explained, points, _total(self.residual), self.count)
+        shape = effect(explained, points, _total(self.residual), self.count)
         rest = self.residual - torch.einsum("pvikn,pni->pvkn", self.by_point, moves)
         rings = self._radial()
         known = shape.deviations > shape_deviations
-        radial, smooth = (
+        radial, smooth, skew = (
             self._added(columns, self.residual, self.count).besides(
                 self._added(columns, rest, self.count - points), known
             )
-            for columns in (rings, torch.cat([rings, self._fields()], dim=2))
+            for columns in (rings, torch.cat([rings, self._fields()], dim=2), self._skew())
         )
         bow = self._added(self._bow(), self.residual, self.count)
-        return Leftover(radial, smooth, shape, bow, self._spread(moves))
+        return Leftover(radial, smooth, skew, shape, bow, self._spread(moves))
 
     def _radial(self) -> Tensor:
         off = self.projected - self.middle[:, None, None]
@@ -144,6 +146,10 @@ class _Scores:
         return self._columns(
             [torch.stack(pair, dim=-1) for term in terms for pair in ((term, nothing), (nothing, term))]
         )
+
+    def _skew(self) -> Tensor:
+        down = (self.projected - self.middle[:, None, None])[..., 1]
+        return self._columns([torch.stack([down, torch.zeros_like(down)], dim=-1)])
 
     def _bow(self) -> Tensor:
         return self.by_point[:, :, 2:] * bow_shape(self.task.points)[:, None]
@@ -177,7 +183,7 @@ class _Scores:
         size, turn = torch.linalg.eigh(X.nan_to_num(0.0, 0.0, 0.0))
         free = size > FREE
         explained = torch.where(free, (turn.mT @ y).squeeze(-1).square() / torch.where(free, size, 1.0), 0.0).sum(-1)
-        return _effect(explained, free.sum(-1), _total(residual), count)
+        return effect(explained, free.sum(-1), _total(residual), count)
 
     def _moved_points(self) -> tuple[Tensor, Tensor, Tensor]:
         """What points that move explain `(n,)`, how many unknowns that takes, and the moves `(n, N, 3)`.
@@ -227,7 +233,7 @@ def _chebyshev(x: Tensor, order: int) -> list[Tensor]:
     return waves
 
 
-def _effect(explained: Tensor, unknowns: Tensor, total: Tensor, count: Tensor) -> Effect:
+def effect(explained: Tensor, unknowns: Tensor, total: Tensor, count: Tensor) -> Effect:
     """The F test: `explained` of the sum of squares `total` by some unknowns, of `count` degrees of freedom.
 
     The statistic goes to standard deviations by the cube root that makes F nearly normal (Paulson 1942).

@@ -7,13 +7,15 @@ in iteratively reweighted least squares. All are twice differentiable at `e2 = 0
 Sources: Huber 1964; Triggs, McLauchlan, Hartley and Fitzgibbon 2000, "Bundle adjustment", section 3.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+SMALLEST = 1e-100
+"""The smallest scale; its inverse is the largest. What is computed of their squares is still right."""
 
 
 @runtime_checkable
@@ -34,8 +36,11 @@ class _Scaled:
     scale: float
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.scale, int | float) and math.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"scale: want a positive number in the residual's unit, got {self.scale!r}")
+        if not (isinstance(self.scale, int | float) and SMALLEST <= self.scale <= 1 / SMALLEST):
+            raise ValueError(
+                f"scale: want a positive number in the residual's unit, between {SMALLEST:g} and {1 / SMALLEST:g}, "
+                f"got {self.scale!r}"
+            )
 
 
 class Huber(_Scaled):

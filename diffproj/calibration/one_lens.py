@@ -15,8 +15,10 @@ from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
 
-def calibrated(views: Views, target: Target, distortion: LensModel, chosen: Options) -> Calibration:
-    """What `calibrate` promises, for one lens and checked options."""
+def calibrated(
+    views: Views, target: Target, distortion: LensModel, chosen: Options, who: str = "calibrate"
+) -> Calibration:
+    """What `calibrate` promises, for one lens and checked options; errors name `who` was asked."""
     model = model_named(distortion)
     data = Data(views, target, chosen.weights)
     if views.size is None:
@@ -42,4 +44,4 @@ def calibrated(views: Views, target: Target, distortion: LensModel, chosen: Opti
     found = second_look(found, straight, reject=chosen.outlier_limit, **limits)
     if near is not None:
         found = restrained(found, *near, views.size, reject=chosen.outlier_limit, **limits)
-    return outcome("calibrate", data, found, views.size, chosen.throw)
+    return outcome(who, data, found, views.size, chosen.throw)

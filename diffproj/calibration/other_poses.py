@@ -8,6 +8,7 @@ from diffproj.calibration.ambiguity import OtherPoses, difference
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.noise import Noise, own_noise, pooled
 from diffproj.calibration.parametrisation import Pose
+from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import FEW_CORNERS, posed, tilted_poses, view_costs, weak_perspective
 
 APART = 3.0
@@ -18,6 +19,9 @@ TYPICAL_PX, TYPICAL_FREEDOM = 0.3, 2
 Four corners leave two degrees of freedom: their residuals may all be small by chance."""
 SYNTHETIC_PX = 1e-3
 """Residuals below which corners are no photograph's, and tell their noise alone."""
+TAIL = 3.0
+"""Degrees of freedom of Student's distribution, which stands for corners of which some may be wrong: a loss tells how
+much a wrong corner may pull, and not how often corners are wrong."""
 EXACT_PX = 1e-9
 """Noise in pixels that is assumed at least: residuals below it are rounding errors, and no odds come of them."""
 
@@ -68,8 +72,20 @@ def _other_poses(found: Fit, variance: Tensor, freedom: Tensor) -> tuple[Tensor,
         number = torch.arange(len(p), device=p.device)
         best = tuple(z.index_put((p, v), new[:, taken][chosen, number]) for z, new in zip(best, poses, strict=True))
         cost = cost.index_put((p, v), lowest[taken])
+    if task.loss is not None:
+        here, there = (_improbability(task, shared, poses, variance.unsqueeze(-1)) for poses in (kept, best))
+        ratio = (there - here).nan_to_num(torch.inf).clamp(min=0).exp()
+        return best[0], best[1], torch.where(cost.isfinite(), ratio, torch.inf)
     excess = 2 * (cost - here).clamp(min=0) / (variance * freedom)
     return best[0], best[1], (freedom / 2 * excess.log1p()).exp()
+
+
+def _improbability(task: Task, shared: Tensor, poses: Pose, variance: Tensor) -> Tensor:
+    """Minus the logarithm of the likelihood of each view `(P, V)` where some corners may be wrong, up to a constant."""
+    squared = task.problem.linearise(shared, poses)[:, :, -1].square().sum(2)
+    squared = squared if task.weights is None else squared * task.weights
+    each = (TAIL + 2) / 2 * (squared / (TAIL * variance)).log1p()
+    return torch.where(task.used, each, 0.0).sum(-1)
 
 
 def _noise(found: Fit, known: Noise | None) -> Noise:

@@ -6,16 +6,17 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from diffproj.calibration.adequacy import remarks
 from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.constraints import free_basis, held_at, make_prior
 from diffproj.calibration.covariance import Covariance, reshaped
 from diffproj.calibration.data import Data
+from diffproj.calibration.entangled import Entangled
 from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.noise import Noise, level, noise_of
 from diffproj.calibration.options import Options
 from diffproj.calibration.other_poses import other_poses
 from diffproj.calibration.parametrisation import SKEW, Parametrisation
+from diffproj.calibration.remarks import remarks
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Prior, Status
 from diffproj.calibration.uncertainty import covariance_of
@@ -92,6 +93,7 @@ def outcome(
         size,
     )
 
+    doubt = Entangled(found, status)
     calibration = Calibration(
         camera,
         posed,
@@ -109,19 +111,20 @@ def outcome(
         skew=task.skew,
         degrees_of_freedom=shaped(noise.freedom),
         lens_region=None if known is None else known.region,
-        _covariance=partial(_covariance, found, data, before, known),
+        _covariance=partial(_covariance, found, data, before, known, doubt),
         _others=partial(_others, found, data, before),
-        _remarks=partial(remarks, found, status),
+        _remarks=partial(remarks, found, status, doubt),
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)
     return calibration
 
 
-def _covariance(found: Fit, data: Data, noise: Noise | None, known: Calibration | None) -> Covariance:
+def _covariance(found: Fit, data: Data, noise: Noise | None, known: Calibration | None, doubt: Entangled) -> Covariance:
     batch = tuple(data.batch)
     before = None if known is None or not known.has_covariance else known.covariance_of_kept_poses
     own = covariance_of(found, noise, None if before is None else before.dispersion.expand(batch).reshape(-1))
+    own = doubt.widened(own)
     R = found.solution.local[0].detach()
     own = replace(reshaped(own, batch), middle=data.middle, _arm=(R @ data.middle).reshape(*batch, -1, 3))
     return own if before is None else own.following(before)

@@ -64,7 +64,7 @@ def restrained(
     if len(which) == 0:
         return found
     given = replace(task, used=task.used | found.rejected).part(which)
-    poorer = replace(given, basis=_without(given, below))
+    poorer = given.holding(below)
     start = fit(poorer, shared[which], tuple(z[which] for z in poses), reject=reject, **steps)
     precision = _unit_precision(start, below, size)
     left = torch.arange(len(which), device=which.device)
@@ -90,15 +90,6 @@ def restrained(
         if len(left) == 0:
             break
     return found
-
-
-def _without(task: Task, held: list[int]) -> Tensor:
-    """The basis `(P, s, q)` without some of the shared parameters."""
-    P, s = task.pixels.shape[0], len(task.names)
-    basis = torch.eye(s, dtype=task.pixels.dtype, device=task.pixels.device).expand(P, s, s)
-    basis = (basis if task.basis is None else task.basis).clone()
-    basis[:, held] = 0.0
-    return basis[..., (basis != 0).any(1).any(0)]
 
 
 def _unit_precision(start: Fit, below: list[int], size: tuple[int, int]) -> Tensor:

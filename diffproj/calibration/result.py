@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffproj._core.copying import Copied
 from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
 from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.bow import bowed
@@ -50,7 +51,7 @@ class CalibrationError(RuntimeError):
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(Copied):
     """A camera with the poses of the views that it was found from, and those views.
 
     Many cameras side by side have a batch shape `*B`; for one camera it is empty.

@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffproj._core.numerics import spread_evenly
 from diffproj.calibration import closed_form
 from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.parametrisation import INTRINSICS, Parametrisation, Pose
@@ -59,7 +60,7 @@ def doubtful(found: Fit, rejecting: bool) -> Tensor:
 def correlation(found: Fit) -> Tensor:
     """Correlation of each corner's residual with that of its nearest neighbour on the target `(P,)`, in some views."""
     V = found.task.used.shape[1]
-    some = torch.linspace(0, V - 1, min(V, SAMPLE_VIEWS)).long()
+    some = spread_evenly(V, min(V, SAMPLE_VIEWS), found.task.used.device)
     task = replace(found.task, pixels=found.task.pixels[:, some], used=found.task.used[:, some])
     poses = tuple(z[:, some] for z in found.solution.local)
     residual = task.problem.linearise(found.solution.shared, poses)[:, :, -1]
@@ -167,11 +168,7 @@ def _poorer(task: Task) -> Task | None:
     late = [i for i, name in enumerate(names) if name in task.parameters.coefficient_names[1:]]
     if not late:
         return None
-    P, s = task.pixels.shape[0], len(names)
-    basis = torch.eye(s, dtype=task.pixels.dtype, device=task.pixels.device).expand(P, s, s)
-    basis = (basis if task.basis is None else task.basis).clone()
-    basis[:, late] = 0.0
-    return replace(task, basis=basis[..., (basis != 0).any(1).any(0)])
+    return task.holding(late)
 
 
 def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Tensor, Pose]]:
@@ -182,7 +179,7 @@ def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Ten
     grid = first.new_tensor(FISHEYE_GRID if fisheye else FOCAL_GRID) * unit
     count = min(V, SAMPLE_VIEWS)
     order = task.used.sum(-1).argsort(dim=-1, descending=True, stable=True)
-    sample = order[:, torch.linspace(0, V - 1, count).long()]
+    sample = order[:, spread_evenly(V, count, order.device)]
     costs = torch.stack([_profile(task, straight, grid[i].expand(P), sample) for i in range(len(grid))])
     best = _lowest(costs)
     starts = []

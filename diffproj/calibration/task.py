@@ -69,6 +69,14 @@ class Task:
         kind = BoardError if self.objective == "plane" else Reprojection
         return kind(self.points, self.pixels, self.used, self.lens, self.bow, self.skew)
 
+    def holding(self, where: list[int]) -> "Task":
+        """The same with some of the shared parameters held, by their positions."""
+        P, s = self.pixels.shape[0], len(self.names)
+        basis = torch.eye(s, dtype=self.pixels.dtype, device=self.pixels.device).expand(P, s, s)
+        basis = (basis if self.basis is None else self.basis).clone()
+        basis[:, where] = 0.0
+        return replace(self, basis=basis[..., (basis != 0).any(1).any(0)])
+
     def part(self, where: slice | Tensor) -> "Task":
         """The task of some of the cameras."""
         cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}
@@ -104,6 +112,15 @@ def solved(
     return parts[0] if len(parts) == 1 else _joined(parts)
 
 
+def _scale(task: Task, unit: float) -> float:
+    """What a residual of `unit` costs, over its square: little with small weights, or a loss of a small scale."""
+    scale = 1.0 if task.weights is None else float(task.weights.flatten(1).amax(1).amin())
+    if task.loss is not None:
+        squared = torch.full((1,), unit**2, dtype=torch.float64, device=task.used.device)
+        scale *= float(task.loss.value(squared)) / unit**2
+    return scale
+
+
 def _solved(task: Task, shared: Tensor, local: tuple[Tensor, ...], **options: Any) -> Solution:
     size = task.used.sum((-2, -1)).amax().clamp(min=1).item()
     unit = NEGLIGIBLE_PX if task.objective == "image" else 1e-13 * float(task.points.abs().amax())
@@ -119,7 +136,7 @@ def _solved(task: Task, shared: Tensor, local: tuple[Tensor, ...], **options: An
         loss=task.loss,
         prior=task.prior,
         basis=task.basis,
-        negligible=size * unit**2,
+        negligible=size * _scale(task, unit) * unit**2,
         **options,
     )
     if task.shares is None:

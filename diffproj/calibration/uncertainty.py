@@ -99,7 +99,7 @@ def _on_the_plane(found: Fit) -> tuple[Equations, Scores]:
     squared = residual.square().sum(2)
     slope, bend = slope_and_bend(found.task.loss, squared)
     both = (weight * slope).unsqueeze(2)
-    spread = found.task.used.sum((-2, -1)) * 2 / found.degrees_of_freedom().clamp(min=1)
+    spread = found.task.used.to(residual).sum((-2, -1)) * 2 / found.degrees_of_freedom().clamp(min=1)
     M = (score * both.square()) @ score.mT * spread[:, None, None, None]
     curved = (score * (2 * weight * bend).unsqueeze(2)) @ score.mT
     return _equations(found, rows, weight * slope, curved), _scores(found, M)

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.distinct import alike
 from diffproj.calibration.held_out import errors_of, folds_of, repeated, without_views
+from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.options import CalibrationOptions, calibration_options
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.lens.models import LensModel
@@ -99,7 +99,7 @@ def cross_validate(
         raise ValueError(f"folds: want a whole number from 2 to the number of views, {len(views)}, got {folds}")
     _check_lens(distortion)
     chosen = calibration_options("cross_validate", options)
-    fits, errors = without_views(views, target, distortion, folds_of(views, folds), chosen)
+    fits, errors = without_views(views, target, distortion, folds_of(views, folds), chosen, who="cross_validate")
     held_out_px, held_out_world, lost = errors.over_views()
     in_sample_px, in_sample_world, _ = errors_of(fits, fits.views.pixels, fits.used).over_views()
     parts = in_sample_px, held_out_px, in_sample_world, held_out_world
@@ -150,18 +150,19 @@ def bootstrap(
     _check_lens(distortion)
     if "weights" in options:
         raise ValueError("weights: want none, for they count here how often a view was drawn")
+    chosen = calibration_options("bootstrap", options)
     generator = torch.Generator().manual_seed(seed)
     group = _groups(views, target)
     number = int(group.amax()) + 1
     if number < 2:
         alone = "one" if len(views) == 1 else f"{len(views)} alike"
         raise ValueError(f"views: want some that show the board differently, got {alone}")
-    drawn = torch.randint(number, (draws, number), generator=generator).to(views.device)
+    drawn = torch.randint(number, (draws, number), generator=generator, device="cpu").to(views.device)
     counts = torch.nn.functional.one_hot(drawn, number).sum(1).to(torch.float64)[:, group]
     every = repeated(views, draws)
     hidden = (counts == 0).unsqueeze(-1).expand(every.visible.shape)
-    options |= {"weights": counts.unsqueeze(-1), "throw": False}
-    found = calibrate(every.hiding(hidden), target, distortion, **options)
+    chosen = chosen.but(weights=counts.unsqueeze(-1), throw=False)
+    found = calibrated(every.hiding(hidden), target, distortion, chosen, "bootstrap")
     kept = found.converged
     if int(kept.sum()) < max(2, draws // 2):
         raise CalibrationError(f"bootstrap: {int(kept.sum())} of {draws} draws determine the camera; add views", found)

@@ -27,6 +27,9 @@ PARALLEL_ANGLE = math.radians(15)
 """Angle between boards below which they count as parallel: they hardly determine the focal length, and the tilt
 found is arbitrary."""
 
+NEARLY_NONE, MOST = 1e-3, 0.9
+"""Weight below which a robust loss leaves nearly nothing of a corner, and the share of such corners that is most."""
+
 ONE_VIEW = (
     "one view does not tell the focal length from the principal point, the lens and the unevenness of the board: add "
     "views with the board tilted by 20 to 50 degrees about both axes, or let fixed or priors hold the principal point "
@@ -68,6 +71,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     causes = [""] * len(status)
     if not bool(status.any()):
         return status, tuple(causes)
+    swamped = _swamped(found)
     for p in status.nonzero().flatten().tolist():
         if bool(none[p]):
             causes[p] = "no view shows at least 4 corners"
@@ -77,6 +81,11 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
                 "coefficients, or take objective='image'"
                 if task.objective == "plane" and bool(task.pixels[p][task.used[p]].isfinite().all())
                 else "the corners are not finite, or the start puts the board behind the camera"
+            )
+        elif bool(swamped[p]):
+            causes[p] = (
+                "the scale of the loss is so far below the residuals that nearly every corner counts as an outlier: "
+                "give it about twice the noise of a corner, in the residual's unit"
             )
         elif status[p] == Status.DIVERGED:
             continue
@@ -108,6 +117,16 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
             free = task.basis is None or bool(task.basis[p, 2:4].any())
             causes[p] = _undetermined(lacking, R[p, used[p]], _foreshortening(seen)[0, used[p]], free)
     return status, tuple(causes)
+
+
+def _swamped(found: Fit) -> Tensor:
+    """Which cameras are fitted by a robust loss under which nearly no corner counts `(P,)`."""
+    task = found.task
+    if task.loss is None:
+        return torch.zeros_like(found.solution.status, dtype=torch.bool)
+    residual = task.problem.linearise(found.solution.shared, found.solution.local)[:, :, -1]
+    outlying = task.used & (task.loss.weight(residual.square().sum(2)) < NEARLY_NONE)
+    return outlying.sum((-2, -1)) > MOST * task.used.sum((-2, -1))
 
 
 def _leans_on_one_view(task: Task) -> Tensor:

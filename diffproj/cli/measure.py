@@ -127,8 +127,8 @@ def run(command: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     sigma = scene.calibration.pixel_sigma if options.pixel_sigma is None else options.pixel_sigma
     if sigma is None or not math.isfinite(sigma):
         raise ValueError(f"--pixel-sigma: want the noise of the pixels in px, for {options.camera} does not tell it")
-    plane = Plane(torch.tensor(options.plane[:3], dtype=torch.float64), options.plane[3])
-    pixels = torch.tensor(options.points, dtype=torch.float64)
+    plane = Plane(torch.tensor(options.plane[:3], dtype=torch.float64, device="cpu"), options.plane[3])
+    pixels = torch.tensor(options.points, dtype=torch.float64, device="cpu")
     measured = measure(pixels, scene.calibration, plane, scene.view, options.pixel_sigma)
     found = document(scene, plane, float(sigma), pixels, measured)
     if options.json:

@@ -68,10 +68,10 @@ def read_calibration(path: Path) -> Calibration | None:
     try:
         found = document["calibration"]
         R, t, points, pixels = (_tensor(found[key], torch.float64) for key in ("R", "t", "points", "pixels"))
-        visible = torch.tensor(found["visible"], dtype=torch.bool)
+        visible = torch.tensor(found["visible"], dtype=torch.bool, device="cpu")
         views = Views(pixels, visible, found["names"], _size(found["size"]))
-        used, rejected = (torch.tensor(found[key], dtype=torch.bool) for key in ("used", "rejected"))
-        status, iterations = (torch.tensor(found[key]) for key in ("status", "iterations"))
+        used, rejected = (torch.tensor(found[key], dtype=torch.bool, device="cpu") for key in ("used", "rejected"))
+        status, iterations = (torch.tensor(found[key], device="cpu") for key in ("status", "iterations"))
         bow = None if found["bow"] is None else _tensor(found["bow"], torch.float64)
         posed = camera if not camera.batch_shape else camera[..., None]
         covariance = None if found["covariance"] is None else Covariance.from_fields(found["covariance"])
@@ -215,4 +215,4 @@ def _size(size: list[int] | None) -> tuple[int, int] | None:
 
 
 def _tensor(numbers: Any, dtype: torch.dtype) -> Tensor:
-    return torch.tensor(numbers, dtype=dtype)
+    return torch.tensor(numbers, dtype=dtype, device="cpu")

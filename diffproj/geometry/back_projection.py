@@ -27,10 +27,10 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from diffproj._core.batched import register_pytree
+from diffproj._core.copying import Copied
 from diffproj._core.numerics import (
     broadcast_batches,
     check_same_kind,
-    check_tensor,
     dot,
     entries,
     in_blocks,
@@ -43,6 +43,7 @@ from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.geometry.intrinsics import pixel_to_normalized
 from diffproj.geometry.plane import Plane
+from diffproj.lens.slopes import by_direction
 
 
 class Reason(enum.IntEnum):
@@ -62,7 +63,7 @@ class Reason(enum.IntEnum):
     """The ray meets the plane behind the camera."""
 
 
-class PlaneMap:
+class PlaneMap(Copied):
     """The map from pixels to points of a plane, built once for a camera and a plane and then applied at will.
 
     `back_project` builds one for each call; keep one where camera and plane stay as they are. It is a PyTree.
@@ -94,6 +95,16 @@ class PlaneMap:
             TypeError: not a camera and a plane, or of different dtypes.
             ValueError: different devices, or batch shapes that do not broadcast.
         """
+        self._build(camera, plane, warn=True)
+
+    @classmethod
+    def quietly(cls, camera: Camera, plane: Plane) -> "PlaneMap":
+        """The same without a warning of rounding: for who builds a map again and again, and has warned before."""
+        plane_map = cls.__new__(cls)
+        plane_map._build(camera, plane, warn=False)
+        return plane_map
+
+    def _build(self, camera: Camera | PinholeCamera, plane: Plane, warn: bool) -> None:
         camera = as_camera(camera)
         if not isinstance(plane, Plane):
             raise TypeError(f"plane: want a dp.Plane, got {type(plane).__name__}")
@@ -102,7 +113,7 @@ class PlaneMap:
         if plane.is_per_point:
             camera = camera[..., None]
         broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape)
-        self.matrix = _plane_matrix(camera, plane).to(camera.dtype)
+        self.matrix = _plane_matrix(camera, plane, warn).to(camera.dtype)
         self.camera, self.is_per_point = camera, plane.is_per_point
 
     @classmethod
@@ -124,27 +135,73 @@ class PlaneMap:
         points, valid = in_blocks(to_plane, self._checked(pixels), self.matrix, *self.camera.tensors())
         return (points.squeeze(-2), valid.squeeze(-1)) if self.is_per_point else (points, valid)
 
+    def resolution(
+        self, pixels: Float[Tensor, "*#batch n 2"]
+    ) -> tuple[Float[Tensor, "*#batch n"], Bool[Tensor, "*#batch n"]]:
+        """World units that a pixel covers `(*B, N)`, and `valid (*B, N)`; see the function `ground_resolution`."""
+        rows = entries(self.matrix)
+
+        def resolution(pixels: Tensor) -> tuple[Tensor, Tensor]:
+            return self._resolution(pixels, rows)
+
+        found, valid = in_blocks(resolution, self._checked(pixels), self.matrix, *self.camera.tensors())
+        return (found.squeeze(-1), valid.squeeze(-1)) if self.is_per_point else (found, valid)
+
     def explain(self, pixels: Float[Tensor, "*#batch n 2"]) -> Int[Tensor, "*#batch n"]:
         """`Reason` codes `(*B, N)` of pixels `(*B, N, 2)`; see the function `explain`."""
         (reasons,) = in_blocks(self._explain, self._checked(pixels), self.matrix, *self.camera.tensors())
         return reasons.squeeze(-1) if self.is_per_point else reasons
 
     def _to_plane(self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
+        _, points, _, valid = self._intersection(pixels, rows)
+        return interleaved(points), valid
+
+    def _intersection(
+        self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]
+    ) -> tuple[list[Tensor | None], list[Tensor], Tensor, Tensor]:
+        """The components of `p`, those of the points, `1 / (b . p)`, and which are valid; 0 where they are not."""
         sight, seen = self._sight(pixels)
-        denominator, threshold = _denominator(rows[3], sight)
+        denominator, threshold = _denominator(self.matrix, rows[3], sight)
         valid = denominator > threshold  # false for NaN, too
         if seen is not None:
             valid = valid & seen
         # Where there is no point, the denominator becomes infinite and p finite before anything is divided, so that
         # neither values nor gradients of infinite or parallel rays ever arise.
-        sight = [component if component is None else component.nan_to_num(0.0, 0.0, 0.0) for component in sight]
+        sight = [component if component is None else torch.where(valid, component, 0.0) for component in sight]
         *numerators, denominator = linear(rows, sight)
         inverse = torch.where(valid, denominator, torch.inf).reciprocal()
-        return interleaved([numerator * inverse for numerator in numerators]), valid
+        return sight, [numerator * inverse for numerator in numerators], inverse, valid
+
+    def _resolution(self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
+        """See `ground_resolution`."""
+        sight, points, inverse, valid = self._intersection(pixels, rows)
+        steps = self._sight_slopes(sight, valid, rows)
+        by_u, by_v = (
+            torch.stack([(along - point * fall) * inverse for along, point in zip(step[:3], points, strict=True)], -1)
+            for step in steps
+            for fall in step[3:]
+        )
+        return _largest_singular_value(by_u, by_v), valid
+
+    def _sight_slopes(
+        self, sight: Sequence[Tensor | None], valid: Tensor, rows: Sequence[Sequence[Tensor]]
+    ) -> list[list[Tensor]]:
+        """The derivatives of `M p` by u and by v: four components each, to within a multiple of `M p` itself."""
+        x, y, z = sight
+        if x is None or y is None or z is None:  # a pinhole, where p follows the pixel
+            return [[row[axis] for row in rows] for axis in (0, 1)]
+        direction = torch.stack([x, y, torch.where(valid, z, 1.0)], dim=-1)
+        # The distorted point does not change along p: any step does that moves it by what the pixel's step asks.
+        g, h = by_direction(self.camera.distortion, direction).unbind(-2)
+        toward, across = torch.linalg.cross(h, direction), torch.linalg.cross(direction, g)
+        volume = dot(g, toward).unsqueeze(-1)
+        F_inverse = pixel_to_normalized(self.camera.K).unsqueeze(-3)
+        steps = ((F_inverse[..., :1, axis] * toward + F_inverse[..., 1:, axis] * across) / volume for axis in (0, 1))
+        return [linear(rows, step.unbind(-1)) for step in steps]
 
     def _explain(self, pixels: Tensor) -> tuple[Tensor]:
         sight, seen = self._sight(pixels)
-        denominator, threshold = _denominator(entries(self.matrix)[3], sight)
+        denominator, threshold = _denominator(self.matrix, entries(self.matrix)[3], sight)
         reasons = torch.where(denominator > threshold, Reason.VALID, Reason.PARALLEL)
         reasons = torch.where(denominator < -threshold, Reason.BEHIND, reasons)
         reasons = torch.where((self.matrix[..., 3, :] == 0).all(dim=-1, keepdim=True), Reason.CAMERA_ON_PLANE, reasons)
@@ -246,32 +303,55 @@ def ground_resolution(
     Returns:
         `(*B, N)`, 0 where not valid; and `valid (*B, N)`.
 
+    The gradient is that of the worst direction's; where all directions are alike, as straight above the plane, that of
+    their mean.
+
+    Raises:
+        TypeError: as `back_project`.
+        ValueError: as `back_project`.
+
     Example:
         >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
         >>> ground_resolution(torch.tensor([[320.0, 240.0]]), Camera(K, t=torch.tensor([0.0, 0, 1000])), Plane.z(0.0))
         (tensor([2.]), tensor([True]))
     """
-    to_plane = PlaneMap(camera, plane)
-    pixels = check_tensor("pixels", pixels, "N", 2)
-    right, down = torch.zeros_like(pixels), torch.zeros_like(pixels)
-    right[..., 0], down[..., 1] = 1.0, 1.0
-    (_, valid), (by_u, _) = torch.func.jvp(to_plane, (pixels,), (right,))[:2]
-    by_v = torch.func.jvp(to_plane, (pixels,), (down,))[1][0]
-    # The larger singular value of the 3 x 2 Jacobian, from its 2 x 2 Gram matrix.
-    a, b, c = (by_u * by_u).sum(-1), (by_u * by_v).sum(-1), (by_v * by_v).sum(-1)
-    spread = torch.hypot((a - c) / 2, b)
-    return ((a + c) / 2 + spread).sqrt(), valid
+    return PlaneMap(camera, plane).resolution(pixels)
 
 
-def _denominator(b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
-    """`b . p`, and the size below which rounding decides its sign."""
-    terms = [entry if component is None else component * entry for component, entry in zip(sight, b, strict=True)]
-    threshold = (terms[0].abs() + terms[1].abs() + terms[2].abs()) * rounding(terms[0].dtype)
-    return terms[0] + terms[1] + terms[2], threshold
+def warn_if_rounded(camera: Camera, plane: Plane) -> None:
+    """Warn where float32 rounds the places that a camera sees on a plane visibly; see `warn_of_rounding`."""
+    if looks_at_rounding(camera.t):
+        with torch.no_grad():
+            plane = plane.like(camera.K)
+            length = plane.length
+            height = (dot(plane.normal, camera.center) - plane.offset).abs()
+            warn_of_rounding(plane.offset.abs() + length * vector_norm(camera.t, dim=-1), height)
 
 
-def _plane_matrix(camera: Camera, plane: Plane) -> Tensor:
-    """`M (*B, 4, 3)` in float64, scaled to `max |M| = 1`; zero where the camera's centre lies in the plane."""
+def _largest_singular_value(by_u: Tensor, by_v: Tensor) -> Tensor:
+    """Of 3 x 2 matrices with these columns `(*B, n, 3)`, from their 2 x 2 Gram matrices; 0, with no slope, of zeros."""
+    size = torch.maximum(by_u.detach().abs().amax(-1), by_v.detach().abs().amax(-1))
+    size = torch.where(size > 0, size, 1.0)  # squares of 1e-25 are 0 in float32
+    by_u, by_v = by_u / size.unsqueeze(-1), by_v / size.unsqueeze(-1)
+    a, b, c = dot(by_u, by_u), dot(by_u, by_v), dot(by_v, by_v)
+    apart = (a != c) | (b != 0)
+    spread = torch.where(apart, torch.hypot(torch.where(apart, (a - c) / 2, 1.0), torch.where(apart, b, 0.0)), 0.0)
+    squared = (a + c) / 2 + spread
+    some = squared > 0
+    return torch.where(some, torch.where(some, squared, 1.0).sqrt(), 0.0) * size
+
+
+def _denominator(matrix: Tensor, b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
+    """`b . p`, and the size below which rounding decides its sign: that of its terms, and of what b was built from."""
+    size = matrix[..., 3, :].detach().abs()
+    size = (size + size.amax(-1, keepdim=True) * torch.finfo(size.dtype).eps) * rounding(size.dtype)
+    bounds = size.unsqueeze(-1).unbind(-2)
+    threshold = linear([bounds], [component if component is None else component.detach().abs() for component in sight])
+    return linear([b], sight)[0], threshold[0]
+
+
+def _plane_matrix(camera: Camera, plane: Plane, warn: bool) -> Tensor:
+    """`M (*B, 4, 3)` in float64, scaled to `max |M| = 1/4`; zero where the camera's centre lies in the plane."""
     R, t = in_float64(camera.R), in_float64(camera.t)
     normal, offset = in_float64(plane.normal), in_float64(plane.offset)
     b = dot(R, normal.unsqueeze(-2))  # the normal in the camera frame: n . C = -b . t
@@ -284,9 +364,10 @@ def _plane_matrix(camera: Camera, plane: Plane) -> Tensor:
         M = torch.cat([(M[..., :2].unsqueeze(-1) * F_inverse.unsqueeze(-3)).sum(dim=-2), M[..., 2:]], dim=-1)
     with torch.no_grad():  # the factor changes no point, so no derivative has to pass through it
         reach, distance = offset.abs() + vector_norm(b, dim=-1) * vector_norm(t, dim=-1), height.abs()
-        factor = M.abs().amax(dim=(-2, -1)).reciprocal().copysign(height)
+        # A quarter, so that no pixel is large enough for a sum of three products to overflow.
+        factor = (0.25 / M.abs().amax(dim=(-2, -1))).copysign(height)
         factor = torch.where(distance > rounding(camera.dtype) * reach, factor, 0.0)
-        if looks_at_rounding(camera.t):
+        if warn and looks_at_rounding(camera.t):
             warn_of_rounding(reach, distance)
     return M * factor[..., None, None]
 

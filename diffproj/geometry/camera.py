@@ -9,6 +9,7 @@ A world point reaches its pixel in three steps, and a pixel goes back by the sam
 `F` may be any invertible 2x2 matrix: skew, or an image that an augmentation has turned, stays exact.
 """
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,22 +22,30 @@ from torch.utils._pytree import tree_leaves
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
     broadcast_batches,
+    check_number,
     check_same_kind,
     check_tensor,
     dot,
     entries,
     has_values,
     in_blocks,
+    least_depth,
     linear,
     transform,
 )
 from diffproj.geometry.exchange import Exchange
+from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounded_pixels
 from diffproj.geometry.grid import checked_size, inside
 from diffproj.geometry.intrinsics import check_intrinsics, check_warp, pixel_to_normalized, warped
 from diffproj.lens.protocol import Lens
 
 ROTATION_TOLERANCE = 1e-5
 """How far `R^T R` may be from the identity, entry by entry, where a user hands a camera in."""
+ROUNDED_ASPECT = 1.1
+"""Factor by which rounding to whole pixels may change the aspect of an image."""
+
+SQUARED = 0.45
+"""The power of the largest number up to which a pixel counts as finite: its square, and what is left of it, are."""
 
 
 class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distortion",), constants=("size",)):
@@ -167,10 +176,12 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         Each axis has its own scale, so that sides rounded to whole pixels stay exact.
 
         Args:
-            size: `(width, height)` of the resized image, its aspect that of the camera's to within a pixel.
+            size: `(width, height)` of the resized image, its aspect that of the camera's to within a pixel, and a
+                tenth.
             stretched: whether the whole image was stretched to another aspect, as networks of a fixed input size do.
 
         Raises:
+            TypeError: the size is not two whole numbers.
             ValueError: the camera does not know its own size, or another aspect. A camera's video mode of another
                 aspect shows a part of the sensor: crop first.
 
@@ -184,10 +195,14 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             raise ValueError(
                 "resized: want a camera with a size, got size=None; give Camera(..., size=(width, height))"
             )
+        if size is None:
+            raise TypeError("size: want (width, height) of the resized image, got None")
         width, height = checked_size(size) or self.size
         scale = (width / self.size[0], height / self.size[1])
         # Rounding moves each side by a pixel at most: is there one scale that both may have been rounded from?
-        if abs(scale[0] - scale[1]) > 1 / self.size[0] + 1 / self.size[1] and not stretched:
+        # Of a few pixels it would leave no aspect at all: there is a limit to what it may change.
+        rounded = abs(scale[0] - scale[1]) <= 1 / self.size[0] + 1 / self.size[1]
+        if not (rounded and max(scale) <= ROUNDED_ASPECT * min(scale)) and not stretched:
             raise ValueError(
                 f"resized: want the aspect of {self.size[0]} x {self.size[1]} px, got {width} x {height}; where the "
                 "image shows a part of the camera's, use cropped(left, top, width, height) first; where all of it was "
@@ -198,7 +213,14 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         return self._with(K=self.K * factors + shift, size=(width, height))
 
     def cropped(self, left: float, top: float, width: int, height: int) -> "Camera":
-        """The camera of the crop whose first pixel was pixel `(left, top)`: the principal point moves along."""
+        """The camera of the crop whose first pixel was pixel `(left, top)`: the principal point moves along.
+
+        Raises:
+            TypeError: `left` or `top` is no number, or width and height are not whole.
+            ValueError: `left` or `top` is not finite, or width or height is not positive.
+        """
+        for name, number in (("left", left), ("top", top)):
+            check_number(name, number)
         shift = self.K.new_tensor([[0, 0, left], [0, 0, top], [0, 0, 0]])
         return self._with(K=self.K - shift, size=checked_size((width, height)))
 
@@ -280,8 +302,16 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             ValueError: wrong shape or device, or batch shapes that do not broadcast.
         """
         points = self._checked("points", points, 3)
+        if looks_at_rounding(self.t):
+            warn_of_rounded_pixels(self.K, self.R, self.t, points)
+        return self._project(points)
+
+    def _project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """`project` of points that were checked, without a warning of rounding."""
 
         def project(points: Tensor) -> tuple[Tensor, Tensor]:
+            finite = points.detach().sum(-1).isfinite()
+            points = points.nan_to_num(0.0, 0.0, 0.0)  # the slope by R is the point, and 0 times infinity is NaN
             rotated = linear(entries(self.R), points.unbind(-1))
             direction = [x + shift.unsqueeze(-1) for x, shift in zip(rotated, self.t.unbind(-1), strict=True)]
             if self.distortion is None:
@@ -289,6 +319,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             else:
                 xy_lens, valid = self.distortion.project_direction(torch.stack(direction, dim=-1))
                 xy = list(xy_lens.unbind(-1))
+            valid = valid & finite
             uv = linear(entries(self.K[..., :2, :]), [*xy, None])
             return torch.stack([torch.where(valid, x, 0.0) for x in uv], dim=-1), valid
 
@@ -312,7 +343,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             ValueError: wrong shape or device, or batch shapes that do not broadcast.
         """
         pixels = self._checked("pixels", pixels, 2)
-        finite = pixels.isfinite().all(dim=-1)
+        finite = (pixels.abs() < torch.finfo(pixels.dtype).max ** SQUARED).all(dim=-1)
         offset = torch.where(finite.unsqueeze(-1), pixels - self.K[..., None, :2, 2], 0.0)
         xy = transform(pixel_to_normalized(self.K), offset)
         if self.distortion is None:
@@ -366,16 +397,18 @@ def as_camera(camera: Camera | PinholeCamera) -> Camera:
         return camera
     if isinstance(camera, PinholeCamera):
         return Camera.from_kornia(camera)
-    raise TypeError(f"camera: want dp.Camera or kornia's PinholeCamera, got {type(camera).__name__}")
+    remedy = "; load it with dp.load_camera(path)" if isinstance(camera, str | os.PathLike) else ""
+    raise TypeError(f"camera: want dp.Camera or kornia's PinholeCamera, got {type(camera).__name__}{remedy}")
 
 
 def _pinhole(direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
     """Perspective division, valid where the point is finite and in front."""
     x, y, z = direction
-    reach = x.abs() + y.abs()
-    valid = (z > torch.finfo(z.dtype).eps * reach) & (reach + z).isfinite()
-    inverse_depth = torch.where(valid, z, 1.0).reciprocal()
-    return [torch.where(valid, component, 0.0) * inverse_depth for component in (x, y)], valid
+    reach, limits = x.abs() + y.abs(), torch.finfo(z.dtype)
+    # Derivatives hold 1 / z, which must not overflow; and x / z, not x times 1 / z, whose derivative would sooner.
+    valid = (z > limits.eps * reach + least_depth(z.dtype)) & (reach + z).isfinite()
+    depth = torch.where(valid, z, 1.0)
+    return [torch.where(valid, component, 0.0) / depth for component in (x, y)], valid
 
 
 def is_rotation(R: Float[Tensor, "*shape 3 3"]) -> Bool[Tensor, "*shape"]:

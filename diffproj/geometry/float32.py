@@ -8,13 +8,13 @@ from torch.linalg import vector_norm
 
 from diffproj._core.numerics import dot, has_values, rounding
 from diffproj._core.warn import warn_caller
-from diffproj.geometry.camera import Camera
-from diffproj.geometry.plane import Plane
 
 VISIBLE = 1e-4
 """Rounding, as a part of the camera's distance from the plane, from which on it is warned of: a tenth of a pixel seen
 from straight above at a focal length of 1000 px."""
 STEP = torch.finfo(torch.float32).eps
+SOME = 8
+"""About how many points are looked at."""
 
 
 def looks_at_rounding(t: Tensor) -> bool:
@@ -43,11 +43,27 @@ def warn_of_rounding(reach: Tensor, height: Tensor) -> None:
         )
 
 
-def warn_if_rounded(camera: Camera, plane: Plane) -> None:
-    """The same for a camera and a plane."""
-    if looks_at_rounding(camera.t):
-        with torch.no_grad():
-            plane = plane.like(camera.K)
-            length = vector_norm(plane.normal, dim=-1)
-            height = (dot(plane.normal, camera.center) - plane.offset).abs()
-            warn_of_rounding(plane.offset.abs() + length * vector_norm(camera.t, dim=-1), height)
+@torch.no_grad()
+def warn_of_rounded_pixels(K: Tensor, R: Tensor, t: Tensor, points: Tensor) -> None:
+    """Warn where float32 rounds pixels visibly, by a look at a few of the points.
+
+    Args:
+        K: intrinsics `(*B, 3, 3)`.
+        R: rotation world to camera `(*B, 3, 3)`.
+        t: translation world to camera `(*B, 3)`.
+        points: in the world `(*B, N, 3)`.
+    """
+    some = points[..., :: max(1, points.shape[-2] // SOME), :]
+    away = (dot(R.unsqueeze(-3), some.unsqueeze(-2)) + t.unsqueeze(-2)).square().sum(-1).sqrt()
+    share = STEP * vector_norm(t, dim=-1).unsqueeze(-1) / away
+    if not bool((share > VISIBLE).any()):  # the usual case ends here
+        return
+    usual = share.nanmedian(-1, keepdim=True).values  # one point close to the camera tells nothing
+    doubtful = (usual > VISIBLE) & usual.isfinite()
+    if bool(doubtful.any()):
+        off = float(torch.where(doubtful, usual * K[..., :1, 0].abs(), 0.0).amax())
+        warn_caller(
+            "float32: the scene is so far from the world's origin that rounding moves pixels by "
+            f"{10.0 ** math.floor(math.log10(off)):g} px or more; use float64 for camera and points, from the start, "
+            "or an origin near the scene"
+        )

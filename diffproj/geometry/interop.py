@@ -29,7 +29,7 @@ def tensors_from_opencv(
     Raises:
         ValueError: a vector is neither `(*B, k)` nor a row or column.
     """
-    kind = K if isinstance(K, Tensor) else torch.empty(0, dtype=torch.float64)
+    kind = K if isinstance(K, Tensor) else torch.empty(0, dtype=torch.float64, device="cpu")
     K = _tensor(K, kind)
     batch = K.shape[:-2]
     coefficients = None if dist is None else _vector("dist", _tensor(dist, kind), batch)
@@ -99,7 +99,7 @@ def pinhole_from_tensors(K: Tensor, R: Tensor, t: Tensor, size: tuple[int, int])
 def _tensor(value: ArrayLike, kind: Tensor) -> Tensor:
     if isinstance(value, Tensor):
         return value
-    return torch.as_tensor(np.asarray(value, dtype=np.float64)).to(kind)
+    return torch.tensor(np.asarray(value, dtype=np.float64), dtype=kind.dtype, device=kind.device)
 
 
 def _array(tensor: Tensor) -> np.ndarray:

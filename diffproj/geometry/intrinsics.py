@@ -44,7 +44,8 @@ def upright(
     """
     a, b, c, d = K[..., :2, :2].flatten(-2).unbind(-1)
     mirrored = a * d < b * c
-    f_y = torch.hypot(c, d) * torch.where(mirrored & (d < 0), -1.0, 1.0)
+    f_y = torch.hypot(c, d)
+    f_y = torch.where(mirrored & (d < 0), -f_y, f_y)
     cosine, sine = d / f_y, c / f_y
     f_x, skew = a * cosine - b * sine, a * sine + b * cosine
     skew = torch.where(skew.abs() <= rounding(K.dtype) * (f_x.abs() + f_y.abs()), 0.0, skew)

@@ -17,6 +17,7 @@ from torch import Tensor
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
     broadcast_batches,
+    check_number,
     check_same_kind,
     check_tensor,
     dot,
@@ -150,6 +151,8 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
             raise ValueError("points: want finite values, got NaN or infinity")
         centroid = points.mean(dim=-2)
         spread = points - centroid.unsqueeze(-2)
+        size = spread.detach().abs().amax((-2, -1), keepdim=True)
+        spread = spread / torch.where(size > 0, size, 1.0)  # the normal is the same, and no square overflows
         scatter = (spread.unsqueeze(-1) * spread.unsqueeze(-2)).sum(dim=-3)
         normal = _smallest_eigenvector(scatter)
         sign = normal.detach().gather(-1, normal.detach().abs().argmax(dim=-1, keepdim=True)).sign()
@@ -189,7 +192,24 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
     @property
     def unit_normal(self) -> Float[Tensor, "*batch 3"]:
         """The normal scaled to length 1."""
-        return self.normal / self.normal.norm(dim=-1, keepdim=True)
+        return self.normalised()[0]
+
+    def normalised(self) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
+        """The unit normal `(*B, 3)`, and the plane's signed distance from the world's origin along it `(*B,)`."""
+        normal, size = self._sized()
+        length = normal.norm(dim=-1, keepdim=True)
+        return normal / length, self.offset / size.squeeze(-1) / length.squeeze(-1)
+
+    @property
+    def length(self) -> Float[Tensor, "*batch"]:
+        """The length of the normal."""
+        normal, size = self._sized()
+        return normal.norm(dim=-1) * size.squeeze(-1)
+
+    def _sized(self) -> tuple[Tensor, Tensor]:
+        """The normal in units of its largest component, and this `(*B, 1)`: the square of 1e20 overflows in float32."""
+        size = self.normal.detach().abs().amax(-1, keepdim=True)
+        return self.normal / size, size
 
     def tangents(self) -> Float[Tensor, "*batch 3 2"]:
         """Two unit vectors of the plane at right angles to each other and to the normal, as columns `(*B, 3, 2)`.
@@ -201,19 +221,28 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
             >>> Plane.z(0.0).tangents().T.tolist()
             [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
         """
-        furthest = torch.nn.functional.one_hot(self.normal.abs().argmin(dim=-1), 3).to(self.normal)
-        first = torch.nn.functional.normalize(torch.linalg.cross(self.normal, furthest), dim=-1)
-        second = torch.nn.functional.normalize(torch.linalg.cross(self.normal, first), dim=-1)
+        normal, _ = self._sized()
+        furthest = torch.nn.functional.one_hot(normal.abs().argmin(dim=-1), 3).to(normal)
+        first = torch.nn.functional.normalize(torch.linalg.cross(normal, furthest), dim=-1)
+        second = torch.nn.functional.normalize(torch.linalg.cross(normal, first), dim=-1)
         return torch.stack([first, second], dim=-1)
 
     def parallel(self, distance: Float[Tensor, "*#batch"] | float) -> "Plane":
         """The parallel plane at a signed distance along the normal, in world units.
 
+        Raises:
+            TypeError: the distance is no number and no tensor.
+            ValueError: it is not finite (checked where values can be read).
+
         Example:
             >>> Plane([0.0, 0.0, -2.0], 0.0).parallel(3.0)  # the normal points down
             Plane(normal=[0.0, 0.0, -2.0], offset=6)
         """
-        offset = self.offset + distance * self.normal.norm(dim=-1)
+        if not isinstance(distance, Tensor):
+            check_number("distance", distance)
+        elif has_values(distance) and not bool(distance.isfinite().all()):
+            raise ValueError("distance: want finite numbers, got NaN or infinity")
+        offset = self.offset + distance * self.length
         normal = self.normal.expand(*offset.shape, 3)
         return self.unchecked(normal, offset, self.is_per_point, self.adopts and not isinstance(distance, Tensor))
 
@@ -222,26 +251,33 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         plane = self.like(points)
         points = check_tensor("points", points, "N", 3)
         check_same_kind(plane=plane.normal, points=points)
-        normal, offset = plane.unit_normal, plane.offset / plane.normal.norm(dim=-1)
+        normal, offset = plane.normalised()
         if not self.is_per_point:
             normal, offset = normal.unsqueeze(-2), offset.unsqueeze(-1)
         return dot(points, normal) - offset
 
     def rms(self, points: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*#batch"]:
         """Root mean square of the points' distances, in world units: the fit error of `from_points`."""
-        return self.distance(points).square().mean(dim=-1).sqrt()
+        distance = self.distance(points)
+        size = distance.detach().abs().amax(-1, keepdim=True)
+        size = torch.where(size > 0, size, 1.0)
+        squared = (distance / size).square().mean(dim=-1)
+        some = squared > 0  # the root's slope at 0 is infinite
+        return torch.where(some, torch.where(some, squared, 1.0).sqrt(), 0.0) * size.squeeze(-1)
 
 
 def _as_tensors(normal: Any, offset: Any) -> tuple[Any, Any]:
     """Python numbers in the dtype and on the device of the tensor beside them, in float64 if there is none."""
     given = normal if isinstance(normal, Tensor) else offset if isinstance(offset, Tensor) else None
-    kind = torch.empty(0, dtype=torch.float64) if given is None or not given.is_floating_point() else given
+    if given is None or not given.is_floating_point():
+        given = torch.empty(0, dtype=torch.float64, device="cpu")
+    kind = given
 
     def convert(name: str, value: Any) -> Any:
         if isinstance(value, Tensor):
             return value
         try:
-            return torch.as_tensor(value, dtype=kind.dtype, device=kind.device)
+            return torch.tensor(value, dtype=kind.dtype, device=kind.device)
         except (TypeError, ValueError, RuntimeError):
             raise TypeError(f"{name}: want a tensor or numbers, got {type(value).__name__}") from None
 

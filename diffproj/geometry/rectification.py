@@ -22,9 +22,8 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from diffproj._core.numerics import BLOCK_POINTS, broadcast_batches, check_tensor
-from diffproj.geometry.back_projection import back_project
+from diffproj.geometry.back_projection import back_project, warn_if_rounded
 from diffproj.geometry.camera import Camera, as_camera
-from diffproj.geometry.float32 import warn_if_rounded
 from diffproj.geometry.grid import checked_size, inside, pixel_grid
 from diffproj.geometry.plane import Plane
 
@@ -50,9 +49,8 @@ def plane_axes(plane: Plane) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "
         >>> origin.tolist(), s.tolist(), t.tolist()
         ([0.0, 0.0, 3.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     """
-    length = plane.normal.norm(dim=-1, keepdim=True)
-    n = plane.normal / length
-    origin = n * (plane.offset.unsqueeze(-1) / length)
+    n, distance = plane.normalised()
+    origin = n * distance.unsqueeze(-1)
     n = torch.where(n[..., 2:] < 0, -n, n)
     x, y = (torch.zeros_like(n).index_fill(-1, torch.tensor(i, device=n.device), 1.0) for i in range(2))
     near = torch.where(n[..., :1].abs() > 0.9, y, x)
@@ -110,7 +108,7 @@ def rectify(
         points = (
             origin.unsqueeze(-2) + s.unsqueeze(-1) * along_s.unsqueeze(-2) + t.unsqueeze(-1) * along_t.unsqueeze(-2)
         )
-        return camera.project(points)
+        return camera._project(camera._checked("points", points, 3))
 
     return _resampled(image, look_up, (rows, columns), (W, H), camera.K)
 

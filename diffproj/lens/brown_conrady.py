@@ -14,13 +14,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj._core.numerics import in_blocks, rounding
+from diffproj._core.numerics import in_blocks, least_depth, rounding
 from diffproj.lens import brown_domain
-from diffproj.lens.brown_equations import COUNTS, Terms, bend, radial
+from diffproj.lens.brown_equations import COUNTS, Terms, bend, by_coefficients, radial, tilted
 from diffproj.lens.brown_inverse import newton, search, squared_domain, untilted
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.compiling import derivative_wanted
 from diffproj.lens.table import inverse_table
+
+LARGEST = 0.25
+"""The power of the largest number up to which squared radii are distorted: what grows with their cube stays finite."""
 
 
 class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
@@ -74,7 +77,7 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
         def forward(points: Tensor) -> tuple[Tensor, Tensor]:
             x, y = points.unbind(-1)
             s = (x * x + y * y).detach()
-            valid = (s <= squared_domain(domain)) & (s < torch.inf)
+            valid = (s <= squared_domain(domain)) & (s < torch.finfo(s.dtype).max ** LARGEST)
             x, y = torch.where(valid, x, 0), torch.where(valid, y, 0)
             terms = Terms.of(self._usable(domain))
             x, y = bend(terms, x, y)
@@ -128,7 +131,7 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
         """
         direction = self._checked("direction", direction, 3)
         x, y, z = direction.unbind(-1)
-        in_front = (z > 0) & torch.isfinite(x + y + z)
+        in_front = (z > least_depth(z.dtype)) & torch.isfinite(x + y + z)
         x, y, z = torch.where(in_front, x, 0), torch.where(in_front, y, 0), torch.where(in_front, z, 1)
         xy_distorted, valid = self.distort(torch.stack([x / z, y / z], dim=-1))
         valid = valid & in_front
@@ -140,6 +143,24 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
         """Directions `(x, y, 1)` whose projections are the distorted points; (0, 0, 1) where not valid."""
         xy, valid = self.undistort(xy_distorted)
         return torch.nn.functional.pad(xy, (0, 1), value=1.0), valid
+
+    def by_direction(self, direction: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*out n 2 3"]:
+        """Derivatives of the distorted points by valid directions `(*B, N, 3)`: `(*B, N, 2, 3)`."""
+        x, y, z = direction.unbind(-1)
+        x, y = x / z, y / z
+        found = tilted(self._terms(), x, y)
+        depth = found.depth * z
+        a, b, c, d = (part / depth for part in found.jacobian)
+        rows = [torch.stack([a, b, -(a * x + b * y)], dim=-1), torch.stack([c, d, -(c * x + d * y)], dim=-1)]
+        return torch.stack(rows, dim=-2)
+
+    def by_coefficients(self, direction: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*out n 2 k"]:
+        """Derivatives of the distorted points of valid directions `(*B, N, 3)` by the coefficients `(*B, N, 2, k)`."""
+        x, y, z = direction.unbind(-1)
+        return by_coefficients(self._terms(), x / z, y / z, self.coefficients.shape[-1])
+
+    def _terms(self) -> Terms:
+        return Terms.of(self._usable(self._domain()))
 
     def turned(
         self, cosine: Float[Tensor, "*lens"], sine: Float[Tensor, "*lens"]

@@ -235,3 +235,37 @@ def tilted(terms: Terms, x: Tensor, y: Tensor) -> Tilted:
         yx * bent.xy + yy * bent.yy,
     )
     return Tilted(x_tilted, y_tilted, chained, depth)
+
+
+def by_coefficients(terms: Terms, x: Tensor, y: Tensor, count: int) -> Tensor:
+    """Derivatives of the distorted point by the first `count` coefficients `(*B, N, 2, count)`."""
+    s, zero = torch.addcmul(x * x, y, y), torch.zeros_like(x)
+    powers = [s, s * s, s * s * s]
+    below = denominator(terms, s)
+    numerator = [(x * power / below, y * power / below) for power in powers]
+    columns = [*numerator[:2], (2 * x * y, s + 2 * y * y), (s + 2 * x * x, 2 * x * y), *numerator[2:]]
+    factor = radial(terms, s)
+    columns += [(-factor * u, -factor * v) for u, v in numerator]
+    columns += [(s, zero), (powers[1], zero), (zero, s), (zero, powers[1])]
+    if terms.tilt is not None:
+        columns = _by_tilt(terms.tilt, *bend(terms, x, y), columns)
+    return torch.stack([torch.stack(row, dim=-1) for row in zip(*columns[:count], strict=True)], dim=-2)
+
+
+def _by_tilt(tilt: Tilt, x: Tensor, y: Tensor, columns: list[tuple[Tensor, Tensor]]) -> list[tuple[Tensor, Tensor]]:
+    """Derivatives of the point `(x', y')` by other coefficients, as those of the tilted one; then its own by both."""
+    x_tilted, y_tilted = tilt.apply(x, y)
+    depth = tilt.depth(x, y)
+    fall_x = -tilt.cos_y * (tilt.cos_x * y + tilt.sin_x)  # dW / dtau_x
+    fall_y = tilt.cos_y * x + tilt.sin_y * (tilt.sin_x * y - tilt.cos_x)
+
+    def onward(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        fall = tilt.sin_y * u - tilt.cos_y * tilt.sin_x * v
+        sideways = tilt.cos_y * v - tilt.sin_x * tilt.sin_y * u
+        return (tilt.cos_x * u - x_tilted * fall) / depth, (sideways - y_tilted * fall) / depth
+
+    own = [
+        ((-tilt.sin_x * x - x_tilted * fall_x) / depth, (-tilt.cos_x * tilt.sin_y * x - y_tilted * fall_x) / depth),
+        (-x_tilted * fall_y / depth, (-tilt.sin_y * y - tilt.sin_x * tilt.cos_y * x - y_tilted * fall_y) / depth),
+    ]
+    return [onward(u, v) for u, v in columns] + own

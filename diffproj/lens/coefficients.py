@@ -83,6 +83,14 @@ class CoefficientLens(Batched, ABC):
         """Distorted points to directions; see `Lens`."""
 
     @abstractmethod
+    def by_direction(self, direction: Tensor) -> Tensor:
+        """Derivatives of the distorted points by valid directions `(*B, N, 3)`: `(*B, N, 2, 3)`, in closed form."""
+
+    @abstractmethod
+    def by_coefficients(self, direction: Tensor) -> Tensor:
+        """Derivatives of the distorted points of valid directions by the coefficients `(*B, N, 2, k)`."""
+
+    @abstractmethod
     def turned(self: L, cosine: Tensor, sine: Tensor) -> tuple[L, Tensor]:
         """The lens turned about its axis by an angle `(*B,)`, and whether there is one `(*B,)`."""
 

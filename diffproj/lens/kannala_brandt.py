@@ -21,13 +21,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj._core.numerics import has_values, in_blocks, in_float64
+from diffproj._core.numerics import has_values, in_blocks, in_float64, least_depth
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.compiling import coordinates, derivative_wanted, with_batch_in_front
 from diffproj.lens.domain import first_failure
 from diffproj.lens.plan import Plan
 from diffproj.lens.polynomial import polynomial
-from diffproj.lens.smooth import angle_over_side, sine_over_angle_and_cosine
+from diffproj.lens.smooth import angle_over_side, angle_over_side_slopes, sine_over_angle_and_cosine
 from diffproj.lens.table import InverseTable, inverse_table
 
 NEWTON_STEPS = 4
@@ -82,8 +82,8 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
             direction: `(*B, N, 3)`, of any length; `z` may be negative.
 
         Returns:
-            Distorted points `(*B, N, 2)`, and `valid`: inside the domain, finite, not the zero vector, and not exactly
-            on the negative axis. (0, 0) with zero gradient where not valid.
+            Distorted points `(*B, N, 2)`, and `valid`: inside the domain, finite, not the zero vector, and not on the
+            negative axis to within rounding. (0, 0) with zero gradient where not valid.
         """
         domain = self._domain()
 
@@ -92,7 +92,7 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
             x, y, z = (directions / _largest_component(directions)).unbind(-1)
             x, y, z = torch.where(valid, x, 0), torch.where(valid, y, 0), torch.where(valid, z, 1)
             side_squared = x * x + y * y
-            k = list(self._usable(domain).unsqueeze(-2).unbind(-1))
+            k = self._columns()
             ratio = angle_over_side(side_squared, z)
             scale = ratio * _profile(k, ratio * ratio * side_squared)
             return torch.stack([x * scale, y * scale], dim=-1), valid
@@ -129,6 +129,40 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
             return torch.stack([x * scale, y * scale, cosine], dim=-1), valid
 
         return in_blocks(backward, self._checked("xy_distorted", xy_distorted, 2), self.coefficients)  # type: ignore[return-value]
+
+    def by_direction(self, direction: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*out n 2 3"]:
+        """Derivatives of the distorted points by valid directions `(*B, N, 3)`: `(*B, N, 2, 3)`."""
+        size = _largest_component(direction)
+        x, y, z = (direction / size).unbind(-1)
+        k = self._columns()
+        side_squared = x * x + y * y
+        ratio = angle_over_side(side_squared, z)
+        by_square, by_z = angle_over_side_slopes(side_squared, z, ratio)
+        angle_squared = ratio * ratio * side_squared
+        profile = _profile(k, angle_squared)
+        rise = ratio * polynomial(angle_squared, [(n + 1) * column for n, column in enumerate(k)])
+        # The distorted point is scale (x, y), with scale = ratio profile.
+        scale = ratio * profile
+        slope = 2 * (by_square * profile + rise * (2 * ratio * by_square * side_squared + ratio * ratio))
+        fall = by_z * (profile + 2 * rise * ratio * side_squared)
+        across = slope * x * y
+        rows = [
+            torch.stack([scale + slope * x * x, across, fall * x], dim=-1),
+            torch.stack([across, scale + slope * y * y, fall * y], dim=-1),
+        ]
+        return torch.stack(rows, dim=-2) / size.unsqueeze(-1)
+
+    def by_coefficients(self, direction: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*out n 2 4"]:
+        """Derivatives of the distorted points of valid directions `(*B, N, 3)` by the coefficients `(*B, N, 2, 4)`."""
+        x, y, z = (direction / _largest_component(direction)).unbind(-1)
+        side_squared = x * x + y * y
+        ratio = angle_over_side(side_squared, z)
+        angle_squared = ratio * ratio * side_squared
+        powers = torch.stack([angle_squared**n for n in range(1, 5)], dim=-1) * ratio.unsqueeze(-1)
+        return torch.stack([x.unsqueeze(-1) * powers, y.unsqueeze(-1) * powers], dim=-2)
+
+    def _columns(self) -> list[Tensor]:
+        return list(self._usable(self._domain()).unsqueeze(-2).unbind(-1))
 
     def turned(
         self,
@@ -177,17 +211,19 @@ def _slope(k: list[Tensor], angle_squared: Tensor) -> Tensor:
 
 
 def _largest_component(direction: Tensor) -> Tensor:
-    """Largest absolute component, without gradient, to normalise by; 1 if it is 0 or not finite."""
+    """Largest absolute component, without gradient, to normalise by; 1 if it is next to 0 or not finite."""
     size = direction.detach().abs().amax(-1, keepdim=True)
-    return torch.where((size > 0) & (size < torch.inf), size, 1)
+    return torch.where((size > least_depth(size.dtype)) & (size < torch.inf), size, 1)
 
 
 def _within(domain: Tensor, direction: Tensor) -> Tensor:
-    """Whether directions lie in the domain and have a unique projection: not 0, nor exactly backwards."""
+    """Whether directions lie in the domain and have a unique projection: not 0, nor backwards to within rounding."""
     x, y, z = (direction / _largest_component(direction)).unbind(-1)
     side = torch.hypot(x, y)
     within = torch.atan2(side, z) <= domain.unsqueeze(-1)
-    return within & torch.isfinite(side + z) & ((side > 0) | (z > 0)) & (domain > 0).unsqueeze(-1)
+    eps = torch.finfo(side.dtype).eps
+    aside = (side > eps) | (z > eps)
+    return within & torch.isfinite(side + z) & aside & (domain > 0).unsqueeze(-1)
 
 
 def _newton(k: list[Tensor], rho_squared: Tensor, sigma: Tensor) -> Tensor:

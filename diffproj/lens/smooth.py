@@ -14,6 +14,7 @@ from diffproj.lens.polynomial import series
 NEAR_ZERO = 0.02
 """End of the series' range: up to it the arc tangent's 11 terms are exact to 1e-19, the others' 7 terms suffice."""
 ARC_TANGENT = [(-1) ** n / (2 * n + 1) for n in range(11)]
+ARC_TANGENT_SLOPE = [n * factor for n, factor in enumerate(ARC_TANGENT)][1:]
 SINE = [(-1) ** n / math.factorial(2 * n + 1) for n in range(7)]
 COSINE = [(-1) ** n / math.factorial(2 * n) for n in range(7)]
 
@@ -25,6 +26,15 @@ def angle_over_side(side_squared: Tensor, z: Tensor) -> Tensor:
     z_near = torch.where(near, z, 1)
     small = series(torch.where(near, side_squared, 0) / (z_near * z_near), ARC_TANGENT) / z_near
     return torch.where(near, small, torch.atan2(side, z) / side)
+
+
+def angle_over_side_slopes(side_squared: Tensor, z: Tensor, ratio: Tensor) -> tuple[Tensor, Tensor]:
+    """The derivatives of `angle_over_side`, whose value is `ratio`, by `side_squared` and by `z`."""
+    near = (z > 0) & (side_squared < NEAR_ZERO * z * z)
+    square, z_near = torch.where(near, 1, side_squared), torch.where(near, z, 1)
+    small = series(torch.where(near, side_squared, 0) / (z_near * z_near), ARC_TANGENT_SLOPE) / z_near**3
+    inverse = 1 / (side_squared + z * z)
+    return torch.where(near, small, (z * inverse - ratio) / (2 * square)), -inverse
 
 
 def sine_over_angle_and_cosine(angle_squared: Tensor) -> tuple[Tensor, Tensor]:

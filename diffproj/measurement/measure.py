@@ -26,14 +26,16 @@ from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from diffproj._core.numerics import check_tensor, in_float64
-from diffproj.calibration.parametrisation import Parametrisation, moved
+from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64, transform
+from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.region import in_region
 from diffproj.calibration.result import Calibration
-from diffproj.geometry.back_projection import back_project
+from diffproj.geometry.back_projection import back_project, warn_if_rounded
 from diffproj.geometry.camera import Camera, as_camera
-from diffproj.geometry.float32 import warn_if_rounded
+from diffproj.geometry.intrinsics import pixel_to_normalized
 from diffproj.geometry.plane import Plane
+from diffproj.lens.coefficients import CoefficientLens
+from diffproj.lens.slopes import by_direction
 from diffproj.measurement import lens_reach
 from diffproj.measurement.doubt import of_the_pose
 from diffproj.measurement.measurement import Measurement
@@ -89,15 +91,22 @@ def measure(
         raise ValueError(f"pixel_sigma: want the noise of the pixels, for {source} does not know it")
     warn_if_rounded(camera, plane)
     camera, plane = camera.to(torch.float64), plane.to(torch.float64)
+    if plane_covariance is not None:
+        plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
+        _check_covariance(plane_covariance.detach())
+        if plane.is_per_point:
+            raise ValueError("plane_covariance: want one plane for all points, got one for each (Plane.per_point)")
+        many = broadcast_batches(pixels=pixels.shape[:-2], plane_covariance=plane_covariance.shape[:-2])
+        pixels = pixels.expand(*many, *pixels.shape[-2:])
     points, valid = back_project(pixels, camera, plane)
     batch = points.shape[:-2]
     sigma = _expanded(level if pixel_sigma is None else pixel_sigma, like=points)
-    by_theta, by_point = _projection_derivatives(points, camera, parameters, known, middle)
+    by_theta, by_point = _projection_derivatives(pixels, points, valid, camera, parameters, known, middle)
     tangents = plane.tangents()
     T = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)  # (*B, N, 3, 2)
     D = torch.where(valid[..., None, None], T @ _inverse2(by_point @ T), 0.0)
     region = calibration.region if isinstance(calibration, Calibration) else None
-    blocks, covariances = [-D @ by_theta], [torch.zeros(*batch, 0, 0).to(D) if known is None else known]
+    blocks, covariances = [-D @ by_theta], [D.new_zeros(*batch, 0, 0) if known is None else known]
     beyond = torch.zeros_like(valid)
     if region is not None and known is not None:
         extrapolated = valid & ~in_region(pixels, region)
@@ -106,12 +115,8 @@ def measure(
         factor = torch.where(beyond, 1.0, factor)[..., None, None]
         blocks, by_theta = [factor * blocks[0]], factor * by_theta
     if plane_covariance is not None:
-        plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
-        _check_covariance(plane_covariance.detach())
-        if plane.is_per_point:
-            raise ValueError("plane_covariance: want one plane for all points, got one for each (Plane.per_point)")
-        n = plane.normal.unsqueeze(-2).expand_as(points)
-        lift = n / n.square().sum(-1, keepdim=True)
+        n = plane.unit_normal.unsqueeze(-2).expand_as(points)
+        lift = n / plane.length[..., None, None]
         lift = lift - (D @ (by_point @ lift.unsqueeze(-1))).squeeze(-1)
         with_offset = torch.cat([-points, torch.ones_like(points[..., :1])], dim=-1)
         blocks.append(lift.unsqueeze(-1) * with_offset.unsqueeze(-2))
@@ -121,9 +126,9 @@ def measure(
         doubt = of_the_pose(pixels, calibration, view_number(calibration, view), plane, points, valid)
         away, covariances = [doubt.columns], [*covariances, doubt.covariance]
     if bool(beyond.any()):  # a parameter of which nothing is known, and no two points follow it alike
-        unlike = torch.linspace(1, 2, points.shape[-2]).to(points).unsqueeze(-1)
+        unlike = torch.linspace(1, 2, points.shape[-2], dtype=points.dtype, device=points.device).unsqueeze(-1)
         away.append(torch.where(beyond.unsqueeze(-1), unlike * T.abs().sum(-1), 0.0).unsqueeze(-1))
-        covariances.append(torch.full((1, 1), torch.inf).to(D))
+        covariances.append(D.new_full((1, 1), torch.inf))
     beside = torch.cat(away, dim=-1)
     common = torch.where(valid[..., None, None], torch.cat([*blocks, beside], dim=-1), 0.0)
     sight = Sight(pixels.expand(*batch, *pixels.shape[-2:]), sigma, camera, plane, by_theta, beside)
@@ -194,32 +199,45 @@ def _check_covariance(given: Tensor) -> None:
 
 
 def _projection_derivatives(
-    points: Tensor, camera: Camera, parameters: Parametrisation, known: Tensor | None, middle: Tensor | None
+    pixels: Tensor,
+    points: Tensor,
+    valid: Tensor,
+    camera: Camera,
+    parameters: Parametrisation,
+    known: Tensor | None,
+    middle: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Derivatives of the pixels by theta `(*B, N, 2, s + 6)` (bow excluded: 0) and by the point `(*B, N, 2, 3)`.
 
-    The pose turns about `middle (3,)`: about a distant origin a turn and a shift would nearly cancel.
+    The pose turns about `middle (3,)`: about a distant origin a turn and a shift would nearly cancel. Where a point is
+    not valid, they are those of some other point.
     """
-    batch = points.shape[:-2]
-    s = parameters.size
-    shared = parameters.pack(camera).expand(*batch, s).reshape(-1, s)
-    R, t = camera.R.expand(*batch, 3, 3).reshape(-1, 1, 3, 3), camera.t.expand(*batch, 3).reshape(-1, 1, 3)
-    flat = points.reshape(len(shared), 1, points.shape[-2], 3)
-    if middle is not None:
-        flat, t = flat - middle, t + R @ middle
-    bow = 0 if known is None else known.shape[-1] - s - 6
-
-    def project(step: Tensor) -> Tensor:
-        pose = moved((R, t), step[s : s + 6].expand(len(shared), 1, 6))
-        return parameters.unpack(shared + step[:s], pose).project(flat + step[s + 6 :])[0].squeeze(1)
-
-    zero = torch.zeros(s + 9, dtype=points.dtype, device=points.device)
-    directions = torch.eye(s + 9, dtype=points.dtype, device=points.device)
-    columns = [torch.func.jvp(project, (zero,), (direction,))[1] for direction in directions]
-    J = torch.stack(columns, dim=-1).reshape(*points.shape[:-1], 2, s + 9)
+    R, lens = camera.R.unsqueeze(-3), camera.distortion
+    arm = _product(R, points if middle is None else points - middle)
+    direction = _product(R, points) + camera.t.unsqueeze(-2)
+    axis = torch.tensor([0.0, 0, 1], dtype=points.dtype, device=points.device)
+    direction = torch.where(valid.unsqueeze(-1), direction, axis)
+    F = camera.K[..., None, :2, :2].expand(*points.shape[:-1], 2, 2)
+    by_camera_point = F @ by_direction(lens, direction)
+    by_point = by_camera_point @ R
+    if known is None:
+        return by_point[..., :0], by_point
+    center = camera.K[..., None, :2, 2]
+    offset = torch.where(valid.unsqueeze(-1), pixels - center, 0.0)
+    xy = transform(pixel_to_normalized(camera.K), offset)
+    columns = [torch.diag_embed(xy), torch.eye(2, dtype=F.dtype, device=F.device).expand_as(F)]
+    if isinstance(lens, CoefficientLens):
+        columns.append(F @ lens.by_coefficients(direction))
+    if parameters.skew:
+        columns.append(torch.nn.functional.pad(xy[..., 1:, None], (0, 0, 0, 1)))
     # A bow bends the board that was calibrated on, not what is measured.
-    by_theta = torch.cat([J[..., :s], J.new_zeros(*J.shape[:-1], bow), J[..., s : s + 6]], dim=-1)
-    return (by_theta if known is not None else by_theta[..., :0]), J[..., s + 6 :]
+    columns.append(F.new_zeros(*F.shape[:-1], known.shape[-1] - parameters.size - POSE))
+    turn = torch.linalg.cross(arm.unsqueeze(-2), by_camera_point)  # g . (omega x arm) = omega . (arm x g)
+    return torch.cat([*columns, turn, by_camera_point], dim=-1), by_point
+
+
+def _product(matrix: Tensor, vectors: Tensor) -> Tensor:
+    return (matrix @ vectors.unsqueeze(-1)).squeeze(-1)
 
 
 def _inverse2(matrix: Tensor) -> Tensor:

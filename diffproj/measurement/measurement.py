@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.copying import Copied
 from diffproj.calibration.covariance import zero_where_infinite
 from diffproj.calibration.region import in_region
 from diffproj.measurement.folded import longest_first, norm_variance
@@ -26,7 +27,7 @@ NONLINEAR = "Nonlinear: close to the horizon or to zero, where the deviation mis
 
 
 @dataclass(frozen=True, eq=False)
-class Measurement:
+class Measurement(Copied):
     """Points measured on a plane, with their joint covariance.
 
     Attributes:
@@ -279,11 +280,12 @@ class Measurement:
         N = self.points.shape[-2]
         if k > N:
             raise ValueError(f"points: want at least {k}, got {N}")
-        return torch.arange(N - k + 1).unsqueeze(-1) + torch.arange(k)
+        first, following = (torch.arange(count, device=self.points.device) for count in (N - k + 1, k))
+        return first.unsqueeze(-1) + following
 
 
 def _sets(name: str, which: Sequence[Sequence[int]] | Tensor, k: int) -> Tensor:
-    index = torch.as_tensor(which)
+    index = which if isinstance(which, Tensor) else torch.as_tensor(which, device="cpu")
     if index.ndim != 2 or index.shape[-1] != k:
         raise ValueError(f"{name}: want point numbers of shape (M, {k}), got {tuple(index.shape)}")
     return index

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.copying import Copied
 from diffproj.measurement.student import normal_reach, student_reach
 
 SIGNIFICANT = 0.9973
@@ -20,7 +21,7 @@ Bounds = Callable[[float, Tensor], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True, eq=False)
-class Quantity:
+class Quantity(Copied):
     """Measured values with their standard deviations.
 
     Attributes:

@@ -34,7 +34,7 @@ def normal_reach(level: float) -> float:
         >>> round(normal_reach(0.95), 4)
         1.96
     """
-    return float(torch.special.ndtri(torch.tensor((1 + check_level(level)) / 2, dtype=torch.float64)))
+    return float(torch.special.ndtri(torch.tensor((1 + check_level(level)) / 2, dtype=torch.float64, device="cpu")))
 
 
 def student_reach(level: float, degrees: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:

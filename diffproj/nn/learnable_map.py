@@ -40,7 +40,7 @@ class LearnableMap(nn.Module):
         super().__init__()
         PlaneMap(camera, plane)  # checks that they fit together
         plane = plane.like(camera.K)
-        distance = ((plane.normal * camera.center).sum(-1) - plane.offset).abs() / plane.normal.norm(dim=-1)
+        distance = plane.distance(camera.center.unsqueeze(-2)).abs()
         of_camera = {part: where for part, where in learn.items() if part != "plane"}
         self.camera = LearnableCamera(camera, of_camera, tied_intrinsics)
         self.plane = LearnablePlane(plane, float(distance.mean()) or 1.0, learn.get("plane", False))
@@ -52,4 +52,4 @@ class LearnableMap(nn.Module):
 
     def forward(self) -> PlaneMap:
         """The map with the current values of the parameters."""
-        return PlaneMap(self.camera(), self.plane())
+        return PlaneMap.quietly(self.camera(), self.plane())

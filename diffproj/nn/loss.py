@@ -1,5 +1,7 @@
 """`PlaneLoss`: a loss in world units over the points that are valid."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -52,15 +54,38 @@ class PlaneLoss(nn.Module):
                 divided by it, so that far points, which one pixel moves further, count as much as near ones. No
                 gradient flows through it.
 
+        Without points the loss is 0.
+
         Raises:
-            TypeError: points or target that are no floating-point tensors.
-            ValueError: points or target without three coordinates.
+            TypeError: points, target, weights or resolution that are no floating-point tensors, or a mask that is not
+                boolean.
+            ValueError: points or target without three coordinates, or something that does not broadcast to the points.
         """
         points, target = check_tensor("points", points, "N", 3), check_tensor("target", target, "N", 3)
+        _check_fits("target", target, points.shape)
         counts = torch.ones_like(points[..., 0], dtype=torch.bool) if valid is None else valid
+        if counts.dtype != torch.bool:
+            raise TypeError(f"valid: want booleans, got {counts.dtype}")
+        for name, tensor in (("valid", counts), ("weights", weights), ("resolution", resolution)):
+            if tensor is not None:
+                _check_fits(name, tensor, points.shape[:-1])
         off = torch.where(counts.unsqueeze(-1), points - target.to(points), 0.0)
         if resolution is not None:
             off = off / torch.where(counts, resolution, 1.0).detach().unsqueeze(-1).to(off)
         value = off.square().sum(-1)
         value = value if self.loss is None else self.loss.value(value)
-        return (value if weights is None else value * weights.to(value)).mean()
+        if weights is not None:
+            value = value * torch.where(counts, weights, 0.0).to(value)
+        return value.sum() / max(value.numel(), 1)
+
+
+def _check_fits(name: str, tensor: Tensor, shape: Sequence[int]) -> None:
+    """Check that a tensor broadcasts to a shape, along its last axis only from one number for all.
+
+    Raises:
+        ValueError: it does not, or would stretch the points.
+    """
+    whole = tensor.ndim < 1 or tensor.shape[-1] == shape[-1]
+    behind = tensor.shape[::-1]
+    if not whole or len(behind) > len(shape) or any(a not in (1, b) for a, b in zip(behind, shape[::-1], strict=False)):
+        raise ValueError(f"{name}: want a shape that broadcasts to {tuple(shape)}, got {tuple(tensor.shape)}")

@@ -60,7 +60,11 @@ def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
     if unknown:
         raise ValueError(f"learn: want parts of {', '.join(available)}, got {unknown[0]!r}")
     wanted = {part: learn[part] for part in names} if isinstance(learn, Mapping) else dict.fromkeys(names, True)
-    return {part: where for part, where in wanted.items() if bool(torch.as_tensor(where).any())}
+    return {part: where for part, where in wanted.items() if _anywhere(where)}
+
+
+def _anywhere(where: Any) -> bool:
+    return bool((where if isinstance(where, Tensor) else torch.as_tensor(where, device="cpu")).any())
 
 
 def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, batch: torch.Size) -> None:

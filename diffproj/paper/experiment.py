@@ -118,7 +118,7 @@ def run_experiment(
         ('all', True)
     """
     calibration = calibrate(fit, board, distortion)
-    held_out = torch.zeros(test.pixels.shape[-2], dtype=torch.bool)
+    held_out = torch.zeros(test.pixels.shape[-2], dtype=torch.bool, device=test.device)
     if strict:
         held_out[1::2] = True
     located = locate(test.hiding(held_out), board, calibration)

@@ -73,17 +73,17 @@ def paper_setup(distortion: Lens | None = None) -> PaperSetup:
         Camera(batch_shape=(5,), pinhole, size=(640, 480), torch.float64, cpu)
     """
     board = Chessboard(columns=9, rows=6, square=25.0, axes="paper")
-    K = torch.tensor([[700.0, 0, 322], [0, 702, 238], [0, 0, 1]], dtype=torch.float64)
+    K = torch.tensor([[700.0, 0, 322], [0, 702, 238], [0, 0, 1]], dtype=torch.float64, device="cpu")
     camera = Camera(K, distortion=distortion, size=(640, 480))
     return PaperSetup(board, _at_poses(camera, board, _FIT_POSES), _at_poses(camera, board, _TEST_POSES))
 
 
 def _at_poses(camera: Camera, board: Chessboard, poses: tuple[tuple[float, ...], ...]) -> Camera:
     """The camera at poses: the board's centre at a position in its frame, the board turned about it by Euler angles."""
-    table = torch.tensor(poses, dtype=camera.dtype)
+    table = torch.tensor(poses, dtype=camera.dtype, device=camera.device)
     psi, phi, theta = table[:, :3].deg2rad().unbind(-1)
     # Straight from above the paper's x points down in the image, its y to the right and its z towards the camera.
-    from_above = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=camera.dtype)
+    from_above = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=camera.dtype, device=camera.device)
     R = from_above @ rotation_from_euler(psi, phi, theta)
     center = board.points.to(camera.dtype).mean(dim=0)
     return camera.at(R, table[:, 3:] - R @ center)

@@ -86,8 +86,8 @@ class Chessboard:
     def points(self) -> Float[Tensor, "n 3"]:
         """The inner corners in the world, row by row, in the unit of `square`: a new float64 tensor on each access."""
         row, column = torch.meshgrid(
-            torch.arange(self.rows, dtype=torch.float64),
-            torch.arange(self.columns, dtype=torch.float64),
+            torch.arange(self.rows, dtype=torch.float64, device="cpu"),
+            torch.arange(self.columns, dtype=torch.float64, device="cpu"),
             indexing="ij",
         )
         return self._placed(row.flatten(), column.flatten())
@@ -104,8 +104,8 @@ class Chessboard:
         """
         top, right, bottom, left = -1.0, float(self.columns), float(self.rows), -1.0
         return self._placed(
-            torch.tensor([top, top, bottom, bottom], dtype=torch.float64),
-            torch.tensor([left, right, right, left], dtype=torch.float64),
+            torch.tensor([top, top, bottom, bottom], dtype=torch.float64, device="cpu"),
+            torch.tensor([left, right, right, left], dtype=torch.float64, device="cpu"),
         )
 
     def _placed(self, row: Float[Tensor, " n"], column: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:

@@ -59,15 +59,16 @@ def board_texture(board: Chessboard, texels: int = 32) -> Texture:
     if texels < 1:
         raise ValueError(f"texels: want at least 1 along a square, got {texels}")
     # Indices of squares: 0 follows the first inner corner.
-    row, column = (torch.arange(-3, count + 2) for count in (board.rows, board.columns))
+    row, column = (torch.arange(-3, count + 2, device="cpu") for count in (board.rows, board.columns))
     row = row.unsqueeze(-1)
     printed = (row >= -1) & (row < board.rows) & (column >= -1) & (column < board.columns)
     paper = (row >= -2) & (row <= board.rows) & (column >= -2) & (column <= board.columns)
-    grey = torch.where(paper, torch.where(printed & ((row + column) % 2 == 0), BLACK, WHITE), TABLE)
+    grey = torch.full(paper.shape, TABLE, dtype=torch.float32, device="cpu")
+    grey = grey.masked_fill(paper, WHITE).masked_fill(printed & ((row + column) % 2 == 0), BLACK)
     low, side = -3 * board.square, board.square
     extent = (low, low, (board.columns + 2) * side, (board.rows + 2) * side)
-    x, y = torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0])
-    axes = (torch.zeros(3), y, x) if board.axes == "paper" else (torch.zeros(3), x, y)
+    x, y, _ = torch.eye(3, dtype=torch.float32, device="cpu")
+    axes = (torch.zeros_like(x), y, x) if board.axes == "paper" else (torch.zeros_like(x), x, y)
     return Texture(grey.repeat_interleave(texels, 0).repeat_interleave(texels, 1)[None], extent, axes)
 
 
@@ -119,8 +120,8 @@ def photograph(
         image = torch.where(seen, shown[0], TABLE) * (1 - vignetting * (1 - _falloff(single)))
         if blur_px > 0:
             kernel = 2 * round(4 * blur_px) + 1
-            image = gaussian_blur2d(image[None, None], (kernel, kernel), (blur_px, blur_px))[0, 0]
-        image = image + noise * torch.randn(image.shape, generator=generator, dtype=image.dtype)
+            image = gaussian_blur2d(image[None, None], (kernel, kernel), image.new_tensor([[blur_px, blur_px]]))[0, 0]
+        image = image + noise * torch.randn(image.shape, generator=generator, dtype=image.dtype, device="cpu")
         images.append((image.clamp(0, 1) * 255).round().to(torch.uint8))
     return torch.stack(images).reshape(*camera.batch_shape, *images[0].shape)
 
@@ -151,7 +152,7 @@ def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px:
         raise ValueError("camera: want a batch of views (V,), got a single camera; camera.at(R, t) makes one")
     pixels, visible = camera.project(board.points.to(camera.dtype))
     generator = torch.Generator().manual_seed(seed)
-    pixels = pixels + noise_px * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
+    pixels = pixels + noise_px * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype, device="cpu")
     if camera.size is not None:
         visible = visible & camera.in_image(pixels)
     return Views(pixels, visible, size=camera.size)
@@ -191,26 +192,26 @@ def random_cameras(
     generator = torch.Generator().manual_seed(seed)
     points = board.points.to(camera.dtype)
     middle, extent = points.mean(dim=0), float((points.amax(dim=0) - points.amin(dim=0)).amax())
-    upright = torch.eye(3, dtype=camera.dtype)
+    upright = torch.eye(3, dtype=camera.dtype, device="cpu")
     if board.axes == "paper":
-        upright = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=camera.dtype)
+        upright = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=camera.dtype, device="cpu")
     singles = [camera] if not camera.batch_shape else [camera[i] for i in _indices(camera.batch_shape)]
     rotations, shifts = [], []
     for single in singles:
-        R, t = torch.zeros(0, 3, 3, dtype=camera.dtype), torch.zeros(0, 3, dtype=camera.dtype)
+        R, t = upright.new_zeros(0, 3, 3), upright.new_zeros(0, 3)
         for _ in range(100):
             count = 8 * views
-            draw = torch.rand(count, 6, generator=generator, dtype=camera.dtype)
+            draw = torch.rand(count, 6, generator=generator, dtype=camera.dtype, device="cpu")
             turned = rotation_from_euler(*((2 * draw[:, :3] - 1) * tilt).unbind(-1)) @ upright
             depth = (distance[0] + (distance[1] - distance[0]) * draw[:, 3]) * extent
             # The board's centre is uniform over the image.
             width, height = single.size or (0, 0)
-            where = draw[:, 4:] * torch.tensor([width - 1.0, height - 1.0], dtype=camera.dtype)
+            where = draw[:, 4:] * torch.tensor([width - 1.0, height - 1.0], dtype=camera.dtype, device="cpu")
             direction, valid = single.without_pose().directions(where)
             direction = direction / direction.norm(dim=-1, keepdim=True)
             shift = direction * depth.unsqueeze(-1) - turned @ middle
             pixels, seen = single.at(turned, shift).project(points)
-            last = torch.tensor([width - 1.0, height - 1.0], dtype=camera.dtype)
+            last = torch.tensor([width - 1.0, height - 1.0], dtype=camera.dtype, device="cpu")
             whole = valid & (seen & (pixels >= 0).all(-1) & (pixels <= last).all(-1)).all(-1)
             R, t = torch.cat([R, turned[whole]]), torch.cat([t, shift[whole]])
             if len(R) >= views:

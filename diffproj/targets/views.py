@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj._core.batched import Batched
+from diffproj._core.batched import Batched, check_index
 from diffproj._core.numerics import broadcast_batches, check_tensor, has_values
 from diffproj.geometry.grid import checked_size
 
@@ -111,7 +111,8 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
                 numbers, or a mask of V booleans. Iterating gives one `Views` of length 1 after the other.
 
         Raises:
-            IndexError: out of range, a mask of another length, or something else than the above.
+            IndexError: out of range, or a mask of another length.
+            TypeError: something else than the above.
 
         Example:
             >>> views = Views(torch.rand(5, 54, 2))
@@ -167,7 +168,7 @@ def _as_tensor(name: str, value: Any) -> Tensor:
         array = np.asarray(value)
         if array is not value and np.issubdtype(array.dtype, np.integer):
             array = array.astype(np.float64)
-        return torch.tensor(array)
+        return torch.tensor(array, device="cpu")
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name}: want a tensor or an array, got {type(value).__name__} ({error})") from None
 
@@ -215,9 +216,14 @@ def _check_finite(pixels: Tensor, visible: Tensor, names: tuple[str, ...]) -> No
 
 def _positions(index: Any, count: int) -> list[int]:
     """What `index` chooses among `count` views, as numbers from 0."""
+    index = list(index) if isinstance(index, tuple | range) else index
+    check_index(index)
     if isinstance(index, slice):
         return list(range(count))[index]
-    array = index.detach().cpu().numpy() if isinstance(index, Tensor) else np.asarray(index)
+    try:
+        array = index.detach().cpu().numpy() if isinstance(index, Tensor) else np.asarray(index)
+    except ValueError:
+        raise IndexError(f"index: want a number, a slice, a list of numbers or a mask, got {index!r}") from None
     if array.size == 0 and array.ndim == 1:
         return []
     if array.dtype == np.bool_:

@@ -113,7 +113,7 @@ def test_expand(make: Callable[..., Batched]) -> None:
     for wide, want in zip(tensors(row.expand(4, 3)), tensors(row), strict=True):
         assert wide.untyped_storage().data_ptr() == want.untyped_storage().data_ptr()
         assert all(torch.equal(part, want) for part in wide)
-    with pytest.raises(RuntimeError):
+    with pytest.raises(ValueError, match="batch_shape: want"):
         row.expand(4)
 
 
@@ -231,3 +231,83 @@ def test_vmap_runs_over_the_batch(make: Callable[..., Batched]) -> None:
 def test_copies(make: Callable[..., Batched], again: Callable[[Any], Any]) -> None:
     item = make(3)
     assert same(again(item), item)
+
+
+class Endless:
+    """What can be asked for any element, and never ends."""
+
+    def __getitem__(self, index: int) -> int:
+        return index
+
+    def __len__(self) -> int:
+        return 3
+
+
+def test_things_that_are_no_index_inside_of_an_index() -> None:
+    """PyTorch reads any sequence number by number, and crashes where that never ends."""
+    views = dp.example_views("left")
+    cameras = dp.Camera(
+        torch.eye(3, dtype=torch.float64).expand(13, 3, 3), distortion=dp.BrownConrady(torch.zeros(13, 4).double())
+    )
+    planes = dp.Plane.z(torch.zeros(13))
+    wrong = [
+        views,
+        [views],
+        [[views]],
+        (0, views),
+        [0, Endless()],
+        Endless(),
+        [None],
+        [0.5],
+        slice("a"),
+        slice(views, None),
+        {},
+        b"x",
+    ]
+    for batch in (cameras, cameras.distortion, planes, views):
+        for index in [*wrong, cameras, planes, torch.tensor(0.5), np.array(["a"]), np.array([0.5])]:
+            with pytest.raises(
+                TypeError, match=r"index: want numbers, slices, lists or masks, got .*; some of a batch is"
+            ):
+                batch[index]
+        with pytest.raises(IndexError):
+            batch[2**70]
+    assert cameras[[0, 5]].batch_shape == (2,)
+    assert (
+        cameras[np.array([3, 1], dtype=np.uint16)].batch_shape == planes[[True] * 2 + [False] * 11].batch_shape == (2,)
+    )
+
+
+@pytest.mark.plain
+def test_a_shape_that_the_batch_does_not_broadcast_to() -> None:
+    planes = dp.Plane.z(torch.zeros(6))
+    assert planes.expand(2, -1).batch_shape == planes.expand((2, 6)).batch_shape == (2, 6)
+    for shape in ((5,), (), (-3, 6), (-1, 6), (6, 2)):
+        with pytest.raises(ValueError, match=r"batch_shape: want one that \(6,\) broadcasts to, got"):
+            planes.expand(*shape)
+    with pytest.raises(TypeError, match="batch_shape: want whole numbers, got"):
+        planes.expand("a")
+    lens = dp.BrownConrady(torch.zeros(6, 4))
+    with pytest.raises(ValueError, match="batch_shape"):
+        lens.expand(5)
+
+
+def test_deep_copies_of_results_of_a_computation() -> None:
+    scale = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    K = scale * torch.tensor([[300.0, 0, 320], [0, 300, 240], [0, 0, 0.5]], dtype=torch.float64)
+    lens = dp.BrownConrady(scale * torch.tensor([0.01, 0, 0, 0], dtype=torch.float64))
+    camera = dp.Camera(K, t=torch.tensor([0.0, 0, 5], dtype=torch.float64), distortion=lens)
+    pixels = torch.tensor([[100.0, 50], [300, 200]], dtype=torch.float64)
+    plane = dp.Plane(scale * torch.tensor([0.0, 0, 1], dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64))
+    for thing in (camera, lens, plane, dp.PlaneMap(camera, plane), dp.Views(K[None, :2, :2])):
+        again = copy.deepcopy(thing)
+        for old, new in zip(tree_leaves(thing), tree_leaves(again), strict=True):
+            assert torch.equal(old, new)
+            assert new.is_leaf
+            assert old.data_ptr() != new.data_ptr()
+    measured = dp.measure(pixels, camera, plane, pixel_sigma=0.5)
+    again = copy.deepcopy({"measured": [measured]})["measured"][0]
+    assert torch.equal(again.lengths().deviation, measured.lengths().deviation)
+    assert again.points.is_leaf
+    length = copy.deepcopy(measured.lengths())
+    assert torch.equal(length.interval()[0], measured.lengths().interval()[0])

@@ -126,5 +126,17 @@ def test_what_is_said_is_in_message_and_summary() -> None:
 def test_skew_is_advised_where_it_is_missing() -> None:
     views = dp.example_views("left")
     skewed = dp.Views(views.pixels @ torch.tensor([[1.0, 0.005], [0, 1]], dtype=views.pixels.dtype).mT, size=views.size)
-    assert "or skew=True" in dp.calibrate(skewed, BOARD).message
+    assert "as through a K with skew" in dp.calibrate(skewed, BOARD).message
+    assert "take skew=True" in dp.calibrate(skewed, BOARD).message
     assert "skew" not in dp.calibrate(skewed, BOARD, skew=True).message
+
+
+@pytest.mark.parametrize("skew", [-30.0, 30.0])
+@pytest.mark.parametrize(("lens", "model"), [(None, "brown5"), (BROWN, "brown4"), (BROWN, "brown5")])
+def test_much_skew_is_advised_too(lens: dp.BrownConrady | None, model: str, skew: float) -> None:
+    """It leaves 0.6 to 1 px, part of which any lens would explain."""
+    true = camera(600, lens)
+    K = true.K.clone()
+    K[0, 1] = skew
+    for text in dp.calibrate(seen(dp.Camera(K, distortion=lens, size=SIZE), 3), BOARD, model).remarks:  # type: ignore[arg-type]
+        assert "take skew=True" in text

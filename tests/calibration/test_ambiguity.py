@@ -277,6 +277,22 @@ def test_easy_views_have_one_pose(calibration: dp.Calibration) -> None:
         assert not bool(dp.locate(dp.Views(pixels), target, known).ambiguous.any())
 
 
+@pytest.mark.usefixtures("quiet")
+@pytest.mark.parametrize("loss", [dp.Huber(0.2), dp.Cauchy(0.2), dp.Cauchy(1.0)])
+def test_a_robust_loss_makes_no_second_pose(loss: Any) -> None:
+    """The other pose fits three corners and leaves the fourth 30 px off, which Cauchy's loss hardly minds."""
+    camera = pinhole(800)
+    R = rotations(torch.tensor([0.42, 0.31, 0.3], dtype=D))
+    pixels, _ = camera.at(R, torch.tensor([20.0, 10, 400], dtype=D)).project(marker(100).points)
+    pixels = pixels + 0.2 * torch.randn(8, 4, 2, generator=torch.Generator().manual_seed(0), dtype=D)
+    alone = [dp.locate(dp.Views(one[None], size=camera.size), marker(100), camera, loss=loss) for one in pixels[:4]]
+    together = dp.locate(dp.Views(pixels, size=camera.size), marker(100), camera, loss=loss)
+    assert not any(bool(one.ambiguous) for one in alone)
+    # A corner that is three deviations off counts or not: one view has minima half a degree apart, and says so.
+    apart = ((together.alternatives.R * together.cameras.R).sum((-2, -1)) - 1).div(2).clamp(-1, 1).acos().rad2deg()
+    assert bool((apart[together.ambiguous] < 2).all())
+
+
 def test_exact_corners_leave_no_doubt() -> None:
     for target, depth in ((marker(27.0), 800.0), (BOARD, 4000.0)):
         pixels, truth = leaning(pinhole(800.0), target, 50, depth, (20.0, 20.0), noise=0.0)

@@ -879,3 +879,27 @@ def test_bad_input_is_refused_by_name() -> None:
     for kind, message, call in cases:
         with pytest.raises(kind, match=message):
             call()
+
+
+def test_scales_of_weights_and_losses() -> None:
+    """Weights are relative; a loss whose scale is no residual's is refused for what it is."""
+    views, board = dp.example_views("left")[:6], dp.Chessboard()
+    want = dp.calibrate(views, board, "brown4")
+    for weight in (1e-25, 1e-12, 1e25):
+        found = dp.calibrate(views, board, "brown4", weights=torch.tensor(weight, dtype=torch.float64))
+        torch.testing.assert_close(found.camera.K, want.camera.K, rtol=1e-8, atol=0)
+        deviation = found.covariance.deviations["f_x"]
+        torch.testing.assert_close(deviation, want.covariance.deviations["f_x"], rtol=1e-6, atol=0)
+    with pytest.raises(ValueError, match="weights: want 0 or numbers from 1e-100 to 1e"):
+        dp.calibrate(views, board, "brown4", weights=torch.tensor(1e-300, dtype=torch.float64))
+    with pytest.raises(dp.CalibrationError, match="scale of the loss is so far below the residuals"):
+        dp.calibrate(views, board, "none", loss=dp.Huber(1e-25))
+    for scale in (1e-200, 1e200, 0.0, float("nan")):
+        with pytest.raises(ValueError, match="scale: want a positive number in the residual's unit"):
+            dp.Huber(scale)
+
+
+def test_priors_keep_all_their_digits() -> None:
+    views, board = dp.example_views("left")[:4], dp.Chessboard()
+    found = dp.calibrate(views, board, "none", priors={"f_x": (533.1, 1e-7)})
+    assert abs(float(found.camera.K[0, 0]) - 533.1) < 1e-9

@@ -51,3 +51,18 @@ def test_map_built_once_and_vmapped(camera: dp.Camera, pixels: Tensor) -> None:
     compiled = torch.compile(torch.func.vmap(lambda pixels: to_plane(pixels)), fullgraph=True)
     points, _ = compiled(pixels.reshape(4, 50, 2))
     torch.testing.assert_close(points.flatten(0, 1), to_plane(pixels)[0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["camera", pytest.param("lens_camera", marks=pytest.mark.slow)])
+def test_ground_resolution(name: str, pixels: Tensor, request: pytest.FixtureRequest) -> None:
+    camera, plane = request.getfixturevalue(name), dp.Plane.z(torch.tensor(3.0, dtype=D))
+
+    class Resolution(torch.nn.Module):
+        def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+            return dp.ground_resolution(pixels, camera, plane)
+
+    want, want_valid = Resolution()(pixels)
+    for form in (torch.compile(Resolution(), fullgraph=True), torch.export.export(Resolution(), (pixels,)).module()):
+        found, valid = form(pixels)
+        torch.testing.assert_close(found, want, rtol=1e-12, atol=0)
+        assert torch.equal(valid, want_valid)

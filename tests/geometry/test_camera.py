@@ -55,7 +55,9 @@ def test_resizing_keeps_pixel_centres_at_integers(camera: dp.Camera) -> None:
     assert half.size == (320, 240)
 
 
-@pytest.mark.parametrize("size", [(321, 240), (320, 241), (319, 240), (1280, 959), (64, 48), (1, 1), (2133, 1600)])
+@pytest.mark.parametrize(
+    "size", [(321, 240), (320, 241), (319, 240), (1280, 959), (64, 48), (13, 10), (4, 3), (2133, 1600)]
+)
 def test_resizing_allows_for_sides_rounded_to_whole_pixels(camera: dp.Camera, size: tuple[int, int]) -> None:
     """Each axis keeps its own scale, so that the pixels are exactly those of the resized image."""
     points = torch.tensor([[10.0, 20, 0], [-50, 60, 0]], dtype=D)
@@ -64,7 +66,9 @@ def test_resizing_allows_for_sides_rounded_to_whole_pixels(camera: dp.Camera, si
     torch.testing.assert_close(camera.resized(size).project(points)[0], want)
 
 
-@pytest.mark.parametrize("size", [(640, 360), (1280, 720), (480, 640), (324, 240), (320, 242), (224, 224)])
+@pytest.mark.parametrize(
+    "size", [(640, 360), (1280, 720), (480, 640), (324, 240), (320, 242), (224, 224), (1, 1), (2, 2), (3, 2)]
+)
 def test_resizing_to_another_aspect_is_refused_unless_it_is_meant(camera: dp.Camera, size: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match=r"want the aspect of 640 x 480 px, got .* cropped\(left.* stretched=True"):
         camera.resized(size)
@@ -322,3 +326,30 @@ def test_converting_keeps_one_camera_in_memory_once(lens_camera: dp.Camera) -> N
     assert torch.equal(single.K, poses.K.float())
     plane = dp.Plane(torch.tensor([0.0, 0, 1], dtype=D).expand(50, 3), torch.arange(50, dtype=D))
     assert plane.to(torch.float32).normal.untyped_storage().nbytes() == 3 * 4
+
+
+@pytest.mark.plain
+def test_sizes_and_crops_that_are_none() -> None:
+    camera = dp.Camera(torch.eye(3, dtype=torch.float64), size=(640, 480))
+    with pytest.raises(TypeError, match=r"size: want \(width, height\) of the resized image, got None"):
+        camera.resized(None)
+    for left, top, name in (
+        (float("nan"), 0, "left"),
+        (0, float("inf"), "top"),
+        (0, torch.tensor(float("nan")), "top"),
+    ):
+        with pytest.raises(ValueError, match=f"{name}: want a finite number"):
+            camera.cropped(left, top, 10, 10)
+    with pytest.raises(TypeError, match="left: want a number, got NoneType"):
+        camera.cropped(None, 0, 10, 10)
+
+
+def test_opencv_s_arrays_are_copied() -> None:
+    K, dist, vector = np.diag([500.0, 500, 1]), np.array([0.1, 0, 0, 0]), np.array([0.1, 0, 5])
+    camera = dp.Camera.from_opencv(K, dist, vector, vector)
+    t = camera.t.clone()
+    for array in (K, dist, vector):
+        array[:] = 7
+    assert camera.K[0, 0] == 500
+    assert camera.distortion.coefficients[0] == 0.1
+    assert torch.equal(camera.t, t)

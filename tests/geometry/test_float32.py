@@ -77,3 +77,26 @@ def test_the_warning_points_at_the_caller_and_comes_once() -> None:
         for _ in range(5):
             dp.back_project(PIXELS.float(), far, GROUND)
     assert [warning.filename for warning in seen] == [__file__]
+
+
+def test_pixels_of_points_far_from_the_origin() -> None:
+    K = torch.tensor([[533.0, 0, 342], [0, 534, 235], [0, 0, 1]])
+    far = dp.Camera(K, t=torch.tensor([-5e6, -5e6, 500]))
+    with pytest.warns(UserWarning, match="float32: .* rounding moves pixels by 0.1 px or more; use float64"):
+        far.project(torch.tensor([[5e6 + 1, 5e6, 0.0]]))
+    far.to(torch.float64).project(torch.tensor([[5e6 + 1, 5e6, 0.0]], dtype=torch.float64))
+    near = dp.Camera(K, t=torch.tensor([-5.0, -5, 500]))
+    for points in (torch.rand(100, 3), torch.zeros(0, 3), torch.full((4, 3), float("nan"))):
+        near.project(points)
+    near.project(torch.tensor([[5.0, 5, -499.99], [0, 0, 1], [0, 0, 2]]))  # one of them close to the camera
+
+
+@pytest.mark.parametrize("learn", [(), "focal", ("pose", "plane")])
+def test_a_projector_warns_once(learn: tuple[str, ...] | str) -> None:
+    K = torch.tensor([[533.0, 0, 342], [0, 534, 235], [0, 0, 1]])
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        projector = dp.PlaneProjector(dp.Camera(K, t=torch.tensor([-5e6, -5e6, 500])), dp.Plane.z(0.0), learn=learn)
+        for _ in range(3):
+            projector(torch.tensor([[300.0, 200]]))
+    assert len(seen) == 1

@@ -1,5 +1,6 @@
 """`Plane`: the sign of its offset, fits and their derivatives, Python numbers, and what is refused."""
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -95,3 +96,51 @@ def test_bad_planes_are_refused_by_name() -> None:
     for kind, message, call in cases:
         with pytest.raises(kind, match=message):
             call()
+
+
+@pytest.mark.parametrize("length", [1e-38, 1e-24, 1e-12, 1e20, 1e38])
+def test_normals_of_any_length_in_float32(length: float) -> None:
+    direction = torch.tensor([0.0, 0.6, 0.8])
+    plane, unit = dp.Plane(direction * length, torch.tensor(3.0 * length)), dp.Plane(direction, torch.tensor(3.0))
+    points = torch.tensor([[0.0, 0, 10], [1, 2, 3]])
+    for found, want in (
+        (plane.unit_normal, direction),
+        (plane.tangents(), unit.tangents()),
+        (plane.distance(points), unit.distance(points)),
+        (plane.parallel(0.25).offset / length, torch.tensor(3.25)),
+        (torch.stack(dp.plane_axes(plane)), torch.stack(dp.plane_axes(unit))),
+        (dp.LearnablePlane(plane)().unit_normal, direction),
+    ):
+        torch.testing.assert_close(found, want, rtol=2e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1e-20, 1e20, 1e30])
+def test_points_in_any_unit_in_float32(unit: float) -> None:
+    points = torch.tensor([[0.0, 0, 1], [4, 0, 1], [0, 4, 1], [4, 4, 1.4]])
+    plane, want = dp.Plane.from_points(points * unit), dp.Plane.from_points(points)
+    torch.testing.assert_close(plane.normal, want.normal)
+    torch.testing.assert_close(plane.rms(points * unit) / unit, want.rms(points), rtol=1e-4, atol=0)
+
+
+def test_points_exactly_on_a_plane_have_an_rms_with_a_gradient() -> None:
+    points = torch.tensor([[0.0, 0, 1], [4, 0, 1], [0, 4, 1]], requires_grad=True)
+    rms = dp.Plane.z(1.0).rms(points)
+    assert rms.item() == 0
+    assert torch.equal(torch.autograd.grad(rms, points)[0], torch.zeros(3, 3))
+
+
+@pytest.mark.plain
+def test_parallels_at_no_distance() -> None:
+    for distance in (float("nan"), float("inf"), torch.tensor(float("nan"))):
+        with pytest.raises(ValueError, match="distance: want (a )?finite numbers?, got"):
+            dp.Plane.z(0.0).parallel(distance)
+    with pytest.raises(TypeError, match="distance: want a number, got"):
+        dp.Plane.z(0.0).parallel(None)
+
+
+@pytest.mark.plain
+def test_an_array_is_copied() -> None:
+    normal = np.array([0.0, 0, 1])
+    plane = dp.Plane(normal, 0.0)
+    normal[:] = 7
+    assert plane.normal.tolist() == [0, 0, 1]

@@ -214,3 +214,28 @@ def test_without_a_derivative_the_result_is_the_same() -> None:
     assert not plain.requires_grad
     assert taped.requires_grad
     torch.testing.assert_close(plain, taped.detach(), rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 14, "fisheye"])
+def test_the_lens_s_own_derivatives(count: int | str) -> None:
+    """In closed form, against automatic differentiation, on the axis and far from it."""
+    if count == "fisheye":
+        kind, numbers = KannalaBrandt, [0.01, -0.02, 0.001, 0.0005]
+        directions = [[0.0, 0, 1], [1e-9, 0, 1], [0.1, -0.05, 1], [0.15, 0, 1], [1, 2, 0], [0.3, 1, -0.4], [1, 2, 3e3]]
+    else:
+        kind = BrownConrady
+        every = [-0.2, 0.05, 0.001, -0.002, 0.002, 0.01, 0.02, 0.001, 0.001, 0.002, 0.003, 0.002, 0.02, -0.03]
+        numbers = every[: int(count)]
+        directions = [[0.0, 0, 1], [1e-9, 0, 1], [0.1, -0.05, 1], [-0.3, 0.4, 2], [0.5, 0.4, 1e-1 * 10], [1, 2, 3e3]]
+    coefficients = torch.tensor(numbers, dtype=torch.float64)
+    given = torch.tensor(directions, dtype=torch.float64)
+
+    def project(direction: Tensor, coefficients: Tensor) -> Tensor:
+        return kind(coefficients).project_direction(direction[None])[0][0]
+
+    by_direction, by_coefficients = vmap(jacrev(project, (0, 1)), (0, None))(given, coefficients)
+    lens = kind(coefficients)
+    torch.testing.assert_close(lens.by_direction(given), by_direction, rtol=1e-12, atol=1e-15)
+    torch.testing.assert_close(lens.by_coefficients(given), by_coefficients, rtol=1e-12, atol=1e-18)
+    some = given[2:].clone().requires_grad_()
+    assert gradcheck(lens.by_direction, some, atol=1e-7)

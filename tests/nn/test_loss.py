@@ -55,3 +55,30 @@ def test_ground_resolution_is_a_finite_difference(lens_camera: dp.Camera, pixels
         ahead, behind = (dp.back_project(pixels[i] + s * around, lens_camera, plane)[0] for s in (1, -1))
         torch.testing.assert_close(got[i], (ahead - behind).norm(dim=-1).amax() / 2e-4, rtol=1e-4, atol=0)
     assert valid.all()
+
+
+def test_what_counts_nothing_and_what_does_not_fit() -> None:
+    points, target = torch.rand(3, 3, requires_grad=True), torch.rand(3, 3)
+    nothing = dp.PlaneLoss()(points[:0], target[:0])
+    assert nothing.item() == 0
+    assert torch.equal(torch.autograd.grad(nothing, points)[0], torch.zeros(3, 3))
+    valid, weights = torch.tensor([True, True, False]), torch.tensor([1.0, 2, float("nan")])
+    found = dp.PlaneLoss()(points, target, valid, weights)
+    torch.testing.assert_close(found, ((points - target).square().sum(-1) * torch.tensor([1.0, 2, 0])).mean())
+    assert bool(torch.autograd.grad(found, points)[0].isfinite().all())
+
+
+@pytest.mark.plain
+@pytest.mark.parametrize("name", ["valid", "weights", "resolution", "target"])
+def test_shapes_that_stretch_the_points(name: str) -> None:
+    points = torch.rand(4, 3, 3)
+    given = {"target": points, "valid": None, "weights": None, "resolution": None}
+    for shape in ((4, 1), (5, 4, 3), (2, 3)):
+        wrong = torch.ones(*shape, dtype=torch.bool if name == "valid" else torch.float32)
+        given[name] = wrong.unsqueeze(-1).expand(*shape, 3) if name == "target" else wrong
+        if name == "target" and shape == (4, 1):
+            continue  # one target for all points of a camera
+        with pytest.raises(ValueError, match=f"{name}: want a shape that broadcasts to"):
+            dp.PlaneLoss()(points, **given)
+    with pytest.raises(TypeError, match="valid: want booleans"):
+        dp.PlaneLoss()(points, points, torch.ones(4, 3))

@@ -1,0 +1,152 @@
+"""Whether the views tell a tilted sensor, a thin prism and skew from a principal point that lies elsewhere.
+
+All of them bend the image to one side, each a little differently. Together they can carry the principal point a hundred
+pixels away for a hair of the error: along such a valley the image hardly changes. Its deviation tells a part of it:
+it is that of the place where the fit ended, in a valley that is curved; and the little that the board is uneven moves
+the minimum along it, in all views alike.
+
+So the same camera is fitted once more without them. Where the corners hardly notice, and yet the principal point or a
+focal length is no longer where its error bar has it, the views do not tell which is right: with d the step from the one
+to the other, the mean square of the error of the parameters that were kept is
+
+    C + d d^T
+
+if the simpler camera is the right one, and no more if it is not.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.adequacy import EXACT_PX, SIGNIFICANT
+from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.dispersion import dispersion
+from diffproj.calibration.fit import Fit, fit
+from diffproj.calibration.leftover import effect
+from diffproj.calibration.parametrisation import INTRINSICS, SKEW
+from diffproj.calibration.solver import Status
+from diffproj.calibration.uncertainty import covariance_of
+
+ONE_SIDED = (("tau_x", "tau_y"), ("s1", "s2", "s3", "s4"), (SKEW,))
+"""Groups of parameters that bend the image to one side, as a shift of the principal point does."""
+FAR = 2.0
+"""Deviations of an intrinsic parameter beyond which its error bar does not cover another value."""
+
+
+@dataclass(frozen=True, eq=False)
+class Simpler:
+    """A simpler camera that the corners of one calibration fit about as well, and whose intrinsics are others.
+
+    Attributes:
+        held: names of the parameters that are 0 in it.
+        name: of the intrinsic parameter that differs most, in deviations.
+        here: its value in the calibration.
+        there: its value in the simpler camera.
+        growth: part by which the residuals are larger there.
+        step: from the shared parameters here to those there `(s,)`.
+    """
+
+    held: tuple[str, ...]
+    name: str
+    here: float
+    there: float
+    growth: float
+    step: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Entangled:
+    """What the views of P cameras do not tell from their intrinsics; looked for when it is asked for.
+
+    Attributes:
+        found: the fit.
+        status: how each camera ended `(P,)`; one that did not converge is not looked at.
+    """
+
+    found: Fit
+    status: Tensor
+
+    @cached_property
+    def simpler(self) -> dict[int, Simpler]:
+        """The simplest camera that the corners fit about as well, by the number of the camera, where it is another."""
+        groups = _free_groups(self.found)
+        if not groups:
+            return {}
+        with torch.no_grad():
+            sound = (self.status == Status.CONVERGED) & (self.found.pixel_sigma() > EXACT_PX)
+            which = sound.nonzero().flatten()
+            return _simpler(self.found.part(which), which.tolist(), groups) if len(which) else {}
+
+    def widened(self, covariance: Covariance) -> Covariance:
+        """The covariance `(P, ...)` with the doubt in it."""
+        if not self.simpler:
+            return covariance
+        step = torch.zeros_like(covariance.shared[..., 0])
+        for p, other in self.simpler.items():
+            step[p] = other.step.to(step)
+        return replace(covariance, shared=covariance.shared + step.unsqueeze(-1) * step.unsqueeze(-2))
+
+
+def _simpler(found: Fit, numbers: list[int], groups: list[tuple[str, ...]]) -> dict[int, Simpler]:
+    told: dict[int, Simpler] = {}
+    deviations = covariance_of(found).shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, : len(INTRINSICS)]
+    left = torch.arange(len(numbers), device=deviations.device)
+    for held in _together(groups):
+        whole = found.part(left)
+        without = _without(whole, held)
+        same = (without.solution.status == Status.CONVERGED) & (_noticed(whole, without, held) < SIGNIFICANT)
+        step = without.solution.shared - whole.solution.shared
+        off = step[:, : len(INTRINSICS)].abs() / deviations[left]
+        off = torch.where(deviations[left] > 0, off, 0.0)
+        growth = (without.solution.cost / whole.solution.cost).sqrt() - 1
+        for i in (same & (off.amax(-1) > FAR)).nonzero().flatten().tolist():
+            k = int(off[i].argmax())
+            here, there = (float(fitted.solution.shared[i, k]) for fitted in (whole, without))
+            told[numbers[int(left[i])]] = Simpler(held, INTRINSICS[k], here, there, float(growth[i]), step[i])
+        left = left[~same]
+        if len(left) == 0:
+            break
+    return told
+
+
+def _free_groups(found: Fit) -> list[tuple[str, ...]]:
+    """The groups that are free, and of which nothing is known beforehand."""
+    names = found.task.names
+    free = torch.ones(len(names), dtype=torch.bool)
+    if found.task.basis is not None:
+        free &= (found.task.basis != 0).any(-1).any(0).cpu()
+    if (known := found.measured_precision()) is not None:
+        free &= ~(known.diagonal(dim1=-2, dim2=-1) > 0).any(0).cpu()
+    groups = [tuple(name for name in group if name in names and free[names.index(name)]) for group in ONE_SIDED]
+    return [group for group in groups if group]
+
+
+def _together(groups: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """The names of all groups, then of fewer and fewer of them."""
+    return [
+        tuple(name for group in chosen for name in group)
+        for count in range(len(groups), 0, -1)
+        for chosen in combinations(groups, count)
+    ]
+
+
+def _without(found: Fit, held: tuple[str, ...]) -> Fit:
+    """The fit to the same corners with some of the parameters 0."""
+    task, shared = found.task, found.solution.shared.detach().clone()
+    where = [task.names.index(name) for name in held]
+    shared[:, where] = 0.0
+    return fit(task.holding(where), shared, tuple(z.detach() for z in found.solution.local))
+
+
+def _noticed(whole: Fit, simpler: Fit, held: tuple[str, ...]) -> Tensor:
+    """How improbable it is that the corners want what was held `(n,)`, as deviations of a normal variable.
+
+    As far as corners err together within a view, as many say as little as fewer would. The richer camera tells how far
+    they do, for the residuals of one that is too simple go together.
+    """
+    more, cost = simpler.solution.cost - whole.solution.cost, simpler.solution.cost
+    unknowns = torch.full_like(cost, len(held))
+    return effect(more / dispersion(whole), unknowns, cost, simpler.degrees_of_freedom()).deviations

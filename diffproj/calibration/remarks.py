@@ -1,0 +1,84 @@
+"""The remarks on a calibration that converged: what is to be known of it, in one text a camera."""
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.adequacy import (
+    BOW_PART,
+    EXACT_PX,
+    LENS_WORDS,
+    NOISY_PX,
+    RADIAL_SHARE,
+    SHAPE_SHARE,
+    SHAPE_VIEWS,
+    SIGNIFICANT,
+    SKEW_PART,
+    SMOOTH_SHARE,
+    other_lens,
+    poses_only,
+)
+from diffproj.calibration.entangled import Entangled, Simpler
+from diffproj.calibration.fit import Fit
+from diffproj.calibration.leftover import Effect, Leftover, leftover
+from diffproj.calibration.solver import Status
+from diffproj.calibration.task import Task
+
+
+def remarks(found: Fit, status: Tensor, doubt: Entangled) -> tuple[str, ...]:
+    """The remarks on each of P cameras, in one text; empty where there are none, or it did not converge."""
+    task = found.task
+    converged = status == Status.CONVERGED
+    held = torch.zeros_like(converged)
+    if task.prior is not None and task.prior.known is not None:
+        held = (task.prior.precision != task.prior.known).any(-1).any(-1)
+    texts: list[list[str]] = [[] for _ in status]
+    for p in (converged & held).nonzero().flatten().tolist():
+        texts[p].append("k4, k5 and k6 are drawn towards 0, for without that the lens folds inside the image")
+    for p, other in doubt.simpler.items():
+        texts[p].append(_not_told(other))
+    sigma = found.pixel_sigma().detach()
+    which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
+    if len(which):
+        left = leftover(found, which, SIGNIFICANT)
+        for i, p in enumerate(which.tolist()):
+            texts[p].extend(filter(None, [_left_over(task, left, i, p, float(sigma[p]))]))
+    return tuple("; ".join(text) for text in texts)
+
+
+def _not_told(other: Simpler) -> str:
+    it = "them" if len(other.held) > 1 else "it"
+    return (
+        f"these views hardly tell {', '.join(other.held)} from {other.name}: without {it} it is {other.there:.1f} px, "
+        f"not {other.here:.1f}, at residuals {100 * other.growth:.1f} % larger; the error bars hold both; fix {it}, or "
+        "take a simpler lens"
+    )
+
+
+def _left_over(task: Task, left: Leftover, i: int, p: int, sigma: float) -> str:
+    """The sentence on the residuals of camera `p`, number `i` of those that were tested; empty where they are noise."""
+
+    def counts(effect: Effect, share: float) -> bool:
+        return float(effect.deviations[i]) > SIGNIFICANT and float(effect.least_share[i]) > share
+
+    if not task.skew and counts(left.skew, max(SMOOTH_SHARE, SKEW_PART * float(left.smooth.least_share[i]))):
+        part = f"{100 * float(left.skew.share[i]):.0f} % of their sum of squares"
+        return f"the residuals {LENS_WORDS} over the image, as through a K with skew ({part}): take skew=True"
+    for radial, effect, share in ((True, left.radial, RADIAL_SHARE), (False, left.smooth, SMOOTH_SHARE)):
+        if counts(effect, share):
+            where = "with the distance from the principal point" if radial else "over the image"
+            part = f"{100 * float(effect.share[i]):.0f} % of their sum of squares"
+            remedy = other_lens(task, p, radial)
+            return f"the residuals {LENS_WORDS} {where}, as through another lens ({part}): {remedy}"
+    if int(task.used[p].any(-1).sum()) >= SHAPE_VIEWS and counts(left.shape, SHAPE_SHARE):
+        if counts(left.bow, BOW_PART * float(left.shape.share[i])):
+            return "the residuals repeat on the board, as if it were bent: take bow=True"
+        return (
+            f"the residuals repeat on the board, whose corners lie {float(left.moved[i]):.2g} world units (RMS) "
+            "off the target's: a flatter or better print would tell more"
+        )
+    if sigma > NOISY_PX:
+        return (
+            f"the corners scatter by {sigma:.1f} px in each coordinate, in sharp photographs by 0.1 to 0.3: "
+            "look for blur and for wrong corners"
+        )
+    return ""
