@@ -16,7 +16,7 @@ from diffproj.targets.images import Orientation, Photograph, Source, as_8_bit, g
 from diffproj.targets.numbering import follow, in_order
 from diffproj.targets.search import find_pattern
 from diffproj.targets.tasks import results_of
-from diffproj.targets.videos import Frame, moved
+from diffproj.targets.videos import Frame, distinct
 from diffproj.targets.views import Views
 
 
@@ -58,8 +58,8 @@ def detect(
     it is found so, by OpenCV's detectors. Its dark and light may be exchanged, as in thermal images. Each corner is
     then placed by fitting its neighbourhood with two crossing edges, their blur and the light. Corners that do not look
     like corners, or lie off the surface through their neighbours, are sought once more, and hidden (`Views.visible`) if
-    they stay so: behind a hand or a clip, in glare, beyond the photograph's border. Half of all corners, and of those along each
-    side, must be visible.
+    they stay so: behind a hand or a clip, in glare, beyond the photograph's border. Half of all corners, and of those
+    along each side, must be visible.
 
     The order is that of `Chessboard.points`. It is never mirrored: along a row, then down a column, is clockwise in the
     image. It starts at a dark corner of the board: the square between the first four corners is dark, and so is the one
@@ -110,26 +110,28 @@ def detect(
         raise TypeError(f"progress: want a function of (done, total), got {type(progress).__name__}")
     if orientation not in get_args(Orientation):
         raise ValueError(f"orientation: want 'sensor' or 'upright', got {orientation!r}")
+    raster: Orientation = "upright" if orientation == "upright" else "sensor"
     if executor is not None and not callable(getattr(executor, "submit", None)):
         raise TypeError(f"executor: want a concurrent.futures.Executor, got {type(executor).__name__}")
     if frames is not None and (isinstance(frames, bool) or not isinstance(frames, int) or frames < 1):
         raise ValueError(f"frames: want a whole number from 1 on, got {frames!r}")
     listing = listed(photographs, frames)
-    size = _common_size(listing, results_of(functools.partial(_size, orientation=orientation), listing, executor))
-    find = functools.partial(_find, board=board, orientation=orientation)
+    size = _common_size(listing, results_of(functools.partial(_size, orientation=raster), listing, executor))
+    find = functools.partial(_find, board=board, orientation=raster)
     found = results_of(find, listing, executor, progress)
     pairs = [(photograph, one.grid) for photograph, one in zip(listing, found, strict=True) if one.grid is not None]
     if not pairs:
         raise BoardNotFoundError(_advice([photograph.label for photograph in listing], found, board))
     for photograph, one in zip(listing, found, strict=True):
-        if one.grid is None and not _chosen(photograph):
+        if one.grid is None and _sharpness(photograph) is None:
             text = f"{_miss(photograph, one.seen, board)}; photograph skipped"
             warnings.warn(text, BoardNotFoundWarning, stacklevel=2)
     seen, grids = zip(*pairs, strict=True)
     grids = follow(list(grids), board)
     # Of a video, one view of each place: copies of a view make error bars too small.
-    new = iter(moved([grid for photograph, grid in zip(seen, grids, strict=True) if _chosen(photograph)], size))
-    kept = [k for k, photograph in enumerate(seen) if not _chosen(photograph) or next(new)]
+    chosen = [k for k, photograph in enumerate(seen) if _sharpness(photograph) is not None]
+    new = distinct([grids[k] for k in chosen], [_sharpness(seen[k]) or 0.0 for k in chosen], size)
+    kept = sorted({*range(len(seen))} - {k for k, differs in zip(chosen, new, strict=True) if not differs})
     pixels = torch.from_numpy(np.stack([grids[k] for k in kept])).reshape(len(kept), len(board), 2)
     names = [seen[k].name for k in kept]
     return Views(pixels, pixels.isfinite().all(dim=-1), names=names, size=size)
@@ -170,9 +172,9 @@ def _check_board(board: object) -> None:
         raise ValueError(f"board: want at least 3 x 3 inner corners for OpenCV's detector, got {got}")
 
 
-def _chosen(photograph: Photograph) -> bool:
-    """Whether it is a frame of a video that was chosen by itself, so that it need not show the board, nor anew."""
-    return isinstance(photograph.source, Frame) and photograph.source.chosen
+def _sharpness(photograph: Photograph) -> float | None:
+    """Of a frame of a video that was chosen for its sharpness, so that it need not show the board; None for others."""
+    return photograph.source.sharpness if isinstance(photograph.source, Frame) else None
 
 
 def _size(photograph: Photograph, orientation: Orientation) -> tuple[int, int]:

@@ -26,18 +26,19 @@ class Frame(NamedTuple):
         video: the file.
         number: of the frame, from 0.
         png: the grey image.
-        chosen: whether it was chosen for its sharpness, so that others may show the board at the same place.
+        sharpness: for which it was chosen, so that others may show the board at the same place; None for one of each
+            so-manieth frame.
     """
 
     video: Path
     number: int
     png: bytes
-    chosen: bool
+    sharpness: float | None
 
     @property
     def image(self) -> UInt8[np.ndarray, "h w"]:
         """The grey image `(H, W)`."""
-        return cv2.imdecode(np.frombuffer(self.png, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+        return np.asarray(cv2.imdecode(np.frombuffer(self.png, dtype=np.uint8), cv2.IMREAD_GRAYSCALE))
 
 
 def frames_of(video: Path, every: int | None) -> list[Frame]:
@@ -50,7 +51,7 @@ def frames_of(video: Path, every: int | None) -> list[Frame]:
     if not count:
         raise ValueError(f"{video}: want a video, got a file of which OpenCV reads no frame")
     if every is not None:
-        return [_kept(video, n, image, chosen=False) for n, image in islice(enumerate(_decoded(video)), 0, None, every)]
+        return [_kept(video, n, image, None) for n, image in islice(enumerate(_decoded(video)), 0, None, every)]
     length = -(-count // MOST)
     frames: list[Frame] = []
     best = -1.0
@@ -62,21 +63,20 @@ def frames_of(video: Path, every: int | None) -> list[Frame]:
             if best >= 0:
                 frames.pop()
             best = sharpness
-            frames.append(_kept(video, number, image, chosen=True))
+            frames.append(_kept(video, number, image, sharpness))
     return frames
 
 
-def moved(grids: list[Float[np.ndarray, "rows columns 2"]], size: tuple[int, int]) -> list[bool]:
-    """Which of successive views of a board differ from all that are kept before them."""
-    kept: list[np.ndarray] = []
+def distinct(
+    grids: list[Float[np.ndarray, "rows columns 2"]], sharpness: list[float], size: tuple[int, int]
+) -> list[bool]:
+    """Which views of a board to keep so that all differ: the sharpest of each place."""
     least = MOVED * float(np.hypot(*size))
-    answers = []
-    for grid in grids:
-        new = all(np.nanmean(np.linalg.norm(grid - other, axis=-1)) >= least for other in kept)
-        answers.append(new)
-        if new:
-            kept.append(grid)
-    return answers
+    kept: list[int] = []
+    for k in sorted(range(len(grids)), key=lambda k: -sharpness[k]):
+        if all(np.nanmean(np.linalg.norm(grids[k] - grids[other], axis=-1)) >= least for other in kept):
+            kept.append(k)
+    return [k in kept for k in range(len(grids))]
 
 
 def _decoded(video: Path) -> Iterator[UInt8[np.ndarray, "_h _w"]]:
@@ -99,5 +99,5 @@ def _sharpness(image: UInt8[np.ndarray, "h w"]) -> float:
     return float(cv2.Laplacian(small, cv2.CV_32F).var())
 
 
-def _kept(video: Path, number: int, image: UInt8[np.ndarray, "h w"], *, chosen: bool) -> Frame:
-    return Frame(video, number, cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes(), chosen)
+def _kept(video: Path, number: int, image: UInt8[np.ndarray, "h w"], sharpness: float | None) -> Frame:
+    return Frame(video, number, cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes(), sharpness)

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 
 import diffproj as dp
 from diffproj import cli
@@ -91,7 +92,7 @@ def test_calibrate_fits_the_bow(photographs: Path, tmp_path: Path, capsys: pytes
 
 
 def test_calibrate_names_rejected_corners(
-    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, file = tmp_path / "photographs", tmp_path / "camera.json"
     shutil.copytree(photographs, folder)
@@ -100,13 +101,13 @@ def test_calibrate_names_rejected_corners(
     assert code == 0
     assert "No corner rejected as outlier" in out
     corner = 11
-    shift = torch.zeros(3, 40, 2, dtype=torch.float64)
+    shift = torch.zeros(5, 40, 2, dtype=torch.float64)
     shift[2, corner, 0] = 4.0
     found = calibrate_command.find_corners
 
-    def spoilt(*arguments, **options):
+    def spoilt(*arguments: Any, **options: Any) -> dp.Views:
         views = found(*arguments, **options)
-        return dp.Views(views.pixels + shift[: len(views)], names=views.names, size=views.size)
+        return dp.Views(views.pixels + shift, names=views.names, size=views.size)
 
     monkeypatch.setattr(calibrate_command, "find_corners", spoilt)
     code, out, _ = calibrate(capsys, folder, *options)
