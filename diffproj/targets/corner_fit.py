@@ -105,7 +105,8 @@ def _fit_block(
             slopes = torch.where(better[:, None, None], new_slopes, slopes)
             cost = torch.where(better, new_cost, cost)
         damping = torch.where(better[:, None], damping * 0.1, damping * 10).clamp(1e-7, 1e6)
-        if bool((step[:, :2].abs().amax(-1) < CLOSE).all()):
+        # A start at the very place says nothing yet about the blur, which decides how well the model fits.
+        if bool((step[:, :2].abs().amax(-1) < CLOSE).all()) and bool((step[:, 8].abs() < 0.05).all()):
             break
     return _judged(unknowns, cost, slopes, weight, corners, base, radius)
 
