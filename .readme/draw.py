@@ -1,6 +1,7 @@
 """Draws the README's pictures again: `python .readme/draw.py [FOLDER]`, by default beside this file."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import diffproj as dp
@@ -8,10 +9,11 @@ from diffproj import figures
 
 views = dp.example_views("left")
 experiment = dp.run_experiment(views[:8], views[8:], dp.Chessboard(axes="paper"))
+experiment = replace(experiment, fit=replace(experiment.fit, unit="mm"))
 calibration = dp.calibrate(views, dp.Chessboard())
 pictures = {
     "fig7.png": figures.png(figures.fig7(experiment), dpi=80),
-    "accuracy.png": figures.png(figures.accuracy(dp.AccuracyMap.over_image(calibration), unit="mm"), dpi=90),
+    "accuracy.png": figures.png(figures.accuracy(dp.AccuracyMap.over_image(calibration, view=0), unit="mm"), dpi=90),
 }
 folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
 for name, content in pictures.items():

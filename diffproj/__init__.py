@@ -14,7 +14,12 @@ Conventions, which hold everywhere:
 * Shapes: `K (*B, 3, 3)`, pixels `(*B, N, 2)`, points `(*B, N, 3)`; a camera or plane has batch shape `*B`, which
   broadcasts. dtype and device of the input are kept and must agree; half and bfloat16 pixels are lifted. A caller's
   tensor is never written.
-* What fails for one element is reported in `valid`; a mistake of the caller raises `TypeError` or `ValueError`.
+* NumPy arrays and lists of numbers are taken wherever a tensor is, images excepted. They are copied, and take the dtype
+  and device of the camera, lens or tensors that they meet; alone, an array of floats keeps its dtype, and all else
+  becomes float64.
+* What fails for one element is reported in `valid`; a mistake of the caller raises `TypeError` (the wrong kind) or
+  `ValueError` (a value or shape that cannot be; `IndexError` where something is indexed) whose message names the
+  argument, what it wants, and what it got.
 * The world's unit is whatever the board's square is given in. RMS is OpenCV's: `sqrt(sum |e|^2 / number of points)`.
 
 Glossary:
@@ -42,48 +47,10 @@ which lives in `diffproj.targets.synthetic`, renders photographs with known trut
 """
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from diffproj.calibration.ambiguity import AmbiguousPoseWarning
-from diffproj.calibration.calibrate import calibrate
-from diffproj.calibration.comparison import LensComparison
-from diffproj.calibration.covariance import Covariance
-from diffproj.calibration.locate import locate
-from diffproj.calibration.losses import Cauchy, Huber, Loss, SoftL1
-from diffproj.calibration.options import CalibrationOptions, LocateOptions
-from diffproj.calibration.refine import refine
-from diffproj.calibration.result import Calibration, CalibrationError
-from diffproj.calibration.solver import Status
-from diffproj.calibration.validation import CrossValidation, bootstrap, cross_validate
-from diffproj.files.load import load_calibration, load_camera
-from diffproj.files.save import save_camera
-from diffproj.geometry.back_projection import PlaneMap, Reason, back_project, explain, ground_resolution
-from diffproj.geometry.camera import Camera
-from diffproj.geometry.euler import euler_from_rotation, rotation_from_euler
-from diffproj.geometry.plane import Plane
-from diffproj.geometry.rectification import plane_axes, rectify, render
-from diffproj.lens.brown_conrady import BrownConrady
-from diffproj.lens.kannala_brandt import KannalaBrandt
-from diffproj.lens.models import register_lens
-from diffproj.lens.protocol import Lens
-from diffproj.measurement.accuracy_map import AccuracyMap
-from diffproj.measurement.measure import measure
-from diffproj.measurement.measurement import Measurement
-from diffproj.measurement.quantity import Quantity
-from diffproj.nn.camera import LearnableCamera
-from diffproj.nn.loss import PlaneLoss
-from diffproj.nn.plane import LearnablePlane
-from diffproj.nn.prior import CalibrationPrior
-from diffproj.nn.projector import PlaneProjector
-from diffproj.paper.experiment import Experiment, run_experiment
-from diffproj.paper.route import paper_route
-from diffproj.paper.setup import PaperSetup, paper_setup
-from diffproj.targets import synthetic as synthetic
-from diffproj.targets.chessboard import Chessboard
-from diffproj.targets.detection import BoardNotFoundError, BoardNotFoundWarning, detect
-from diffproj.targets.examples import example_views
-from diffproj.targets.residuals import image_residuals, plane_residuals
-from diffproj.targets.views import Views
+if TYPE_CHECKING:
+    from diffproj._public import *
 
 __version__ = "0.1.0"
 
@@ -98,6 +65,7 @@ __all__ = [
     "CalibrationOptions",
     "CalibrationPrior",
     "Camera",
+    "CameraMismatchWarning",
     "Cauchy",
     "Chessboard",
     "Covariance",
@@ -113,6 +81,7 @@ __all__ = [
     "Loss",
     "Measurement",
     "PaperSetup",
+    "PixelNoiseWarning",
     "Plane",
     "PlaneLoss",
     "PlaneMap",
@@ -132,6 +101,7 @@ __all__ = [
     "explain",
     "ground_resolution",
     "image_residuals",
+    "load",
     "load_calibration",
     "load_camera",
     "locate",
@@ -154,8 +124,20 @@ _RENAMED = {"image_map": "AccuracyMap.over_image", "plane_map": "AccuracyMap.ove
 
 
 def __getattr__(name: str) -> Any:
-    """`diffproj.figures` at its first use, for it needs matplotlib, which nothing else does; names that changed."""
+    """All public names when the first is asked for; `diffproj.figures` at its own first use, for it needs matplotlib.
+
+    And the new names of those that changed.
+    """
+    if name in __all__ or name == "synthetic":
+        public = import_module("diffproj._public")
+        globals().update({each: getattr(public, each) for each in (*__all__, "synthetic")})
+        return globals()[name]
     if name == "figures":
         return import_module("diffproj.figures")
     remedy = f"; it is diffproj.{_RENAMED[name]} now" if name in _RENAMED else ""
     raise AttributeError(f"module 'diffproj' has no attribute {name!r}{remedy}")
+
+
+def __dir__() -> list[str]:
+    """The public names, whether they were asked for yet or not."""
+    return sorted([*__all__, "__version__", "figures", "synthetic"])

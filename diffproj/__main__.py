@@ -13,7 +13,11 @@ def main() -> int:
         missing = (error.name or "").partition(".")[0]
         if missing not in ("matplotlib", "rich"):
             raise
-        print(f"diffproj: the command line needs {missing}; pip install 'diffproj[cli]'", file=sys.stderr)
+        print(
+            f"diffproj: the command line needs {missing}: pip install {missing}, or, in the folder of diffproj's "
+            "source, pip install '.[cli]'",
+            file=sys.stderr,
+        )
         return 1
 
 

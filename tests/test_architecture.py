@@ -96,8 +96,18 @@ def test_public_names_are_documented_and_sorted() -> None:
     assert all(getattr(diffproj, name).__doc__ for name in diffproj.__all__)
 
 
-def test_import_loads_neither_the_compiler_nor_matplotlib() -> None:
-    """Both take as long as PyTorch itself."""
-    command = "import sys, diffproj; print(*(name in sys.modules for name in ('torch._dynamo', 'matplotlib')))"
+def test_public_names_are_there_before_they_are_asked_for() -> None:
+    command = "import diffproj; print(*(name for name in dir(diffproj) if not name.startswith('_')))"
     done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True)
-    assert (done.stdout.strip(), done.stderr) == ("False False", "")
+    assert done.stdout.split() == sorted([*diffproj.__all__, "figures", "synthetic"])
+    assert done.stderr == ""
+
+
+def test_importing_waits_for_nothing_before_a_public_name_is_asked_for() -> None:
+    """And that loads neither the compiler nor matplotlib, each of which takes as long as PyTorch itself."""
+    command = (
+        "import sys, diffproj; print('torch' in sys.modules); diffproj.Camera\n"
+        "print(*(name in sys.modules for name in ('torch', 'torch._dynamo', 'matplotlib')))"
+    )
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("False\nTrue False False\n", "")

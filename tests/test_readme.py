@@ -54,6 +54,10 @@ def folder(example: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) ->
     shutil.copy(folder / "photos" / "3.jpg", folder / "photo.jpg")
     dp.save_camera(folder / "camera.json", calibration)
     dp.save_camera(folder / "camera.yaml", calibration)
+    two = calibration.cameras[:2]
+    two = dp.Camera(two.K, two.R, two.t, size=two.size)
+    dp.save_camera(folder / "camchain.yaml", two, format="kalibr")
+    dp.save_camera(folder / "cameras.txt", two.without_pose())
     return folder
 
 
@@ -79,6 +83,8 @@ def inputs(example: dict[str, Any]) -> dict[str, Any]:
         "corners": torch.stack([calibration.views.pixels, right.pixels]),
         "visible": torch.stack([calibration.views.visible, right.visible]),
         "plane": plane,
+        "located": dp.locate(example["views"], example["board"], calibration),
+        "measured": dp.measure(example["pixels"].detach(), calibration, plane, view=0, pixel_sigma=0.5),
         "extent": (0.0, 0.0, 200.0, 125.0),
         "resolution": 2.5,
         "image": image,

@@ -1,5 +1,6 @@
 """Write files whole or not at all."""
 
+import errno
 import os
 import secrets
 from pathlib import Path
@@ -17,10 +18,24 @@ def write_whole(path: str | os.PathLike[str], content: str | bytes) -> None:
         content: text (written as UTF-8) or bytes.
 
     Raises:
-        OSError: the folder does not exist or cannot be written; an existing file is then as it was.
+        OSError: the folder does not exist or cannot be written, the disk is full, or there is something else than a
+            file; an existing file is then as it was. The error names the path.
     """
-    path = Path(os.path.realpath(path))
+    real = Path(os.path.realpath(path))
     data = content.encode() if isinstance(content, str) else content
+    try:
+        _put(real, data)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), os.fspath(path)) from error
+
+
+def _put(path: Path, data: bytes) -> None:
+    if path.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+    if path.exists() and not path.is_file():
+        raise OSError(
+            errno.EISDIR if path.is_dir() else errno.EEXIST, "want the place of a file, got a folder or a device"
+        )
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     handle = os.open(temporary, flags, 0o666)  # less the umask, which the system takes off by itself

@@ -7,6 +7,7 @@ and `torch.export` carry it. Inside such a transformation the tensors are tracer
 whose values nobody can read: this is why a PyTree is rebuilt by `unchecked`.
 """
 
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, TypeVar
 
@@ -15,8 +16,10 @@ import torch
 import torch.utils._pytree as torch_pytree
 from torch import Tensor
 
+from diffproj._core.arguments import called, listing, whole_number
 from diffproj._core.copying import Copied
 from diffproj._core.numerics import at_least_float32, converted
+from diffproj._core.shown import Shown
 
 T = TypeVar("T")
 B = TypeVar("B", bound="Batched")
@@ -24,7 +27,7 @@ Rearrange = Callable[[Tensor, int], Tensor]
 """Takes a tensor and how many axes it has behind those of the batch to the same in another arrangement."""
 
 
-class Batched(Copied):
+class Batched(Copied, Shown):
     """Tensors that share batch axes `*B`, parts with the same batch axes, and constants."""
 
     __slots__ = ()
@@ -76,10 +79,20 @@ class Batched(Copied):
         """The same in another dtype or on another device: arguments as `torch.Tensor.to`; half becomes float32.
 
         Raises:
-            TypeError: the dtype is not of floating-point type.
+            TypeError: the arguments name no dtype and no device, or a dtype that is not of floating-point type.
+            ValueError: there is no such device.
         """
         # An empty tensor shows what the arguments ask for.
-        wanted = at_least_float32(torch.empty(0, dtype=self.dtype, device=self.device).to(*args, **kwargs))
+        try:
+            wanted = torch.empty(0, dtype=self.dtype, device=self.device).to(*args, **kwargs)
+        except TypeError:
+            given = ", ".join(called(value) for value in (*args, *kwargs.values()))
+            raise TypeError(f"dtype, device: want a torch.dtype, a device or a tensor, got {given}") from None
+        except (RuntimeError, AssertionError, NotImplementedError, ValueError, OverflowError) as error:
+            raise ValueError(
+                f"dtype, device: want ones that are here, got {(*args, *kwargs.values())} ({error})"
+            ) from None
+        wanted = at_least_float32(wanted)
         if not wanted.is_floating_point():
             raise TypeError(f"dtype: want a floating-point one, got {wanted.dtype}")
 
@@ -114,7 +127,7 @@ class Batched(Copied):
             raise TypeError(f"batch_shape: want whole numbers, got {tuple(shape)}")
         new = len(shape) - len(own)
         wanted = [own[k - new] if length == -1 and k >= new else length for k, length in enumerate(shape)]
-        fits = new >= 0 and all(length >= 0 for length in wanted[:new])
+        fits = new >= 0 and all(0 <= length < sys.maxsize for length in wanted[:new])
         if not fits or any(length not in (1, want) for length, want in zip(own, wanted[new:], strict=True)):
             raise ValueError(f"batch_shape: want one that {tuple(own)} broadcasts to, got {tuple(shape)}")
         return torch.Size(wanted)
@@ -124,7 +137,7 @@ class Batched(Copied):
 
         Raises:
             TypeError: the index is not one that tensors take.
-            IndexError: there is no such element.
+            IndexError: there is no such element, or the index does not fit the batch shape.
         """
         check_index(index)
         return self._rearranged(lambda tensor, behind: index_batch(tensor, index, behind), lambda part: part[index])
@@ -139,12 +152,14 @@ class Batched(Copied):
 
         Raises:
             TypeError: others than this class among them, or different dtypes or kinds of parts.
-            ValueError: none, different constants, or batch shapes that do not broadcast.
+            ValueError: none, different constants, shapes or devices, or batch shapes that do not broadcast, or no such
+                axis.
         """
-        items = list(items)
+        items = listing("items", items, f"several {cls.__name__}")
         if not items or not all(isinstance(item, cls) for item in items):
             got = ", ".join(sorted({type(item).__name__ for item in items})) or "none"
             raise (TypeError if items else ValueError)(f"items: want at least one {cls.__name__}, got {got}")
+        items = cls._alike(items)
         if len({item.dtype for item in items}) > 1:
             raise TypeError(f"items: want one dtype, got {sorted({str(item.dtype) for item in items})}; .to() converts")
         try:
@@ -152,11 +167,23 @@ class Batched(Copied):
         except RuntimeError:
             got = ", ".join(str(tuple(item.batch_shape)) for item in items)
             raise ValueError(f"items: batch shapes do not broadcast: {got}") from None
+        if len({item.device for item in items}) > 1:
+            raise ValueError(f"items: want one device, got {sorted({str(item.device) for item in items})}; .to() moves")
         items = [item.expand(*batch) for item in items]
-        dim = dim % (len(batch) + 1)
+        for name in cls._tensors:
+            shapes = {tuple(getattr(item, name).shape) for item in items}
+            if len(shapes) > 1:
+                raise ValueError(f"items: want {name} of one shape, got {sorted(shapes)}")
+        axes = len(batch) + 1
+        dim = whole_number("dim", dim, f"an axis from {-axes} to {axes - 1}", least=-axes, most=axes - 1) % axes
         fields = {name: torch.stack([getattr(item, name) for item in items], dim) for name in cls._tensors}
         fields |= {name: _stacked(name, [getattr(item, name) for item in items], dim) for name in cls._parts}
         return cls.unchecked(**fields, **{name: cls._agreed(name, items) for name in cls._constants})
+
+    @classmethod
+    def _alike(cls, items: list[Any]) -> list[Any]:
+        """The items that are to be stacked, those that adapt to others adapted."""
+        return items
 
     @classmethod
     def _agreed(cls: type[B], name: str, items: Sequence[B]) -> Any:
@@ -243,7 +270,8 @@ def _is_index(part: Any) -> bool:
 def _described(part: Any) -> str:
     """The kind of a thing that is no index; of a list, that of what does not belong there."""
     if isinstance(part, list):
-        return f"a list with {_described(next(element for element in part if not _is_index(element)))}"
+        odd = (element for element in part if isinstance(element, slice) or not _is_index(element))
+        return f"a list with {_described(next(odd))}"
     if isinstance(part, Tensor | np.ndarray):
         return f"{type(part).__name__} of {part.dtype}"
     return type(part).__name__
@@ -256,8 +284,9 @@ def index_batch(tensor: Tensor, index: Any, behind: int) -> Tensor:
         index = (*index, Ellipsis)
     try:
         return tensor[(*index, *(slice(None),) * behind)]
-    except (ValueError, OverflowError) as error:  # numbers beyond 64 bits
-        raise IndexError(f"index: want numbers of the batch, got others ({error})") from None
+    except (IndexError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        shape = tuple(tensor.shape[: tensor.ndim - behind])
+        raise IndexError(f"index: want one that fits the batch shape {shape}, got another ({error})") from None
 
 
 def _for_tensors(part: Any) -> Any:

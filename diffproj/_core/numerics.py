@@ -13,27 +13,17 @@ Three rules live here because they are easy to break one call at a time:
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from diffproj._core.arguments import Kind, tensor_of
 from diffproj._core.torch_private import in_forward_mode, in_functional_transform
 
 BLOCK_POINTS = 2**16
 """Points handled at once when no derivative is asked: large enough to hide the cost of dispatch, small enough that
 the intermediate results stay in the processor's cache."""
-
-
-@runtime_checkable
-class Kind(Protocol):
-    """What has a dtype and a device: a tensor, a lens."""
-
-    @property
-    def dtype(self) -> torch.dtype: ...
-
-    @property
-    def device(self) -> torch.device: ...
 
 
 # ----------------------------------------------------------------------------------------------- argument checks
@@ -44,55 +34,38 @@ def at_least_float32(tensor: Tensor) -> Tensor:
     return tensor.float() if tensor.dtype in (torch.float16, torch.bfloat16) else tensor
 
 
-def check_tensor(name: str, value: object, *shape: int | str) -> Tensor:
+def check_tensor(name: str, value: object, *shape: int | str, like: Kind | None = None) -> Tensor:
     """Check that `value` is a floating-point tensor whose trailing axes fit `shape`, and lift it.
+
+    NumPy arrays and lists of numbers are taken as well: see `diffproj._core.arguments`.
 
     Args:
         name: the argument's name, for the message.
         value: what the caller handed in.
         shape: the trailing axes: a number where the length is fixed, a word where it is free; `"*"` in front of them
             stands for any leading axes and is implied.
+        like: whose dtype and device an array takes on.
 
     Returns:
         The tensor, in float32 if it came in half precision.
 
     Raises:
-        TypeError: not a tensor, or not of floating-point type.
+        TypeError: no tensor, array or numbers, or a tensor that is not of floating-point type.
         ValueError: the trailing axes do not fit.
     """
     if not isinstance(value, Tensor):
-        raise TypeError(f"{name}: want a torch.Tensor, got {type(value).__name__}; torch.as_tensor(...) makes one")
+        value = tensor_of(name, value, like)
     if not value.is_floating_point():
         raise TypeError(f"{name}: want a floating-point tensor, got {value.dtype}; .double() or .float() makes one")
-    fits = value.ndim >= len(shape) and all(
-        isinstance(want, str) or want == got
-        for want, got in zip(shape, value.shape[value.ndim - len(shape) :], strict=True)
-    )
-    if not fits:
-        want = ", ".join(["*B", *map(str, shape)])
-        raise ValueError(f"{name}: want shape ({want}), got {tuple(value.shape)}")
+    if shape:
+        fits = value.ndim >= len(shape) and all(
+            isinstance(want, str) or want == got
+            for want, got in zip(shape, value.shape[value.ndim - len(shape) :], strict=True)
+        )
+        if not fits:
+            want = ", ".join(["*B", *map(str, shape)])
+            raise ValueError(f"{name}: want shape ({want}), got {tuple(value.shape)}")
     return at_least_float32(value)
-
-
-def check_number(name: str, value: object) -> None:
-    """Check that `value` is a finite number, or a tensor of one.
-
-    Raises:
-        TypeError: it is neither.
-        ValueError: it is NaN or infinite, where its value can be read.
-    """
-    if isinstance(value, Tensor):
-        if value.numel() != 1 or value.dtype == torch.bool or value.is_complex():
-            raise TypeError(f"{name}: want a number, got a tensor of shape {tuple(value.shape)} and {value.dtype}")
-        if not has_values(value):
-            return
-        value = value.item()
-    try:
-        finite = math.isfinite(value)  # type: ignore[arg-type]
-    except TypeError:
-        raise TypeError(f"{name}: want a number, got {type(value).__name__}") from None
-    if not finite:
-        raise ValueError(f"{name}: want a finite number, got {value}")
 
 
 def check_same_kind(**tensors: Kind | None) -> None:
@@ -106,7 +79,8 @@ def check_same_kind(**tensors: Kind | None) -> None:
     (first, reference), *others = present
     for name, tensor in others:
         if tensor.dtype != reference.dtype:
-            raise TypeError(f"{name}: want {reference.dtype} as {first} has, got {tensor.dtype}; .to(...) converts")
+            want = reference.dtype
+            raise TypeError(f"{name}: want {want} as {first} has, got {tensor.dtype}; {name}.to({want}) converts")
         if tensor.device != reference.device:
             raise ValueError(f"{name}: want device {reference.device} as {first} has, got {tensor.device}")
 
@@ -131,16 +105,6 @@ def has_values(*tensors: Tensor) -> bool:
     """Whether the values of these tensors can be read here: not while compiling, exporting or under `vmap`."""
     tracing = torch.compiler.is_compiling() or in_functional_transform()
     return not (tracing or any(tensor.is_meta for tensor in tensors))
-
-
-def as_values(value: Any, like: Tensor) -> Tensor:
-    """A tensor as it is; numbers, nested lists and arrays in float64 on the device of `like`.
-
-    Python's numbers would take on PyTorch's default dtype, with 7 digits, and its default device.
-    """
-    if isinstance(value, Tensor):
-        return value
-    return torch.as_tensor(value, dtype=torch.float64 if like.device.type != "mps" else None, device=like.device)
 
 
 def spread_evenly(total: int, count: int, device: torch.device) -> Tensor:

@@ -17,7 +17,7 @@ with p the other's probability and d the step that leads to it, the mean square 
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
@@ -26,6 +26,8 @@ from diffproj.calibration.parametrisation import Pose
 
 SURE = 100.0
 """Ratio of likelihoods from which on the kept pose counts as certain: below it, its chance to be wrong exceeds 1 %."""
+MAX_NAMES = 10
+"""Names of ambiguous views in a message."""
 
 
 class AmbiguousPoseWarning(UserWarning):
@@ -78,3 +80,14 @@ def widened(covariance: Covariance, kept: Pose, others: OtherPoses, middle: Tens
     one, other = ((R.detach(), t.detach() + R.detach() @ about) for R, t in (kept, (others.R, others.t)))
     step = difference(one, other, middle.detach() - about) * others.probability.sqrt().unsqueeze(-1)
     return replace(covariance, _alone=covariance._alone + step.unsqueeze(-1) * step.unsqueeze(-2))
+
+
+def described(ambiguous: Bool[Tensor, "*batch v"], names: tuple[str, ...]) -> str:
+    """Which views are ambiguous, in words; empty where none is."""
+    doubtful = [
+        f"{names[view]}{f' of camera {tuple(camera)}' * bool(camera)}" for *camera, view in ambiguous.nonzero().tolist()
+    ]
+    if not doubtful:
+        return ""
+    more = f" and {len(doubtful) - MAX_NAMES} more views" if len(doubtful) > MAX_NAMES else ""
+    return f"two poses fit {', '.join(doubtful[:MAX_NAMES])}{more}, and the one that was kept may be the wrong one"

@@ -12,7 +12,7 @@ from diffproj.calibration.options import CalibrationOptions, calibration_options
 from diffproj.calibration.result import Calibration
 from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target
-from diffproj.targets.views import Views
+from diffproj.targets.views import Views, as_views
 
 
 def calibrate(
@@ -50,6 +50,7 @@ def calibrate(
         0.177 [533, 533]
     """
     chosen = calibration_options("calibrate", options)
-    if distortion == "auto":
+    as_views(views)
+    if isinstance(distortion, str) and distortion == "auto":
         return chosen_lens(views, target, chosen)
     return calibrated(views, target, distortion, chosen)

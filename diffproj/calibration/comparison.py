@@ -1,16 +1,17 @@
 """`LensComparison`: how the lenses fared that `calibrate(..., distortion="auto")` compared."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from jaxtyping import Float
 from torch import Tensor
 
+from diffproj._core.shown import Shown
 from diffproj.lens.models import MODELS, LensModel
 
 
-@dataclass(frozen=True, eq=False)
-class LensComparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class LensComparison(Shown):
     """Lenses side by side, from the simplest to the richest.
 
     Attributes:
@@ -33,6 +34,19 @@ class LensComparison:
     worse_px: Float[Tensor, " m"]
     deviation_px: Float[Tensor, " m"]
     causes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """The lenses as columns of Python's own numbers and words: `pandas.DataFrame` takes it."""
+        names = "fitted_px", "held_out_px", "worse_px", "deviation_px"
+        columns: dict[str, list[Any]] = {"model": list(self.models)}
+        columns |= {name: getattr(self, name).tolist() for name in names}
+        return columns | {"cause": list(self.causes)}
+
+    def _facts(self) -> list[str]:
+        return [f"{self.chosen} of {', '.join(self.models)}", f"by held-out {self.held_out}"]
+
+    def _columns(self) -> dict[str, list[Any]]:
+        return self.to_dict()
 
     def summary(self) -> str:
         """A table of text; a star marks the lens that was taken."""

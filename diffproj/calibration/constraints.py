@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._core.numerics import as_values
+from diffproj._core.arguments import called, tensor_of
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.solver import Prior
 
@@ -75,7 +75,7 @@ def make_prior(
         where = parameters.positions("priors", name)
         pair = value if isinstance(value, tuple) else (None, value)
         if len(pair) != 2:
-            raise ValueError(f"priors: want a deviation or (mean, deviation) for {name!r}, got {value!r}")
+            raise ValueError(f"priors: want a deviation or (mean, deviation) for {name!r}, got {called(value)}")
         if pair[0] is not None:
             mean = _written(mean, where, pair[0], name, batch)
         deviation = _written(torch.ones_like(mean), where, pair[1], name, batch)
@@ -91,7 +91,9 @@ def make_prior(
 
 def _written(into: Tensor, where: list[int], value: Any, name: str, batch: Sequence[int]) -> Tensor:
     """A copy with `value`, which broadcasts to `(*B, len(where))`, at some columns."""
-    tensor = as_values(value, into)
+    tensor = tensor_of(f"priors[{name!r}]", value)
+    if tensor.is_complex() or tensor.is_meta:
+        raise TypeError(f"priors: want real numbers for {name!r}, got {tensor.dtype} on {tensor.device}")
     try:
         tensor = tensor.to(into).expand(*batch, len(where)).reshape(-1, len(where))
     except RuntimeError:

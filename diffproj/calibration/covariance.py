@@ -28,15 +28,19 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.arguments import instance, position
 from diffproj._core.copying import Copied
+from diffproj._core.numerics import broadcast_batches
+from diffproj._core.shown import Shown, counted, number
+from diffproj.calibration.fields import mask, tensor
 from diffproj.calibration.solver import Equations
 
 SINGULAR = 2e-15
 """Eigenvalue of S, scaled by the diagonal of U, at and below which it is rounding error."""
 
 
-@dataclass(frozen=True, eq=False)
-class Covariance(Copied):
+@dataclass(frozen=True, eq=False, repr=False)
+class Covariance(Copied, Shown):
     """Joint covariance of shared parameters and poses, for batch shape `*B`.
 
     A pose is perturbed by `R <- exp(omega) R`, `t <- t + tau`: its six coordinates are omega in radians (about the
@@ -76,12 +80,25 @@ class Covariance(Copied):
         spread = self.shared.diagonal(dim1=-2, dim2=-1).sqrt()
         return dict(zip(self.names, spread.unbind(-1), strict=True))
 
+    def _facts(self) -> list[str]:
+        return [
+            counted(self.shared.shape[:-2], "camera"),
+            f"{len(self.names)} shared parameters",
+            f"{self.undetermined_views.shape[-1]} poses",
+            f"dispersion {number(self.dispersion)}",
+        ]
+
+    def _columns(self) -> dict[str, list[Any]]:
+        texts = [number(deviation, ".4g") for deviation in self.deviations.values()]
+        return {"parameter": list(self.names), "standard deviation": texts}
+
     def between(self, view: int, other: int) -> Float[Tensor, "*batch 6 6"]:
         """The cross-covariance of the poses of two views; the covariance of the pose where they are the same."""
+        view, other = self._number("view", view), self._number("other", other)
         F, G = self._follow[..., view, :, :], self._follow[..., other, :, :]
         Q, P = self._mixed[..., view, :, :], self._mixed[..., other, :, :]
         blocks = F @ zero_where_infinite(self.shared) @ G.mT - Q @ G.mT - F @ P.mT
-        same = view % self._alone.shape[-3] == other % self._alone.shape[-3]
+        same = view == other
         if same:
             blocks = blocks + self._alone[..., view, :, :]
         blocks = self._turns[..., view, :, :] @ blocks @ self._turns[..., other, :, :].mT
@@ -91,6 +108,7 @@ class Covariance(Copied):
 
     def cross(self, view: int) -> Float[Tensor, "*batch 6 s"]:
         """The cross-covariance of a pose (rows) and the shared parameters (columns)."""
+        view = self._number("view", view)
         cross = self._mixed[..., view, :, :] - self._follow[..., view, :, :] @ zero_where_infinite(self.shared)
         return torch.where(self.undetermined_views[..., view, None, None], 0.0, self._turns[..., view, :, :] @ cross)
 
@@ -104,7 +122,13 @@ class Covariance(Copied):
 
         The noise of both is assumed independent; the bow of the other calibration's board is dropped.
         """
+        instance("known", known, Covariance, "a dp.Covariance")
         s = self.shared.shape[-1]
+        if known.names[:s] != self.names:
+            raise ValueError(
+                f"known: want a covariance of {', '.join(self.names)}, got one of {', '.join(known.names)}"
+            )
+        broadcast_batches(covariance=self.shared.shape[:-2], known=known.shared.shape[:-2])
         shared, undetermined = known.shared[..., :s, :s], known.undetermined[..., :s]
         batch = self.shared.shape[:-2]
         shared, undetermined = shared.expand(*batch, s, s), undetermined.expand(*batch, s)
@@ -152,8 +176,8 @@ class Covariance(Copied):
 
         Raises:
             KeyError: a field is missing.
-            TypeError: a field holds something other than numbers.
-            ValueError: a field's lists are not of equal lengths.
+            ValueError: a field holds something other than numbers, shapes do not fit each other, or a variance is
+                negative.
 
         Example:
             >>> import diffproj as dp
@@ -161,22 +185,38 @@ class Covariance(Copied):
             >>> torch.equal(dp.Covariance.from_fields(covariance.to_fields()).full(), covariance.full())
             True
         """
-        undetermined, undetermined_views = (
-            torch.tensor(fields[key], dtype=torch.bool, device="cpu") for key in ("undetermined", "undetermined_views")
-        )
-        shared, *blocks = (
-            torch.tensor(fields[key], dtype=torch.float64, device="cpu")
-            for key in ("shared", "follow", "mixed", "alone")
-        )
+        names = fields["names"]
+        if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+            raise ValueError("names: want a list of texts, got something else")
+        count = len(names)
+        undetermined_views = mask(fields, "undetermined_views")
+        *batch, views = undetermined_views.shape
+        undetermined = mask(fields, "undetermined", (*batch, count))
+        shared = tensor(fields, "shared", (*batch, count, count), gaps=True)
+        follow, mixed = (tensor(fields, name, (*batch, views, 6, count), gaps=True) for name in ("follow", "mixed"))
+        alone = tensor(fields, "alone", (*batch, views, 6, 6), gaps=True)
+        for name, block in (("shared", shared), ("alone", alone)):
+            if bool((block.diagonal(dim1=-2, dim2=-1) < 0).any()):
+                raise ValueError(f"{name}: want variances of at least 0, got a negative one")
         dispersion = torch.ones_like(shared[..., 0, 0])  # a file of an earlier version has none
         if "dispersion" in fields:
-            dispersion = torch.tensor(fields["dispersion"], dtype=torch.float64, device="cpu")
+            dispersion = tensor(fields, "dispersion", tuple(batch), least=0, gaps=True)
+        middle = []
+        if "middle" in fields or "arm" in fields:
+            middle = [tensor(fields, "middle", (3,)), tensor(fields, "arm", (*batch, views, 3))]
         infinite = torch.diag_embed(torch.where(undetermined, torch.inf, 0.0).to(shared))
-        middle = [
-            torch.tensor(fields[key], dtype=torch.float64, device="cpu") for key in ("middle", "arm") if key in fields
-        ]
         known = undetermined, undetermined_views, dispersion
-        return cls(tuple(fields["names"]), shared + infinite, *known, *blocks, *middle)
+        return cls(tuple(names), shared + infinite, *known, follow, mixed, alone, *middle)
+
+    @property
+    def has_gaps(self) -> Bool[Tensor, "*batch"]:
+        """Whether anything in it is not a number `(*B,)`, as of a camera that did not converge."""
+        blocks = (self._follow, self._mixed, self._alone)
+        gaps = self.shared.isnan().flatten(-2).any(-1) | self.dispersion.isnan()
+        return gaps | torch.stack([block.isnan().flatten(-3).any(-1) for block in blocks]).any(0)
+
+    def _number(self, name: str, view: int) -> int:
+        return position(name, view, self._alone.shape[-3], "views")
 
     @property
     def _turns(self) -> Tensor:

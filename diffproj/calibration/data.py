@@ -6,13 +6,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._core.numerics import as_values, in_float64
+from diffproj._core.arguments import Array, tensor_of
+from diffproj._core.numerics import in_float64
 from diffproj.calibration.distinct import shares
 from diffproj.calibration.losses import SMALLEST
 from diffproj.calibration.task import Task
 from diffproj.lens.models import LensModel
-from diffproj.targets.target import Target
-from diffproj.targets.views import Views
+from diffproj.targets.target import Target, points_of
+from diffproj.targets.views import Views, as_views
 
 OUTSIDE = 0.02
 """Part of the image's size by which a corner may lie outside of it, by noise or a cut-off board."""
@@ -33,19 +34,19 @@ class Data:
         given_points, given_pixels, given_weights: with graph, and with `*B` in front; points in the world.
 
     Raises:
-        TypeError: views are no `Views`.
+        TypeError: views are no `Views`, the target is none, or the weights are no numbers.
         ValueError: views, board and weights do not fit together, or the board is of no use.
     """
 
-    def __init__(self, views: Views, target: Target, weights: Tensor | None) -> None:
-        if not isinstance(views, Views):
-            raise TypeError(f"views: want dp.Views, got {type(views).__name__}; dp.Views(pixels, size=...) makes them")
-        if len(views) == 0:
+    def __init__(self, views: Views, target: Target, weights: Tensor | Array | float | None) -> None:
+        if len(as_views(views)) == 0:
             raise ValueError("views: want at least one, got none")
-        if not isinstance(target, Target):
-            raise TypeError(f"target: want dp.Chessboard or anything with .points (N, 3), got {type(target).__name__}")
+        if 0 in views.batch_shape:
+            raise ValueError(f"views: want those of at least one camera, got batch shape {tuple(views.batch_shape)}")
+        if views.pixels.is_meta:
+            raise ValueError("views: want corners with values, got some on the meta device")
         self.views, self.target, self.batch = views, target, views.batch_shape
-        self.given_points = in_float64(target.points.to(views.device))
+        self.given_points = in_float64(points_of(target).to(views.device))
         self.given_pixels = in_float64(views.pixels)
         points = self.given_points.detach()
         count = views.pixels.shape[-2]
@@ -61,9 +62,11 @@ class Data:
         visible = views.visible
         self.given_weights, self.weights = None, None
         if weights is not None:
-            given = as_values(weights, views.pixels).to(views.device)
+            given = tensor_of("weights", weights)
+            if given.is_complex() or given.is_meta:
+                raise TypeError(f"weights: want real numbers, got {given.dtype} on {given.device}")
             try:
-                given = in_float64(given).expand(visible.shape)
+                given = in_float64(given.to(views.device)).expand(visible.shape)
             except RuntimeError:
                 want, got = tuple(visible.shape), tuple(given.shape)
                 raise ValueError(f"weights: want a shape that broadcasts to {want}, got {got}") from None

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from diffproj._core.numerics import as_values
+from diffproj._core.arguments import tensor_of
 from diffproj.calibration.adequacy import LENS_WORDS
 from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.held_out import Errors, folds_of, without_corners, without_views
@@ -101,7 +101,7 @@ def _compared(
     # All are judged by the same corners: without those that no lens could explain.
     outliers = torch.stack([fit.rejected for fit in fits.values() if bool(fit.converged)] or [~views.visible]).all(0)
     if chosen.weights is not None:
-        outliers = outliers | (as_values(chosen.weights, views.pixels).to(views.device).expand(outliers.shape) <= 0)
+        outliers = outliers | (tensor_of("weights", chosen.weights).to(views.device).expand(outliers.shape) <= 0)
     return [_candidate(views.hiding(outliers), target, model, fit, chosen, by_views) for model, fit in fits.items()]
 
 

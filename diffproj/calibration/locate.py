@@ -11,6 +11,7 @@ from diffproj.calibration import closed_form, start
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, fit
+from diffproj.calibration.mismatch import CameraMismatchWarning, described
 from diffproj.calibration.options import LocateOptions, locate_options
 from diffproj.calibration.outcome import outcome
 from diffproj.calibration.result import Calibration
@@ -37,7 +38,10 @@ def locate(
     other is in `alternatives`, and the covariance holds the doubt; where it may well be the right one, the view is
     `ambiguous`, and an `AmbiguousPoseWarning` names it.
     A chessboard that looks the same when turned (`Chessboard.turns`) leaves open which corner is the origin: a warning
-    says so. The board is taken to be flat, also where a calibration found a bow.
+    says so.
+    With a calibration in the place of a camera a `CameraMismatchWarning` names the views whose corners are not where it
+    sees them, as photographs of another camera, zoom or focus: see `mismatch`.
+    The board is taken to be flat, also where a calibration found a bow.
 
     Args:
         views: corners `(*B, V, N, 2)`.
@@ -68,7 +72,9 @@ def locate(
     if isinstance(target, Chessboard) and target.turns > 1:
         warn_caller(f"locate: {origin_doubt(target)}")
     if bool(found.ambiguous.any()):
-        warnings.warn(f"locate: {found.doubts}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
+        warnings.warn(f"locate: {found.ambiguity}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
+    if text := described(found.mismatch, views.names):
+        warn_caller(f"locate: {text}", CameraMismatchWarning)
     return found
 
 

@@ -14,6 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffproj._core.arguments import called, number
+from diffproj._core.numerics import check_tensor
+
 SMALLEST = 1e-100
 """The smallest scale; its inverse is the largest. What is computed of their squares is still right."""
 
@@ -36,11 +39,16 @@ class _Scaled:
     scale: float
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.scale, int | float) and SMALLEST <= self.scale <= 1 / SMALLEST):
-            raise ValueError(
-                f"scale: want a positive number in the residual's unit, between {SMALLEST:g} and {1 / SMALLEST:g}, "
-                f"got {self.scale!r}"
-            )
+        want = f"a positive number in the residual's unit, between {SMALLEST:g} and {1 / SMALLEST:g}"
+        scale = number("scale", self.scale, want, least=SMALLEST, most=1 / SMALLEST)
+        object.__setattr__(self, "scale", scale)
+
+
+def _checked(squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Squared residuals; one look where they are a tensor, for the solver asks often."""
+    if isinstance(squared, Tensor) and squared.is_floating_point():
+        return squared
+    return check_tensor("squared", squared)
 
 
 class Huber(_Scaled):
@@ -53,11 +61,13 @@ class Huber(_Scaled):
 
     def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`e2`, and `2 scale |e| - scale^2` beyond `scale`."""
+        squared = _checked(squared)
         far = squared > self.scale**2
         return torch.where(far, 2 * self.scale * torch.where(far, squared, 1).sqrt() - self.scale**2, squared)
 
     def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """1, and `scale / |e|` beyond `scale`."""
+        squared = _checked(squared)
         far = squared > self.scale**2
         return torch.where(far, self.scale / torch.where(far, squared, 1).sqrt(), torch.ones_like(squared))
 
@@ -72,11 +82,12 @@ class SoftL1(_Scaled):
 
     def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`2 scale^2 (sqrt(1 + e2 / scale^2) - 1)`, without cancellation."""
+        squared = _checked(squared)
         return 2 * squared / (1 + (1 + squared / self.scale**2).sqrt())
 
     def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`1 / sqrt(1 + e2 / scale^2)`."""
-        return (1 + squared / self.scale**2).rsqrt()
+        return (1 + _checked(squared) / self.scale**2).rsqrt()
 
 
 class Cauchy(_Scaled):
@@ -89,11 +100,21 @@ class Cauchy(_Scaled):
 
     def value(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`scale^2 log(1 + e2 / scale^2)`."""
-        return self.scale**2 * (squared / self.scale**2).log1p()
+        return self.scale**2 * (_checked(squared) / self.scale**2).log1p()
 
     def weight(self, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """`1 / (1 + e2 / scale^2)`."""
-        return 1 / (1 + squared / self.scale**2)
+        return 1 / (1 + _checked(squared) / self.scale**2)
+
+
+def check_loss(loss: Loss | None) -> None:
+    """Check that something is a loss, or `None`.
+
+    Raises:
+        TypeError: it is neither.
+    """
+    if isinstance(loss, type) or not (loss is None or isinstance(loss, Loss)):
+        raise TypeError(f"loss: want one such as dp.Huber(0.5), got {called(loss)}")
 
 
 def slope_and_bend(loss: Loss | None, squared: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,8 +7,9 @@ from typing import Any, TypedDict, get_args
 import numpy as np
 from torch import Tensor
 
+from diffproj._core.arguments import Array, called, choice, flag, function, number, whole_number, words
 from diffproj.calibration.constraints import Priors
-from diffproj.calibration.losses import Loss
+from diffproj.calibration.losses import Loss, check_loss
 from diffproj.calibration.result import Objective
 
 OUTLIER_LIMIT = 5.0
@@ -32,7 +33,7 @@ class LocateOptions(TypedDict, total=False):
         throw: raise where a camera did not converge, as it does if left out; if False, look at `Calibration.status`.
     """
 
-    weights: Tensor | None
+    weights: Tensor | Array | float | None
     loss: Loss | None
     max_iterations: int
     tolerance: float
@@ -112,10 +113,9 @@ def locate_options(given: Mapping[str, Any]) -> Options:
 
     Raises:
         TypeError: an unknown option, or one of another type.
+        ValueError: a value that is not allowed.
     """
-    options = _with_defaults("locate", given, _LOCATE)
-    _check_loss(options.loss)
-    return options
+    return _with_defaults("locate", given, _LOCATE)
 
 
 def calibration_options(who: str, given: Mapping[str, Any]) -> Options:
@@ -126,18 +126,19 @@ def calibration_options(who: str, given: Mapping[str, Any]) -> Options:
         ValueError: a value that is not allowed, or options that contradict each other.
     """
     options = _with_defaults(who, given, _CALIBRATION)
-    if options.objective not in get_args(Objective):
-        raise ValueError(f"objective: want one of {', '.join(get_args(Objective))}, got {options.objective!r}")
+    choice("objective", options.objective, get_args(Objective))
+    options.bow, options.skew = flag("bow", options.bow), flag("skew", options.skew)
+    options.tied_focal = flag("tied_focal", options.tied_focal)
+    options.fixed = words("fixed", options.fixed, "several names")
     if options.bow and options.objective == "plane":
         raise ValueError("bow: want False with objective='plane', for a bowed board has no plane")
-    if isinstance(options.fixed, str):
-        raise TypeError(f"fixed: want several names, as in fixed=({options.fixed!r},), got a string")
-    if options.priors is not None and not isinstance(options.priors, Mapping):
-        raise TypeError(f"priors: want a mapping from names, got {type(options.priors).__name__}")
-    _check_loss(options.loss)
-    reject = options.reject_outliers
-    if not isinstance(reject, bool | np.bool_ | int | float) or not reject >= 0:
-        raise ValueError(f"reject_outliers: want True or a number above 0, got {reject!r}")
+    if options.priors is not None:
+        if not isinstance(options.priors, Mapping):
+            raise TypeError(f"priors: want a mapping from names, got {called(options.priors)}")
+        words("priors", tuple(options.priors), "names of parameters")
+    if not isinstance(options.reject_outliers, bool | np.bool_):
+        want = "True or a number above 0"
+        options.reject_outliers = number("reject_outliers", options.reject_outliers, want, least=0)
     return options
 
 
@@ -145,9 +146,11 @@ def _with_defaults(who: str, given: Mapping[str, Any], defaults: Mapping[str, An
     unknown = [name for name in given if name not in defaults]
     if unknown:
         raise TypeError(f"{who}: want options of {', '.join(defaults)}, got {unknown[0]!r}")
-    return Options(**{**defaults, **given})
-
-
-def _check_loss(loss: object) -> None:
-    if loss is not None and not isinstance(loss, Loss):
-        raise TypeError(f"loss: want one such as dp.Huber(0.5), got {type(loss).__name__}")
+    options = Options(**{**defaults, **given})
+    check_loss(options.loss)
+    options.max_iterations = whole_number("max_iterations", options.max_iterations, "a whole number of steps", least=0)
+    options.tolerance = number("tolerance", options.tolerance, "a part of the cost, at least 0", least=0)
+    if options.progress is not None:
+        function("progress", options.progress, "a function of (done, total)")
+    options.throw = flag("throw", options.throw)
+    return options

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.ambiguity import OtherPoses
+from diffproj.calibration.compatibility import mismatch
 from diffproj.calibration.constraints import free_basis, held_at, make_prior
 from diffproj.calibration.covariance import Covariance, reshaped
 from diffproj.calibration.data import Data
@@ -114,6 +115,7 @@ def outcome(
         _covariance=partial(_covariance, found, data, before, known, doubt),
         _others=partial(_others, found, data, before),
         _remarks=partial(remarks, found, status, doubt),
+        _mismatch=None if known is None else partial(mismatch, found, known, tuple(batch)),
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)

@@ -4,6 +4,7 @@ from typing import Unpack
 
 from kornia.geometry.camera import PinholeCamera
 
+from diffproj._core.arguments import flag
 from diffproj.calibration import start
 from diffproj.calibration.data import Data
 from diffproj.calibration.implicit import differentiated
@@ -61,6 +62,7 @@ def refine(
             "camera: want dp.Camera, got Calibration; "
             "give calibration.camera, or calibration.cameras to start from its poses"
         )
+    differentiable = flag("differentiable", differentiable)
     chosen = calibration_options("refine", options)
     data = Data(views, target, chosen.weights)
     camera = as_camera(camera)

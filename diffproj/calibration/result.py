@@ -9,14 +9,18 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffproj._core.arguments import instance
 from diffproj._core.copying import Copied
+from diffproj.calibration import ambiguity as ambiguities
+from diffproj.calibration import mismatch as mismatches
+from diffproj.calibration.account import Account
 from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
-from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.bow import bowed
 from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
-from diffproj.calibration.distinct import alike, described
-from diffproj.calibration.parametrisation import BOW, SKEW, Parametrisation
+from diffproj.calibration.mismatch import Mismatch
+from diffproj.calibration.parametrisation import Parametrisation
+from diffproj.calibration.record import Recorded
 from diffproj.calibration.region import covered_region
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
@@ -25,17 +29,6 @@ from diffproj.targets.views import Views
 
 Objective = Literal["image", "plane"]
 """What is minimised: the distance on the image in pixels, or on the board in world units."""
-
-SENTENCES = {
-    Status.CONVERGED: "converged: no step lowers the error any more",
-    Status.MAX_ITERATIONS: "was still falling when the iterations ended: raise max_iterations, or look for mixed-up "
-    "corners",
-    Status.DIVERGED: "found no step that lowers the error: look for mixed-up corners, or start closer",
-    Status.DEGENERATE: "the views do not determine the camera",
-}
-
-MAX_NAMES = 10
-"""Names of ambiguous views in a message."""
 
 
 class CalibrationError(RuntimeError):
@@ -50,8 +43,8 @@ class CalibrationError(RuntimeError):
         self.calibration = calibration
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration(Copied):
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Account, Copied, Recorded):
     """A camera with the poses of the views that it was found from, and those views.
 
     Many cameras side by side have a batch shape `*B`; for one camera it is empty.
@@ -80,6 +73,7 @@ class Calibration(Copied):
             board as it does, to within 2 px, which bring nothing new. `None` where all counted fully.
         skew: whether the skew of K is among the parameters: it was fitted, or K had some that was held.
         comparison: how the lenses fared, where `distortion="auto"` compared them.
+        unit: the world's unit, such as `"mm"`, where it is known; files keep it.
     """
 
     camera: Camera
@@ -99,9 +93,11 @@ class Calibration(Copied):
     degrees_of_freedom: Float[Tensor, "*batch"] | None = None
     lens_region: Float[Tensor, "*#batch directions"] | None = None
     comparison: LensComparison | None = None
+    unit: str | None = None
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
     _remarks: Callable[[], tuple[str, ...]] | None = None
+    _mismatch: Callable[[], Mismatch] | None = None
 
     @property
     def board_points(self) -> Float[Tensor, "*batch n 3"]:
@@ -158,17 +154,27 @@ class Calibration(Copied):
 
     @property
     def doubts(self) -> str:
+        """What makes the poses doubtful, in words; empty where nothing does, or where it is not known.
+
+        Views that are `ambiguous`; and, of a calibration that `locate` found with another, views that this one does
+        not fit: see `mismatch`.
+        """
+        return "; ".join(filter(None, [self.ambiguity, mismatches.described(self.mismatch, self.views.names)]))
+
+    @property
+    def ambiguity(self) -> str:
         """Which views are ambiguous, in words; empty where none is, or where other poses are not known."""
-        if not self.has_alternatives:
-            return ""
-        doubtful = [
-            f"{self.views.names[view]}{f' of camera {tuple(camera)}' * bool(camera)}"
-            for *camera, view in self.ambiguous.nonzero().tolist()
-        ]
-        if not doubtful:
-            return ""
-        more = f" and {len(doubtful) - MAX_NAMES} more views" if len(doubtful) > MAX_NAMES else ""
-        return f"two poses fit {', '.join(doubtful[:MAX_NAMES])}{more}, and the one that was kept may be the wrong one"
+        return ambiguities.described(self.ambiguous, self.views.names) if self.has_alternatives else ""
+
+    @cached_property
+    def mismatch(self) -> Mismatch:
+        """How the views compare with the calibration that they were located with: `ratio`, `doubtful`, `scale`.
+
+        The photographs of another camera, zoom or focus are `doubtful`: their corners are not where this calibration
+        sees them, by more than noise and what it leaves open. Their `ratio`, residuals in times the calibration's, need
+        not be large. The ratio is NaN and nothing is doubtful where there is nothing to compare with.
+        """
+        return self._mismatch() if self._mismatch is not None else mismatches.none_at_all(self.used)
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
@@ -283,58 +289,12 @@ class Calibration(Copied):
         own = self.knows_intrinsics or not self.has_covariance
         return covered_region(self.views.pixels, self.used) if own else None
 
-    def summary(self) -> str:
-        """One camera as a text for people: parameters with deviations, RMS of each view, how it ended.
 
-        Raises:
-            ValueError: there are many cameras.
-        """
-        if self.views.batch_shape:
-            raise ValueError(f"summary: want one camera, got batch shape {tuple(self.views.batch_shape)}; see message")
-        deviations = self.covariance.deviations if self._covariance is not None else {}
-        values = dict(zip(self.parameters.names, self.shared.tolist(), strict=True))
+def as_calibration(calibration: Calibration) -> Calibration:
+    """A calibration as it is.
 
-        def line(title: str, names: tuple[str, ...], form: str, unit: str) -> str:
-            texts = (f"{values[name]:{form}}{_spread(deviations.get(name), form)}" for name in names)
-            return f"{title:<16}{'  '.join(texts)}{unit}"
-
-        lines = [
-            line("focal lengths", ("f_x", "f_y"), "10.3f", " px"),
-            line("principal point", ("c_x", "c_y"), "10.3f", " px"),
-            *(line(f"lens {name}", (name,), "10.5f", "") for name in self.parameters.coefficient_names),
-        ]
-        if self.parameters.skew:
-            lines.append(line("skew", (SKEW,), "10.3f", " px"))
-        if self.bow is not None:
-            lines.append(line("bow along x, y", BOW, "10.4f", " world units"))
-        lines.append(f"{'RMS':<16}{self.rms.item():10.4f} px over {int(self.used.sum())} corners")
-        width = max(map(len, self.views.names), default=0)
-        seen, used = self.views.visible.sum(-1).tolist(), self.used.sum(-1).tolist()
-        odds = self.likelihood_ratio.tolist() if self.has_alternatives else [torch.inf] * len(used)
-        for view, (name, rms) in enumerate(zip(self.views.names, self.view_rms.tolist(), strict=True)):
-            out = self.rejected[view].nonzero().flatten().tolist()
-            remark = f"  without corners {', '.join(map(str, out))}" if out and used[view] else ""
-            if odds[view] < SURE:
-                remark += f"  another pose is {odds[view]:.2g} times less likely"
-            text = f"{rms:.4f} px{remark}" if used[view] else f"left out: {seen[view] - len(out)} corners, 4 are needed"
-            lines.append(f"  {name:<{width}}  {text}")
-        if self.shares is not None:
-            same = alike(self.points, self.views.pixels.unsqueeze(0), self.used.unsqueeze(0))[0]
-            lines.append(described(same, self.views.names))
-        if self.camera.size is not None and (share := float(border_with_rays(self.camera, self.camera.size))) < 1:
-            lines.append(
-                f"{'image':<16}{100 * (1 - share):.0f} % of its border lies beyond the fold of the lens: no rays"
-            )
-        remarks = [*self.remarks[0].split("; "), "" if self.status else self.doubts]
-        return "\n".join([*lines, self._ends()[0], *filter(None, remarks)])
-
-    def _ends(self) -> list[str]:
-        """How each camera ended, in a sentence."""
-        codes = [Status(code) for code in self.status.flatten().tolist()]
-        return [cause or SENTENCES[code] for code, cause in zip(codes, self.causes or ("",) * len(codes), strict=True)]
-
-
-def _spread(deviation: Tensor | None, form: str) -> str:
-    if deviation is None or not float(deviation) > 0:
-        return ""
-    return " (not determined)" if bool(deviation.isinf()) else f" ± {float(deviation):.{form.split('.')[1]}}"
+    Raises:
+        TypeError: it is none.
+    """
+    want = "a dp.Calibration"
+    return instance("calibration", calibration, Calibration, want, "dp.calibrate and dp.load_calibration give one")

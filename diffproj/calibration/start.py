@@ -37,6 +37,8 @@ def from_camera(
             are not a camera's.
     """
     model_of(camera.distortion)
+    if camera.K.is_meta:
+        raise ValueError("camera: want one with values, got one on the meta device")
     given.check_size(camera.size, data.views.size)
     camera = camera.detach().to(data.points.device, data.points.dtype)
     batch, V = tuple(data.batch), len(data.views)

@@ -6,24 +6,28 @@ resampled with replacement (Efron 1979). Both solve all refits as one batch.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Unpack
+from typing import Any, Unpack
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from diffproj._core.arguments import checked_seed, whole_number
+from diffproj._core.shown import Shown
+from diffproj.calibration.data import Data
 from diffproj.calibration.distinct import alike
 from diffproj.calibration.held_out import errors_of, folds_of, repeated, without_views
 from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.options import CalibrationOptions, calibration_options
 from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.calibration.solver import Status
 from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target
-from diffproj.targets.views import Views
+from diffproj.targets.views import Views, as_views
 
 
-@dataclass(frozen=True, eq=False)
-class CrossValidation:
+@dataclass(frozen=True, eq=False, repr=False)
+class CrossValidation(Shown):
     """Errors of k refits on the views that they were fitted to, and on those held out.
 
     Attributes:
@@ -42,6 +46,20 @@ class CrossValidation:
     in_sample_world: Float[Tensor, " k"]
     held_out_world: Float[Tensor, " k"]
     lost: Int[Tensor, " k"]
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """The folds as columns of Python's own numbers and words: `pandas.DataFrame` takes it."""
+        names = "in_sample_px", "held_out_px", "in_sample_world", "held_out_world", "lost"
+        columns: dict[str, list[Any]] = {"fold": list(range(1, len(self.lost) + 1))}
+        columns["status"] = [Status(code).name for code in self.fits.status.tolist()]
+        return columns | {name: getattr(self, name).tolist() for name in names}
+
+    def _facts(self) -> list[str]:
+        held_out, fitted = (float(part.square().mean().sqrt()) for part in (self.held_out_px, self.in_sample_px))
+        return [f"{len(self.lost)} folds", f"held out RMS {held_out:.4f} px", f"fitted {fitted:.4f} px"]
+
+    def _columns(self) -> dict[str, list[Any]]:
+        return self.to_dict()
 
     def summary(self) -> str:
         """A table of text: each fold, and the root mean square over the folds."""
@@ -82,6 +100,7 @@ def cross_validate(
         options: as `calibrate` takes them.
 
     Raises:
+        TypeError: views are no `dp.Views`, folds no whole number, or an option is unknown or of another type.
         ValueError: fewer views than folds, fewer than 2 folds, more than one camera, or `bow`.
         CalibrationError: a refit did not converge.
 
@@ -91,14 +110,13 @@ def cross_validate(
         >>> bool((outcome.held_out_px < 0.3).all())
         True
     """
-    if views.batch_shape:
-        raise ValueError(f"views: want those of one camera, got batch shape {tuple(views.batch_shape)}")
-    if options.get("bow"):
-        raise ValueError("bow: want False, for held-out views are located on a flat board")
-    if not isinstance(folds, int) or not 2 <= folds <= len(views):
-        raise ValueError(f"folds: want a whole number from 2 to the number of views, {len(views)}, got {folds}")
+    _check_views(views)
     _check_lens(distortion)
     chosen = calibration_options("cross_validate", options)
+    if chosen.bow:
+        raise ValueError("bow: want False, for held-out views are located on a flat board")
+    want = f"a whole number from 2 to the number of views, {len(views)}"
+    folds = whole_number("folds", folds, want, least=2, most=len(views))
     fits, errors = without_views(views, target, distortion, folds_of(views, folds), chosen, who="cross_validate")
     held_out_px, held_out_world, lost = errors.over_views()
     in_sample_px, in_sample_world, _ = errors_of(fits, fits.views.pixels, fits.used).over_views()
@@ -134,6 +152,7 @@ def bootstrap(
         out.
 
     Raises:
+        TypeError: views are no `dp.Views`, draws or seed no whole numbers, or an option is unknown or of another type.
         ValueError: more than one camera, all views alike, fewer than 2 draws, or weights.
         CalibrationError: fewer than half of the draws, or fewer than 2, converged.
 
@@ -143,16 +162,14 @@ def bootstrap(
         >>> 0.2 < float(spread["f_x"]) < 2.0
         True
     """
-    if views.batch_shape:
-        raise ValueError(f"views: want those of one camera, got batch shape {tuple(views.batch_shape)}")
-    if not isinstance(draws, int) or draws < 2:
-        raise ValueError(f"draws: want a whole number of at least 2, got {draws}")
+    _check_views(views)
+    draws = whole_number("draws", draws, "a whole number of at least 2", least=2)
     _check_lens(distortion)
+    chosen = calibration_options("bootstrap", options)
     if "weights" in options:
         raise ValueError("weights: want none, for they count here how often a view was drawn")
-    chosen = calibration_options("bootstrap", options)
-    generator = torch.Generator().manual_seed(seed)
-    group = _groups(views, target)
+    generator = torch.Generator().manual_seed(checked_seed(seed))
+    group = _groups(Data(views, target, None))
     number = int(group.amax()) + 1
     if number < 2:
         alone = "one" if len(views) == 1 else f"{len(views)} alike"
@@ -169,21 +186,24 @@ def bootstrap(
     return dict(zip(found.parameters.names, found.shared[kept].std(0).unbind(), strict=True))
 
 
+def _check_views(views: Views) -> None:
+    if as_views(views).batch_shape:
+        raise ValueError(f"views: want those of one camera, got batch shape {tuple(views.batch_shape)}")
+
+
 def _check_lens(distortion: str) -> None:
-    if distortion == "auto":
+    if isinstance(distortion, str) and distortion == "auto":
         raise ValueError(
             "distortion: want the name of a lens, got 'auto'; calibrate with it, and give the lens it took"
         )
 
 
-def _groups(views: Views, target: Target) -> Tensor:
+def _groups(data: Data) -> Tensor:
     """Numbers `(V,)`, from 0, of what is drawn together: views that show the board alike."""
-    used = views.visible & (views.visible.sum(-1, keepdim=True) >= 4)
-    points = target.points.to(views.pixels)
-    same = alike(points - points.mean(0), views.pixels.detach().unsqueeze(0), used.unsqueeze(0))[0]
-    same = same | torch.eye(len(views), dtype=torch.bool, device=views.device)
+    same = alike(data.points, data.pixels, data.used)[0]
+    same = same | torch.eye(len(same), dtype=torch.bool, device=same.device)
     first = same.to(torch.uint8).argmax(-1)
-    for _ in range(len(views)):
+    for _ in range(len(same)):
         if torch.equal(first[first], first):
             break
         first = first[first]

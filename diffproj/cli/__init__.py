@@ -1,7 +1,7 @@
 """The `diffproj` command: joins calibration, measurement, experiment, figures and files.
 
-Each command is a module of its own with `add_options` and `run`, and is imported only when it is called: help and
-mistakes in the command line wait for nothing else.
+Each command is two modules: its command line, with `add_options`, and its work, with `run`, which is imported only when
+the command line was understood. So help and mistakes wait neither for PyTorch nor for other commands.
 
 Exit codes: 0 done, 1 the work failed (one line says what and what to do), 2 the command was not understood, 130
 interrupted from the keyboard.
@@ -18,9 +18,11 @@ from diffproj import __version__
 COMMANDS = {
     "calibrate": "find a camera from photographs of a chessboard, and write a camera file",
     "measure": "measure points, lengths and an area on a plane in a photograph, with error bars",
+    "convert": "turn a camera file of one program into that of another",
+    "info": "tell what is in a camera file, and whether it can be right",
     "experiment": "calibrate, put corners back on the board, and print the errors (the paper's Table 1 and Fig. 7)",
 }
-"""What each command does; its module has its name."""
+"""What each command does; the module of its command line has its name."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -29,6 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given[:1] == ["help"]:  # `diffproj help measure` is `diffproj measure --help`
         given = [*given[1:], "--help"]
     options = _parser(given).parse_args(shielded(given))
+    if "check" in options:  # what options mean together
+        options.check(options)
     from diffproj.cli.running import run
 
     return run(options)

@@ -1,23 +1,12 @@
-"""`diffproj experiment`: the paper's Table 1 and Fig. 7."""
+"""The command line of `diffproj experiment`; `experimenting.py` does the work."""
 
 import argparse
 from pathlib import Path
 from typing import get_args
 
-from rich.markup import escape
-from rich.table import Table
-
-from diffproj._core.atomic import write_whole
-from diffproj.cli.inputs import board_size, find_corners, photographs, square_side
-from diffproj.cli.terminal import RESULTS, progress_bars, result
-from diffproj.files.save import save_camera
-from diffproj.lens.models import LensModel
-from diffproj.paper.experiment import Experiment, choose, default_split, parse_split, run_experiment
-from diffproj.paper.setup import paper_setup
-from diffproj.targets import synthetic
-from diffproj.targets.chessboard import Chessboard
-from diffproj.targets.examples import example_views
-from diffproj.targets.views import Views
+from diffproj.cli.inputs import board_size, some_path
+from diffproj.cli.units import Length, square_side
+from diffproj.lens.names import LensModel
 
 DESCRIPTION = (
     "Calibrates a camera from views of a chessboard, finds the pose of each test view, puts every corner of it back on "
@@ -38,7 +27,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "package; or photographs rendered with known truth (default: left)",
     )
     source.add_argument(
-        "--images", nargs="+", type=Path, metavar="PHOTO", help="your own photographs, or folders of them"
+        "--images", nargs="+", type=some_path, metavar="PHOTO", help="your own photographs, or folders of them"
     )
     command.add_argument(
         "--board", type=board_size, default=(9, 6), metavar="CxR", help="inner corners of your board (default: 9x6)"
@@ -46,9 +35,9 @@ def add_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--square",
         type=square_side,
-        default=25.0,
+        default=Length(25.0, "mm"),
         metavar="SIDE",
-        help="side of a square; its unit is the unit of all results (default: 25)",
+        help="side of a square, such as 25mm or 1in; its unit is that of all results (default: 25mm)",
     )
     command.add_argument(
         "--distortion", choices=get_args(LensModel), default="brown5", help="the lens that is fitted (default: brown5)"
@@ -64,74 +53,9 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--output",
-        type=Path,
+        type=some_path,
         default=Path("diffproj-experiment"),
         metavar="FOLDER",
         help="where the files go (default: diffproj-experiment)",
     )
-    command.set_defaults(run=run)
-
-
-def run(options: argparse.Namespace) -> int:
-    """Run the command."""
-    from diffproj import figures  # here, for matplotlib takes long to load; first of all, for it may be missing
-
-    views, board, split = _corners(options)
-    if options.split is not None:
-        split = parse_split(options.split, len(views))
-    fit, test = choose(views, split)
-    outcome = run_experiment(fit, test, board, options.distortion, options.strict)
-    RESULTS.print(_table(outcome))
-    result(f"\n{outcome.fit.summary()}")
-    options.output.mkdir(parents=True, exist_ok=True)
-    write_whole(options.output / "table1.csv", outcome.to_csv())
-    write_whole(options.output / "fig7.png", figures.png(figures.fig7(outcome)))
-    save_camera(options.output / "camera.json", outcome.fit)
-    result(f"\nWritten to {options.output}: table1.csv, fig7.png, camera.json")
-    return 0
-
-
-def _corners(options: argparse.Namespace) -> tuple[Views, Chessboard, tuple[list[int], list[int]]]:
-    """The views, the board and the default split that the options ask for."""
-    columns, rows = options.board
-    board = Chessboard(columns, rows, options.square, axes="paper")
-    if options.images is None and (columns, rows) != (9, 6):
-        raise ValueError(f"--board: want 9x6 for --data, got {columns}x{rows}; --images takes your own photographs")
-    if options.images is not None:
-        with progress_bars() as bars:
-            views = find_corners(photographs(options.images), board, bars)
-        return views, board, default_split(len(views))
-    if options.data == "synthetic":
-        setup = paper_setup()
-        with progress_bars() as bars:
-            cameras = [setup.cameras[i] for i in range(len(setup.names))]
-            images = [
-                synthetic.photograph(camera, setup.board, seed=i).numpy()
-                for i, camera in enumerate(bars.track(cameras, description="Rendering"))
-            ]
-            views = find_corners(images, setup.board, bars)
-        named = Views(views.pixels, views.visible, setup.names, views.size)
-        count = len(setup.fit.R)
-        return named, board, (list(range(count)), list(range(count, len(named))))
-    views = example_views(options.data)
-    return views, board, default_split(len(views))
-
-
-def _table(outcome: Experiment) -> Table:
-    table = Table(title="Table 1. Errors on the board (world units), mean ± standard deviation")
-    table.add_column("view", overflow="fold")
-    table.add_column("corners", justify="right")
-    for axis in ("E_x", "E_y", "E_z"):
-        table.add_column(axis, justify="right", no_wrap=True)
-    *rows, total = outcome.rows
-    for row in (*rows, total):
-        if row is total:
-            table.add_section()
-        pairs = zip(row.mean, row.deviation, strict=True)
-        table.add_row(escape(row.view), str(row.corners), *(_pair(mean, deviation) for mean, deviation in pairs))
-    return table
-
-
-def _pair(mean: float, deviation: float) -> str:
-    """Both to four decimals; what is there only by rounding shows its size."""
-    return f"{mean:.4f} ± {deviation:.4f}" if mean == 0 or mean >= 5e-5 else f"{mean:.0e} ± {deviation:.0e}"
+    command.set_defaults(work="experimenting")

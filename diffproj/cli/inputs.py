@@ -1,46 +1,55 @@
-"""Options and inputs that commands share: the board, camera files, photographs and the corners in them."""
+"""What options take, in several commands: a board, numbers, camera files and places to write to."""
 
 import argparse
-import math
-import os
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, get_args
-
-from rich.progress import Progress
-
-from diffproj.targets.chessboard import Chessboard
-from diffproj.targets.detection import detect
-from diffproj.targets.images import SUFFIXES, Orientation, Source, listed
-from diffproj.targets.views import Views
 
 CAMERA_SUFFIXES = (".json", ".yaml", ".yml", ".xml")
-SMALLEST_BOARD = 3
-"""Inner corners each way that the corner detector needs."""
+SMALLEST_BOARD, LARGEST_BOARD = 3, 1000
+"""Inner corners each way that the corner detector needs, and more than any photograph resolves."""
+
+HAND = 0.5
+"""Standard deviation in px, along u and along v, of points that a person picks in a photograph."""
+
+DETECTOR = "detector"
+"""What `--pixel-sigma` takes for pixels that a program found as well as the board's corners."""
+
+LARGEST_NUMBER = 1e100
+"""Numbers beyond it are mistakes; with them, squares would overflow."""
 
 
 def board_size(text: str) -> tuple[int, int]:
     """Read inner corners such as `9x6`."""
     columns, separator, rows = text.lower().partition("x")
-    if not (separator and columns.isdecimal() and rows.isdecimal()):
+    if not (separator and columns.isdecimal() and rows.isdecimal() and len(text) < 100):
         raise argparse.ArgumentTypeError(f"want inner corners as COLUMNSxROWS, such as 9x6, got {text!r}")
     if min(int(columns), int(rows)) < SMALLEST_BOARD:
         raise argparse.ArgumentTypeError(
             f"want at least {SMALLEST_BOARD}x{SMALLEST_BOARD} inner corners (one less than the squares), got {text!r}"
         )
+    if max(int(columns), int(rows)) > LARGEST_BOARD:
+        raise argparse.ArgumentTypeError(f"want at most {LARGEST_BOARD} inner corners each way, got {text!r}")
     return int(columns), int(rows)
 
 
-def square_side(text: str) -> float:
-    """Read the side of a square."""
-    try:
-        side = float(text)
-    except ValueError:
-        side = math.nan
-    if not (math.isfinite(side) and side > 0):
-        raise argparse.ArgumentTypeError(f"want the side of a square as a positive number, such as 25, got {text!r}")
-    return side
+def some_path(text: str) -> Path:
+    """Read the name of a file or folder; an empty one would be that of the folder where one is."""
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError(f"want the name of a file, got {text!r}")
+    return Path(text)
+
+
+def add_orientation(group: argparse._ArgumentGroup | argparse.ArgumentParser) -> None:
+    """Give a command the option that says how the pixels of photographs are counted."""
+    group.add_argument(
+        "--orientation",
+        choices=("sensor", "upright"),
+        default="sensor",
+        help="how pixels are counted: as the sensor recorded them, or with the photograph turned upright as its EXIF "
+        "data ask, which is what most programs show (default: sensor)",
+    )
 
 
 def camera_file(text: str) -> Path:
@@ -51,54 +60,53 @@ def camera_file(text: str) -> Path:
 
 
 def numbers(text: str, count: int) -> tuple[float, ...] | None:
-    """Read so many finite numbers with commas between them; `None` where it is something else."""
+    """Read so many numbers with commas between them; `None` where it is something else, or beyond 1e100."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         return None
-    return values if len(values) == count and all(map(math.isfinite, values)) else None
+    return values if len(values) == count and all(abs(value) <= LARGEST_NUMBER for value in values) else None
 
 
-def photographs(paths: Iterable[Path]) -> list[Source]:
-    """Files as they are, and the photographs in folders, in natural order; each once, however often it is named.
+def check_writable(option: str, path: Path) -> None:
+    """Find out before the long work, and not after it, whether a file can be written.
 
     Raises:
-        ValueError: a folder holds no photograph.
-        FileNotFoundError: there is no such file.
+        ValueError: it is a folder, or its own folder does not exist.
+        OSError: its folder cannot be written to.
     """
-    found: dict[Path, Source] = {}
-    for path in paths:
-        if path.is_dir() and not any(file.suffix.lower() in SUFFIXES for file in path.iterdir()):
-            raise ValueError(
-                f"{path}: want a folder with photographs ({', '.join(sorted(SUFFIXES))}), found none in it"
-            )
-        for photograph in listed(str(path)):
-            # The same corners twice would make the standard deviations look smaller than they are.
-            found.setdefault(Path(str(photograph.source)).resolve(), photograph.source)
-    return list(found.values())
+    if path.is_dir():
+        raise ValueError(f"{option}: want a file, got a folder: {path}")
+    if not path.parent.is_dir():
+        raise ValueError(f"{option}: no such folder: {path.parent}; make it first, or choose another")
+    _check_place(option, path.parent)
 
 
-def find_corners(
-    sources: list[Any], board: Chessboard, bars: Progress, title: str = "Finding corners", orientation: str = "sensor"
-) -> Views:
-    """The board's corners in photographs, on all cores, under a progress bar."""
-    task = bars.add_task(title, total=None)
-    with ThreadPoolExecutor(min(len(sources), os.cpu_count() or 1)) as cores:
-        return detect(
-            sources,
-            board,
-            lambda done, total: bars.update(task, completed=done, total=total),
-            orientation=orientation,
-            executor=cores,
-        )
+def check_folder(option: str, path: Path) -> None:
+    """Find out before the long work whether a folder can be written to, or be made.
+
+    Raises:
+        ValueError: there is a file in its place.
+        OSError: it cannot be written to.
+    """
+    there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not there.is_dir():
+        raise ValueError(f"{option}: want a folder, got the file {there}; choose another")
+    _check_place(option, there)
 
 
-def add_orientation(group: argparse._ArgumentGroup | argparse.ArgumentParser) -> None:
-    """Give a command the option that says how the pixels of photographs are counted."""
-    group.add_argument(
-        "--orientation",
-        choices=get_args(Orientation),
-        default="sensor",
-        help="how pixels are counted: as the sensor recorded them, or with the photograph turned upright as its EXIF "
-        "data ask, which is what most programs show (default: sensor)",
-    )
+def _check_place(option: str, folder: Path) -> None:
+    """Check that files can be made in a folder."""
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise OSError(f"{option}: cannot write to the folder {folder} ({error.strerror}); choose another") from error
+
+
+@contextmanager
+def writing(option: str, path: Path) -> Iterator[None]:
+    """Say of which option a file was that could not be written."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(f"{option}: could not write {path} ({error.strerror}); choose another place") from error

@@ -1,20 +1,11 @@
-"""`diffproj measure`: points, lengths and an area on a plane, with error bars, from pixels of a photograph."""
+"""The command line of `diffproj measure`; `measuring.py` does the work."""
 
 import argparse
 import functools
-import json
-import math
-from pathlib import Path
 
-import torch
-
-from diffproj.cli.inputs import add_orientation, board_size, camera_file, numbers, square_side
-from diffproj.cli.measure_document import document
-from diffproj.cli.measure_tables import say
-from diffproj.cli.scene import new_photograph, stored_view
-from diffproj.cli.terminal import result
-from diffproj.geometry.plane import Plane
-from diffproj.measurement.measure import measure
+from diffproj.cli.drawing import drawing
+from diffproj.cli.inputs import DETECTOR, HAND, LARGEST_NUMBER, add_orientation, board_size, numbers, some_path
+from diffproj.cli.units import Length, height, square_side
 
 DESCRIPTION = """\
 Turns pixels of a photograph into points on a plane, and prints them with the
@@ -28,26 +19,32 @@ Where the camera stood is taken from a board in the photograph (--board and
 EPILOG = """\
 pixels:
   u runs to the right and v down; 0,0 is the middle of the first pixel. They may
-  be negative or lie outside the photograph.
+  be negative or lie outside the photograph. Each is taken to be off by 0.5 px,
+  as points picked by hand are: --pixel-sigma tells another noise. A file of
+  points has a line name,u,v for each, or u,v; titles and empty lines are
+  passed over.
 
-the board's frame:
+the plane:
+  It is the board's face, unless --height or --plane say another. Heights count
+  from the face towards the camera: --height 12 is the top of a box 12 high that
+  lies on the board, and --height -3 the table below a board 3 thick.
+
+the board's frame, for --plane and for the points:
   The origin is the first inner corner, x runs to the right along the board's
-  rows, y down its columns, and z into the board, away from the camera: heights
-  above the board are negative. The first corner touches two dark squares: one
+  rows, y down its columns, and z into the board, away from the camera: above
+  the board z is negative. The first corner touches two dark squares: one
   inside the first four corners, one diagonally outside. The unit is that of
   --square. --view has the frame of the calibration: this one for a file from
   'diffproj calibrate'; for one from 'diffproj experiment', x runs down, y to
-  the right and z towards the camera.
+  the right and z towards the camera. --draw shows the frame in the photograph.
 
 examples:
-  diffproj measure photo.jpg --camera camera.json --board 9x6 --square 25 \\
-      --points 210.5,133 402,140.5 395,300
+  diffproj measure photo.jpg --camera camera.json --board 9x6 --square 25mm \\
+      --points 210.5,133 402,140.5 395,300 --draw measured.png
   diffproj measure --camera camera.json --view left01.jpg \\
       --points 210,133 402,140
-  diffproj measure photo.jpg --camera camera.yaml --board 9x6 --square 25 \\
-      --points 210,133 402,140 --plane 0,0,1,-12 --pixel-sigma 0.7 --json
-
-  The last one measures on top of a box 12 high that lies on the board.
+  diffproj measure photo.jpg --camera camera.yaml --board 9x6 --square 25mm \\
+      --points-file points.csv --height 12 --pixel-sigma 0.7 --csv > box.csv
 
 exit codes: 0 done, also where pixels have no point on the plane, which the
 output names; 1 it failed, one line says why; 2 the command was not understood
@@ -64,26 +61,32 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "       %(prog)s --camera FILE --view NAME --points u,v ... [options]"
     )
     photograph = command.add_argument(
-        "photograph", type=Path, metavar="PHOTO", help="the photograph, with --board; --view needs none"
+        "photograph", type=some_path, metavar="PHOTO", help="the photograph, with --board; --view needs none"
     )
     # Not nargs="?": argparse would fill that with nothing as soon as an option comes before the photograph.
     photograph.required = False
     command.add_argument(
         "--camera",
-        type=camera_file,
+        type=some_path,
         required=True,
         metavar="FILE",
-        help="the camera file. A .json from 'diffproj calibrate' brings the camera's own uncertainty along; .yaml, "
-        ".yml or .xml as OpenCV writes them do not (required)",
+        help="the camera file, in any format that 'diffproj info' reads. A .json from 'diffproj calibrate' brings the "
+        "camera's own uncertainty along; other programs' files do not (required)",
     )
-    command.add_argument(
+    pixels = command.add_mutually_exclusive_group(required=True)
+    pixels.add_argument(
         "--points",
         type=_pixel,
         nargs="+",
         action="extend",
-        required=True,
         metavar="u,v",
-        help="the pixels to measure, in order (required)",
+        help="the pixels to measure, in order (these or --points-file)",
+    )
+    pixels.add_argument(
+        "--points-file",
+        type=some_path,
+        metavar="FILE",
+        help="a CSV file with the pixels to measure, a line name,u,v for each",
     )
     pose = command.add_argument_group("where the camera stood: a board in PHOTO, or a view of the calibration")
     either = pose.add_mutually_exclusive_group(required=True)
@@ -98,44 +101,43 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "--square",
         type=square_side,
         metavar="SIDE",
-        help="side of a square of the board, measured on the print; its unit becomes that of all results",
+        help="side of a square of the board, measured on the print, such as 25mm, 2.5cm or 1in; its unit becomes that "
+        "of all results",
+    )
+    plane = command.add_argument_group("the plane")
+    which = plane.add_mutually_exclusive_group()
+    which.add_argument(
+        "--height",
+        type=height,
+        default=Length(0.0),
+        metavar="H",
+        help="a plane parallel to the board, H above its face as the camera sees it, such as 12 or 12mm (default: 0, "
+        "the face itself)",
+    )
+    which.add_argument(
+        "--plane", type=_plane, metavar="a,b,c,d", help="the plane a x + b y + c z = d in the board's frame"
     )
     more = command.add_argument_group("more")
     more.add_argument(
-        "--plane",
-        type=_plane,
-        default=(0.0, 0.0, 1.0, 0.0),
-        metavar="a,b,c,d",
-        help="the plane a x + b y + c z = d in the board's frame (default: 0,0,1,0, the board itself)",
-    )
-    more.add_argument(
         "--pixel-sigma",
         type=_pixel_sigma,
+        default=None,
         metavar="S",
-        help="standard deviation of u and of v of each point, in px. The default is that of the board's corners, which "
-        "a program found to a fraction of a pixel: for points picked by hand, give 0.5 to 1",
+        help=f"standard deviation of u and of v of each point, in px; or '{DETECTOR}', the noise of the board's "
+        f"corners, for pixels that a program found as well as these (default: {HAND}, for points picked by hand)",
     )
     add_orientation(more)
-    more.add_argument("--json", action="store_true", help="print one JSON document, with null for what is not known")
-    command.set_defaults(run=functools.partial(run, command))
-
-
-def run(command: argparse.ArgumentParser, options: argparse.Namespace) -> int:
-    """Run the command."""
-    _check_which_pose(command, options)
-    scene = stored_view(options) if options.view is not None else new_photograph(options)
-    sigma = scene.calibration.pixel_sigma if options.pixel_sigma is None else options.pixel_sigma
-    if sigma is None or not math.isfinite(sigma):
-        raise ValueError(f"--pixel-sigma: want the noise of the pixels in px, for {options.camera} does not tell it")
-    plane = Plane(torch.tensor(options.plane[:3], dtype=torch.float64, device="cpu"), options.plane[3])
-    pixels = torch.tensor(options.points, dtype=torch.float64, device="cpu")
-    measured = measure(pixels, scene.calibration, plane, scene.view, options.pixel_sigma)
-    found = document(scene, plane, float(sigma), pixels, measured)
-    if options.json:
-        result(json.dumps(found, indent=1, allow_nan=False))
-    else:
-        say(found, scene)
-    return 0
+    output = more.add_mutually_exclusive_group()
+    output.add_argument("--json", action="store_true", help="print one JSON document, with null for what is not known")
+    output.add_argument("--csv", action="store_true", help="print one table for spreadsheets")
+    more.add_argument(
+        "--draw",
+        type=drawing,
+        metavar="FILE",
+        help="draw the board's corners and axes, the points and the lengths into the photograph: a .png, .svg or .pdf, "
+        "replaced if there is one",
+    )
+    command.set_defaults(work="measuring", check=functools.partial(_check_which_pose, command))
 
 
 def _pixel(text: str) -> tuple[float, ...]:
@@ -149,7 +151,7 @@ def _pixel(text: str) -> tuple[float, ...]:
 
 def _plane(text: str) -> tuple[float, ...]:
     values = numbers(text, 4)
-    if values is None or not any(values[:3]):
+    if values is None or max(map(abs, values[:3])) < 1 / LARGEST_NUMBER:
         raise argparse.ArgumentTypeError(
             "want a plane a x + b y + c z = d as a,b,c,d without spaces, a, b and c not all 0, such as 0,0,1,25, "
             f"got {text.strip()!r}"
@@ -157,10 +159,12 @@ def _plane(text: str) -> tuple[float, ...]:
     return values
 
 
-def _pixel_sigma(text: str) -> float:
+def _pixel_sigma(text: str) -> float | str:
     values = numbers(text, 1)
+    if text.strip() == DETECTOR:
+        return DETECTOR
     if values is None or values[0] <= 0:
-        raise argparse.ArgumentTypeError(f"want a positive number of pixels, such as 0.5, got {text!r}")
+        raise argparse.ArgumentTypeError(f"want a positive number of pixels, such as 0.5, or {DETECTOR}, got {text!r}")
     return values[0]
 
 

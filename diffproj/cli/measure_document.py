@@ -2,10 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import torch
 
+from diffproj.cli.measure_plane import described, height_above_face
+from diffproj.cli.points_file import Pixel
 from diffproj.cli.scene import Scene
 from diffproj.geometry.back_projection import Reason, explain
 from diffproj.geometry.camera import Camera
@@ -22,30 +25,42 @@ REASONS = {
 }
 
 
+class PixelNoise(NamedTuple):
+    """The standard deviation of a pixel's coordinates, and where it comes from: `hand`, `option` or `detector`."""
+
+    sigma: float
+    source: str
+
+
 def document(
-    scene: Scene, plane: Plane, pixel_sigma: float, pixels: torch.Tensor, measured: Measurement
+    scene: Scene, plane: Plane, noise: PixelNoise, pixels: Sequence[Pixel], measured: Measurement
 ) -> dict[str, Any]:
     """Everything that was measured.
 
     Args:
         scene: the camera at its pose.
         plane: what was measured on.
-        pixel_sigma: the standard deviation of a pixel's coordinates.
-        pixels: `(N, 2)`.
+        noise: of the pixels.
+        pixels: what was measured.
         measured: their points.
     """
-    camera = scene.calibration.cameras[scene.view]
-    points, remarks = _points(camera, plane, pixels, measured)
+    points, remarks = _points(scene.camera, plane, pixels, measured)
+    names = [pixel.name for pixel in pixels]
     found = _quantities(measured.lengths()) if len(points) > 1 else []
-    lengths = [{"from": number, "to": number + 1, **length} for number, length in enumerate(found, start=1)]
-    for number, length in enumerate(lengths, start=1):
-        if length["significant"] is False:
-            remarks.append(f"The length {number} to {number + 1} is below three deviations: it cannot be told from 0.")
-    area = _quantities(measured.area())[0] if len(points) > 2 else None
+    lengths = [
+        {"from": number, "to": number + 1, "name": f"{names[number - 1]}, {names[number]}", **length}
+        for number, length in enumerate(found, start=1)
+    ]
+    for (start, end), length in zip(pairwise(names), lengths, strict=True):
+        if length["significant"] is False and length["deviation"] is not None:
+            remarks.append(f"The length {start} to {end} is below three deviations: it cannot be told from 0.")
+    area = None
+    if len(points) > 2:
+        area = {"name": f"{names[0]} to {names[-1]}", **_quantities(measured.area())[0]}
     normal = plane.normal.tolist()
     if area is not None and area["value"] is not None and crosses(measured.points.tolist(), normal):
         remarks.append("The outline crosses itself, so its area means little: give the points in order around it.")
-    elif area is not None and area["significant"] is False:
+    elif area is not None and area["significant"] is False and area["deviation"] is not None:
         remarks.append("The area is below three deviations: it cannot be told from 0.")
     if scene.calibration.has_alternatives and bool(scene.calibration.ambiguous[scene.view]):
         ratio = float(scene.calibration.likelihood_ratio[scene.view])
@@ -53,26 +68,34 @@ def document(
             f"The board's corners fit two poses, and the one taken is only {ratio:.2g} times likelier than the other; "
             "the deviations hold the doubt. A photograph with the board larger or more tilted tells them apart."
         )
+    height = height_above_face(scene, plane)
     return {
         "camera": str(scene.camera_file),
         "photograph": None if scene.photograph is None else str(scene.photograph),
         "view": scene.calibration.views.names[scene.view],
         "view_rms": _known(float(scene.calibration.view_rms[scene.view])),
+        "unit": scene.square.unit,
+        "square": scene.square.value,
         "plane": [*normal, float(plane.offset)],
-        "pixel_sigma": pixel_sigma,
+        "height": height,
+        "plane_in_words": described(plane, height, scene.square.unit),
+        "pixel_sigma": noise.sigma,
+        "pixel_sigma_from": noise.source,
         "deviations_include": list(scene.includes),
         "points": points,
         "lengths": lengths,
         "area": area,
+        "doubts": measured.doubts or None,
         "remarks": remarks,
     }
 
 
 def _points(
-    camera: Camera, plane: Plane, pixels: torch.Tensor, measured: Measurement
+    camera: Camera, plane: Plane, given: Sequence[Pixel], measured: Measurement
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """The points, and remarks on those that are not on the plane or not in the photograph."""
     rows, remarks = [], []
+    pixels = torch.tensor([[pixel.u, pixel.v] for pixel in given], dtype=torch.float64, device="cpu")
     seen = camera.in_image(pixels).tolist() if camera.size is not None else [True] * len(pixels)
     beyond = [None] * len(pixels) if measured.extrapolated is None else measured.extrapolated.tolist()
     bent, outside = measured.nonlinear.tolist(), []
@@ -82,19 +105,20 @@ def _points(
     ):
         reason = Reason(code)
         valid = reason == Reason.VALID
-        row = {"number": number, "pixel": pixel, "valid": valid, "reason": None if valid else reason.name}
+        name = given[number - 1].name
+        row = {"number": number, "name": name, "pixel": pixel, "valid": valid, "reason": None if valid else reason.name}
         row["world"] = [_known(x) for x in point] if valid else None
         row["deviation"] = [_known(x) for x in deviation] if valid else None
         row["interval_95"] = [[_known(a), _known(b)] for a, b in zip(low, high, strict=True)] if valid else None
         row["extrapolated"] = beyond[number - 1]
         rows.append(row)
         if not valid:
-            remarks.append(f"Point {number} is not on the plane: {REASONS[reason]}.")
+            remarks.append(f"Point {name} is not on the plane: {REASONS[reason]}.")
         elif not seen[number - 1]:
             width, height = camera.size or (0, 0)
-            remarks.append(f"Point {number} lies outside the photograph of {width} x {height} px.")
+            remarks.append(f"Point {name} lies outside the photograph of {width} x {height} px.")
         elif beyond[number - 1]:
-            outside.append(number)
+            outside.append(name)
         if bent[number - 1]:
             bounds = ", ".join(
                 f"{axis} {between(a, b, s)}"
@@ -102,7 +126,7 @@ def _points(
                 if s > 1e-9 * max(deviation)
             )
             remarks.append(
-                f"Point {number} is so close to the horizon that its deviations mislead. 95 % intervals: {bounds}."
+                f"Point {name} is so close to the horizon that its deviations mislead. 95 % intervals: {bounds}."
             )
     if outside:
         remarks.append(
@@ -113,9 +137,9 @@ def _points(
     return rows, remarks
 
 
-def listed(word: str, numbers: Sequence[int]) -> str:
+def listed(word: str, names: Sequence[str]) -> str:
     """`Point 2 lies`, `Points 2, 3 and 5 lie`."""
-    *most, last = map(str, numbers)
+    *most, last = names
     return f"{word}s {', '.join(most)} and {last} lie" if most else f"{word} {last} lies"
 
 

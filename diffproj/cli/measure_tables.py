@@ -2,14 +2,23 @@
 
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 from diffproj.cli.scene import Scene
 from diffproj.cli.terminal import RESULTS, aligned, result, rounded
+from diffproj.cli.units import heading
 
 EXACT = 1e-9
 """Standard deviation, as a part of the point's largest coordinate, that is rounding error: the plane alone says what
 such a coordinate is."""
+
+NOISE = {
+    "hand": "{} px for each pixel, as for points picked by hand (--pixel-sigma)",
+    "option": "{} px for each pixel",
+    "detector": "{} px for each pixel, as for the board's corners",
+}
+"""The noise of the pixels that were measured, by where it comes from."""
 
 
 def say(document: dict[str, Any], scene: Scene) -> None:
@@ -20,22 +29,23 @@ def say(document: dict[str, Any], scene: Scene) -> None:
         scene: the camera at its pose.
     """
     result(f"{scene.title}\n")
-    RESULTS.print(_points_table(document, scene.unit))
+    RESULTS.print(_points_table(document, scene.unit_in_words))
     if document["lengths"]:
         result("")
-        RESULTS.print(_lengths_table(document["lengths"]))
+        RESULTS.print(_lengths_table(document["lengths"], heading(scene.square.unit)))
     area = document["area"]
     if area is not None:
         value, deviation, interval = shown(area)
-        known = f"{value} ± {deviation}, 95 % interval {interval}"
+        unit = f" {scene.square.unit}²" if scene.square.unit else ""
+        known = f"{value} ± {deviation}{unit}, 95 % interval {interval}"
         text = "not known, for not all points are on the plane" if area["value"] is None else known
-        result(f"\nArea of the outline 1 to {len(document['points'])}: {text}")
+        result(f"\nArea of the outline {area['name']}: {text}")
     if document["remarks"]:
         result("")
     for remark in document["remarks"]:
         RESULTS.print(remark, markup=False)
     result("")
-    noise = f"the pixels' noise of {document['pixel_sigma']:.2g} px"
+    noise = NOISE[document["pixel_sigma_from"]].format(f"{document['pixel_sigma']:.2g}")
     sentence = {
         3: f"The deviations hold {noise}, and how surely the pose and the camera are known.",
         2: f"The deviations hold {noise} and how surely the pose is known, but NOT how surely the camera is, for its "
@@ -47,8 +57,9 @@ def say(document: dict[str, Any], scene: Scene) -> None:
 
 
 def _points_table(document: dict[str, Any], unit: str) -> Table:
-    table = Table(title=f"Points on the plane {equation(document['plane'])}, in {unit}", title_justify="left")
-    table.add_column("point", justify="right")
+    title = f"Points on the plane {document['plane_in_words']}, in {unit}"
+    table = Table(title=title, title_justify="left")
+    table.add_column("point", justify="right" if all(row["name"].isdecimal() for row in document["points"]) else "left")
     table.add_column("pixel u, v", no_wrap=True)
     found = [row for row in document["points"] if row["valid"]]
     columns = []
@@ -60,7 +71,7 @@ def _points_table(document: dict[str, Any], unit: str) -> Table:
     cells = iter(zip(*columns, strict=True))
     for row in document["points"]:
         u, v = row["pixel"]
-        table.add_row(str(row["number"]), f"{u:g}, {v:g}", *(next(cells) if row["valid"] else ("none",) * 3))
+        table.add_row(escape(row["name"]), f"{u:g}, {v:g}", *(next(cells) if row["valid"] else ("none",) * 3))
     return table
 
 
@@ -76,14 +87,14 @@ def coordinate(world: list[float], deviations: list[float | None], axis: int) ->
     return text, f" ± {spread}"
 
 
-def _lengths_table(lengths: list[dict[str, Any]]) -> Table:
-    table = Table(title="Lengths", title_justify="left")
+def _lengths_table(lengths: list[dict[str, Any]], unit: str | None) -> Table:
+    table = Table(title="Lengths" + (f" in {unit}" if unit else ""), title_justify="left")
     for name in ("from, to", "length", "standard deviation", "95 % interval"):
         table.add_column(name, overflow="fold")
     rows = [shown(length) for length in lengths]
     values, deviations = (aligned(column) for column in zip(*((row[0], row[1]) for row in rows), strict=True))
     for length, value, deviation, (_, _, interval) in zip(lengths, values, deviations, rows, strict=True):
-        table.add_row(f"{length['from']}, {length['to']}", value, deviation, interval)
+        table.add_row(escape(length["name"]), value, deviation, interval)
     return table
 
 
@@ -98,15 +109,3 @@ def shown(quantity: dict[str, Any]) -> tuple[str, str, str]:
         return f"{value:.6g}", "0", ""
     low, high = ("" if bound is None else rounded(bound, deviation)[0] for bound in interval)
     return (*rounded(value, deviation), f"{low} to {high}" if high else f"from {low}")
-
-
-def equation(plane: list[float]) -> str:
-    """The plane's equation for people: `z = 0`, `0.6 x + 0.8 z = 5`."""
-    *normal, offset = plane
-    terms = [(factor, name) for factor, name in zip(normal, "xyz", strict=True) if factor]
-    text = " ".join(
-        f"{'-' if factor < 0 else '+'} {'' if abs(factor) == 1 else f'{abs(factor):g} '}{name}"
-        for factor, name in terms
-    )
-    text = text.removeprefix("+ ") if text.startswith("+") else text.replace("- ", "-", 1)
-    return f"{text} = {offset:g}"

@@ -1,25 +1,48 @@
 """Running a command: its warnings and failures as one line each on standard error, and the exit code."""
 
 import argparse
+import io
+import sys
+import traceback
 import warnings
+from importlib import import_module
+from pathlib import Path
 
-from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.result import CalibrationError
-from diffproj.cli.terminal import failure, note
-from diffproj.targets.detection import BoardNotFoundWarning
+from diffproj.cli.terminal import failure, in_options, note
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command that was understood; returns the exit code."""
+    """Run the command that was understood; returns the exit code.
+
+    What was warned of is in `options.warned`, for documents that hold all that was said.
+    """
+    for stream in (sys.stdout, sys.stderr):  # a terminal that has no ± shows a question mark
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         with warnings.catch_warnings():
-            for kind in (AmbiguousPoseWarning, BoardNotFoundWarning):
-                warnings.simplefilter("always", kind)
-            warnings.showwarning = lambda message, *_: note(str(message))
-            return options.run(options)
+            warnings.simplefilter("always", UserWarning)
+            options.warned = []
+            warnings.showwarning = lambda message, *_: _warn(options.warned, in_options(str(message)))
+            return import_module(f"diffproj.cli.{options.work}").run(options)
     except (ValueError, OSError, CalibrationError) as error:
         note(failure(error))
         return 1
     except KeyboardInterrupt:
         note("interrupted")
         return 130
+    except ImportError:  # of what the command line needs, see `__main__`
+        raise
+    except Exception as error:  # a mistake of ours; who calls the command has no use for its traceback
+        *_, (frame, line) = traceback.walk_tb(error.__traceback__)
+        where = f"{Path(frame.f_code.co_filename).name}:{line}"
+        note(f"unexpected {type(error).__name__} at {where}: {failure(error)}; please report it with the command")
+        return 1
+
+
+def _warn(warned: list[str], text: str) -> None:
+    """Say a warning, once."""
+    if text not in warned:
+        warned.append(text)
+        note(text)

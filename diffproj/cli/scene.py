@@ -1,17 +1,20 @@
 """Where the camera stood: at a view that it was calibrated with, or before a board in a new photograph."""
 
 import argparse
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from diffproj._core.warn import warn_caller
-from diffproj.calibration.locate import located
+import torch
+
+from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration, CalibrationError
-from diffproj.cli.inputs import find_corners, photographs
+from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import progress_bars
+from diffproj.cli.units import Length, agreed, heading
 from diffproj.files.load import load
 from diffproj.geometry.camera import Camera
-from diffproj.targets.chessboard import Chessboard, origin_doubt
+from diffproj.targets.chessboard import Chessboard
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,8 @@ class Scene:
         view: the number of the view.
         includes: whose uncertainty the standard deviations include: pixels, pose, camera.
         title: where the pose comes from, and how well it fits.
-        unit: what the world's unit is.
+        square: the side of the board's squares; its unit is the world's.
+        unit_in_words: the world's unit for headings, also where it is not known.
     """
 
     camera_file: Path
@@ -34,7 +38,13 @@ class Scene:
     view: int
     includes: tuple[str, ...]
     title: str
-    unit: str
+    square: Length
+    unit_in_words: str
+
+    @property
+    def camera(self) -> Camera:
+        """The camera at its pose."""
+        return self.calibration.cameras[self.view]
 
 
 def stored_view(options: argparse.Namespace) -> Scene:
@@ -65,7 +75,10 @@ def stored_view(options: argparse.Namespace) -> Scene:
     includes = ("pixels", "pose") if calibration.has_covariance else ("pixels",)
     title = f"{path}: view {name}\nRMS {float(calibration.view_rms[number]):.4f} px"
     includes += ("camera",) if calibration.knows_intrinsics else ()
-    return Scene(path, None, calibration, number, includes, title, "the calibration's unit")
+    square = _calibrated_square(calibration)
+    return Scene(
+        path, None, calibration, number, includes, title, square, heading(square.unit) or "the calibration's unit"
+    )
 
 
 def new_photograph(options: argparse.Namespace) -> Scene:
@@ -75,15 +88,20 @@ def new_photograph(options: argparse.Namespace) -> Scene:
         ValueError: no single photograph, no board in it, another size than the camera's, or no pose that fits.
     """
     camera, calibration = _loaded(options.camera)
+    square = options.square
+    if calibration is not None:
+        square, doubt = agreed(square, _calibrated_square(calibration), options.camera)
+        if doubt is not None:
+            warnings.warn(doubt, stacklevel=2)
+    if options.photograph.is_dir():
+        raise ValueError(f"PHOTO: want one photograph, got the folder {options.photograph}")
     sources = photographs([options.photograph])
     if len(sources) > 1:
-        raise ValueError(f"PHOTO: want one photograph, got {len(sources)} in {options.photograph}")
+        raise ValueError(f"PHOTO: want one photograph, got {len(sources)} of the form {options.photograph}")
     columns, rows = options.board
-    board = Chessboard(columns, rows, options.square)
+    board = Chessboard(columns, rows, square.value)
     with progress_bars() as bars:
         views = find_corners(sources, board, bars, orientation=options.orientation)
-    if board.turns > 1:
-        warn_caller(f"--board: {origin_doubt(board)}")
     if camera.size is not None and camera.size != views.size:
         (w, h), (width, height) = views.size or (0, 0), camera.size
         raise ValueError(
@@ -91,7 +109,7 @@ def new_photograph(options: argparse.Namespace) -> Scene:
             "it with the camera as it was calibrated, and do not resize or crop it"
         )
     try:
-        found = located(views, board, camera if calibration is None else calibration)
+        found = locate(views, board, camera if calibration is None else calibration)
     except CalibrationError as error:
         raise ValueError(
             f"{options.photograph}: no pose of the board explains its corners; check --camera, --board and --square"
@@ -101,7 +119,8 @@ def new_photograph(options: argparse.Namespace) -> Scene:
     if calibration is not None:
         title += f" ({float(calibration.rms):.4f} px in the calibration)"
         includes += ("camera",) if calibration.knows_intrinsics else ()
-    return Scene(options.camera, options.photograph, found, 0, includes, title, "the unit of --square")
+    unit = heading(square.unit) or "the unit of --square"
+    return Scene(options.camera, Path(str(sources[0])), found, 0, includes, title, square, unit)
 
 
 def _loaded(path: Path) -> tuple[Camera, Calibration | None]:
@@ -111,3 +130,9 @@ def _loaded(path: Path) -> tuple[Camera, Calibration | None]:
     if camera.batch_shape:
         raise ValueError(f"--camera: want one camera, got {camera.batch_shape.numel()} side by side in {path}")
     return camera, calibration
+
+
+def _calibrated_square(calibration: Calibration) -> Length:
+    """The side of the squares of the board that a camera was calibrated with: from its first corner to its second."""
+    first, second, *_ = calibration.points
+    return Length(float(torch.linalg.vector_norm(second - first)), calibration.unit)

@@ -1,6 +1,7 @@
 """What commands say and where: results on standard output, progress, warnings and failures on standard error."""
 
 import math
+import re
 from collections.abc import Sequence
 
 from rich.console import Console
@@ -16,6 +17,14 @@ HUGE = 1e5
 """Standard deviation from which numbers are shown with a power of ten, as for points close to the horizon."""
 
 
+REMEDIES = {
+    FileNotFoundError: "; check its name and its folder",
+    IsADirectoryError: "; want a file in its place",
+    PermissionError: "; choose another place, or change who may use it",
+}
+"""What to do about errors of the system."""
+
+
 def note(text: str) -> None:
     """One line on standard error, however long."""
     NOTES.print(f"diffproj: {text}", markup=False, soft_wrap=True)
@@ -26,9 +35,21 @@ def result(text: str) -> None:
     RESULTS.print(text, markup=False, soft_wrap=True)
 
 
+def counted(count: int, thing: str) -> str:
+    """`1 file`, `2 files`."""
+    return f"{count} {thing}" + "s" * (count != 1)
+
+
 def in_options(text: str) -> str:
-    """What a calibration advises, with the command's options in place of Python's."""
-    return text.replace("distortion=", "--distortion ").replace("bow=True", "--bow").replace("'auto'", "auto")
+    """What the library says, with the command's options in place of Python's, and without what it has not."""
+    text = re.sub(r"^(calibrate|locate|measure): ", "", text)
+    text = re.sub(r", or (let fixed or priors hold|fix) the principal point and the lens( \([^)]*\))?", "", text)
+    return (
+        text.replace("distortion=", "--distortion ")
+        .replace("bow=True", "--bow")
+        .replace("skew=True", "--skew")
+        .replace("'auto'", "auto")
+    )
 
 
 def failure(error: Exception) -> str:
@@ -42,7 +63,7 @@ def failure(error: Exception) -> str:
             )
         return in_options(" ".join(str(error).split()))
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror}"
+        return f"{error.filename}: {error.strerror}" + REMEDIES.get(type(error), "")
     return " ".join(str(error).split())
 
 

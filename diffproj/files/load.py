@@ -1,44 +1,75 @@
 """`load`, `load_camera` and `load_calibration`: cameras and calibrations from files."""
 
-from pathlib import Path
+import numpy as np
 
+from diffproj._core.arguments import file_path
 from diffproj.calibration.result import Calibration
 from diffproj.files import own_json
+from diffproj.files.document import Document
 from diffproj.files.formats import FormatName, PathLike, format_of
+from diffproj.files.found import Found
 from diffproj.geometry.camera import Camera
 
+DAMAGE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
+"""What a reader meets in a file that is not what it says; all become one `ValueError` that names the file."""
 
-def load_camera(path: PathLike, format: FormatName | None = None) -> Camera:  # noqa: A002
+
+def load_camera(path: PathLike, format: FormatName | None = None, camera: str | int | None = None) -> Camera:  # noqa: A002
     """Load a camera; of a calibration, the camera without a pose.
+
+    The formats are told apart by what is in the file; `diffproj.files` lists them with their conventions, which are
+    turned into those of `Camera`. What is not understood to the last coefficient of the lens is refused.
 
     Args:
         path: the file to read.
-        format: as for `save_camera`.
+        format: the format, where it is not to be told by the content: `"opencv"`, `"ros"`, `"json"`, ...
+        camera: which one of several, by its name in the file or its number, counted from 0. Left out, several cameras
+            are a batch where they have one lens model and one size.
 
     Returns:
-        The camera; in float64 from OpenCV's formats, in the dtype it was saved in from JSON.
+        The camera; in float64, from this package's own JSON in the dtype it was saved in.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: unknown suffix or format, or the file is not what it should be.
+        TypeError: the path is none, the format is no string, or `camera` is neither a name nor a number.
+        OSError: there is no such file, or it cannot be read.
+        ValueError: the file is of no known format, is damaged, holds a lens that is none of this package's, or holds
+            several cameras that make no batch; the message names the file and what to do.
 
     Example:
         >>> import tempfile, torch, diffproj as dp
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     dp.save_camera(f"{folder}/camera.yaml", dp.Camera(torch.eye(3), size=(640, 480)))
         ...     dp.load_camera(f"{folder}/camera.yaml")
-        Camera(batch_shape=(), pinhole, size=(640, 480), torch.float64, cpu)
+        Camera(f 1.0, 1.0 px, c 0.0, 0.0 px, pinhole, 640 x 480 px, no pose, torch.float64)
     """
-    path = Path(path)
-    return format_of(path, format).read_camera(path)
+    document = Document.read(file_path("path", path))
+    found = found_in(document, format)
+    try:
+        return found.chosen(camera)
+    except ValueError as error:
+        raise ValueError(_message(document, error)) from error
+
+
+def found_in(document: Document, format: FormatName | None = None) -> Found:  # noqa: A002
+    """All cameras of a file.
+
+    Raises:
+        ValueError: as for `load_camera`.
+    """
+    try:
+        with np.errstate(all="ignore"):  # a camera that is not finite is refused where it is built
+            return format_of(document, format).read(document)
+    except DAMAGE as error:
+        raise ValueError(_message(document, error)) from error
 
 
 def load_calibration(path: PathLike) -> Calibration:
     """Load a whole calibration from this package's own JSON; see `save_camera`.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is no JSON of this package, or holds a camera alone.
+        TypeError: the path is none.
+        OSError: there is no such file, or it cannot be read.
+        ValueError: the file is no JSON of this package, is damaged, or holds a camera alone.
 
     Example:
         >>> import tempfile, diffproj as dp
@@ -49,12 +80,13 @@ def load_calibration(path: PathLike) -> Calibration:
         >>> again.summary() == calibration.summary()
         True
     """
-    path = Path(path)
-    if format_of(path) is not own_json:
-        raise ValueError(f"{path}: want a .json file, for OpenCV's formats hold no corners; load_camera reads them")
-    calibration = own_json.read_calibration(path)
+    document = Document.read(file_path("path", path))
+    calibration = _calibration(document)
     if calibration is None:
-        raise ValueError(f"{path}: want a calibration, got a camera alone; load_camera reads it")
+        raise ValueError(
+            f"{path}: want a calibration as save_camera writes it to .json, got a file with cameras alone; load_camera "
+            "reads it"
+        )
     return calibration
 
 
@@ -62,9 +94,26 @@ def load(path: PathLike) -> Camera | Calibration:
     """Load what a file holds: the whole calibration where there is one, the camera otherwise.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: unknown suffix, or the file is not what it should be.
+        TypeError: the path is none.
+        OSError: there is no such file, or it cannot be read.
+        ValueError: as for `load_camera`.
     """
-    path = Path(path)
-    calibration = own_json.read_calibration(path) if format_of(path) is own_json else None
+    calibration = _calibration(Document.read(file_path("path", path)))
     return load_camera(path) if calibration is None else calibration
+
+
+def _calibration(document: Document) -> Calibration | None:
+    try:
+        return own_json.read_calibration(document) if own_json.recognises(document) else None
+    except DAMAGE as error:
+        raise ValueError(_message(document, error)) from error
+
+
+def _message(document: Document, error: Exception) -> str:
+    """One line that names the file and what is wrong with it."""
+    said = " ".join(str(error).split())
+    if isinstance(error, KeyError):
+        said = f"want the key {said.strip(chr(39))}, got a file without it"
+    elif not isinstance(error, ValueError):
+        said = f"the file is damaged ({error!r})"
+    return f"{document.path}: {said}"

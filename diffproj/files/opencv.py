@@ -1,19 +1,69 @@
-"""OpenCV's YAML and XML: one camera, under the keys that OpenCV's own calibration program writes."""
+"""OpenCV's YAML, XML and JSON, and the same without OpenCV's tags: K, lens and size under the names of `named.py`.
+
+Written are the keys that OpenCV's own calibration program writes. Read are also those of its stereo program, whose `R`
+and `T` place the second camera beside the first, and of files that hold cameras in mappings of their own. Integer pixel
+centres; coefficients in OpenCV's order; a fisheye lens only where the file says so.
+"""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from diffproj.calibration.result import Calibration
+from diffproj.files import named
+from diffproj.files.document import Document
+from diffproj.files.found import Found
 from diffproj.geometry.camera import Camera
 from diffproj.lens.kannala_brandt import KannalaBrandt
 
-SUFFIXES: tuple[str, ...] = (".yml", ".yaml", ".xml")
+
+def recognises(document: Document) -> bool:
+    """Whether K stands in it, or in a mapping of it, under a known name."""
+    try:
+        return bool(_holders(document.tree))
+    except ValueError:
+        return False
 
 
-def dumps(path: Path, item: Camera | Calibration) -> str:
-    """A camera as the text of a file, XML where the suffix is `.xml`; of a calibration also poses and errors.
+def read(document: Document) -> Found:
+    """The cameras of the file.
+
+    Raises:
+        ValueError: there is none, or something about it is not understood.
+    """
+    holders = _holders(document.tree)
+    if list(holders) == [""] or not holders:
+        tree = document.tree
+        return named.read(tree if isinstance(tree, dict) else {})
+    named.check_no_lens(document.tree, list(holders.values()))
+    cameras: dict[str, Camera] = {}
+    for name, holder in holders.items():
+        for inner, camera in named.read(holder).cameras.items():
+            cameras[name if inner == "camera" else f"{name} {inner}"] = camera
+    return Found(cameras)
+
+
+def _holders(tree: Any) -> dict[str, dict[str, Any]]:
+    """The mappings that hold a K: the file's own, by the name `""`, or those in it by their names."""
+    if isinstance(tree, dict):
+        if named.holds_matrix(tree):
+            return {"": tree}
+        return {str(key): value for key, value in tree.items() if isinstance(value, dict) and named.holds_matrix(value)}
+    items = enumerate(tree) if isinstance(tree, list) else ()
+    found = ((str(item.get("name", item.get("id", i))), item) for i, item in items if isinstance(item, dict))
+    holders: dict[str, dict[str, Any]] = {}
+    for name, item in found:
+        if named.holds_matrix(item):
+            if name in holders:
+                raise ValueError(f"{name}: want each camera once, got two of the name")
+            holders[name] = item
+    return holders
+
+
+def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
+    """One camera, as XML or JSON where the suffix says so; of a calibration also poses and errors.
 
     Raises:
         ValueError: a batch of cameras, a pose, skew or a lens that OpenCV does not have.
@@ -21,15 +71,16 @@ def dumps(path: Path, item: Camera | Calibration) -> str:
     camera = item.camera if isinstance(item, Calibration) else item
     if camera.batch_shape:
         raise ValueError(
-            f"{path}: OpenCV's formats hold one camera, got batch shape {tuple(camera.batch_shape)}; use .json"
+            f"OpenCV's formats hold one camera, got batch shape {tuple(camera.batch_shape)}; "
+            "use .json, or save them one by one"
         )
     K, dist, rvec, tvec = camera.to_opencv()
     if rvec.any() or tvec.any():
         remedy = "camera.without_pose()"
         if not np.array_equal(K, camera.K.numpy(force=True)):  # of a turned image: OpenCV's camera is turned instead
             remedy = "camera.upright().without_pose(), whose axes are those of the turned image"
-        raise ValueError(f"{path}: OpenCV's formats hold no pose; use .json, or save {remedy}")
-    suffix = ".xml" if path.suffix.lower() == ".xml" else ".yml"
+        raise ValueError(f"OpenCV's formats hold no pose; use .json, or save {remedy}")
+    suffix = path.suffix.lower() if path.suffix.lower() in (".xml", ".json") else ".yml"
     storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     if camera.size is not None:
         storage.write("image_width", camera.size[0])
@@ -44,30 +95,4 @@ def dumps(path: Path, item: Camera | Calibration) -> str:
         storage.write("extrinsic_parameters", np.concatenate([rvecs, tvecs], axis=-1))
         storage.write("avg_reprojection_error", float(item.rms))
         storage.write("per_view_reprojection_errors", item.view_rms.numpy().reshape(-1, 1))
-    return storage.releaseAndGetString()
-
-
-def read_camera(path: Path) -> Camera:
-    """The camera of a file that OpenCV's calibration program or this package wrote, in float64.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not what it should be.
-    """
-    text = path.read_text(encoding="utf-8", errors="replace")
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    except (cv2.error, SystemError) as error:
-        raise ValueError(f"{path}: want a YAML or XML file that OpenCV reads, got something else") from error
-    try:
-        K, dist = storage.getNode("camera_matrix").mat(), storage.getNode("distortion_coefficients").mat()
-        width, height = (int(storage.getNode(key).real()) for key in ("image_width", "image_height"))
-        fisheye = bool(storage.getNode("fisheye_model").real())
-    finally:
-        storage.release()
-    if K is None:
-        raise ValueError(f"{path}: want the key camera_matrix, got a file without it")
-    try:
-        return Camera.from_opencv(K, dist, size=(width, height) if width and height else None, fisheye=fisheye)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from error
+    return {path: storage.releaseAndGetString()}

@@ -1,25 +1,28 @@
 """`save_camera`: cameras and calibrations to files."""
 
-from pathlib import Path
-
 from kornia.geometry.camera import PinholeCamera
 
+from diffproj._core.arguments import file_path
 from diffproj._core.atomic import write_whole
 from diffproj.calibration.result import Calibration
-from diffproj.files.formats import FormatName, PathLike, format_of
+from diffproj.files.formats import FormatName, PathLike, format_to_write
 from diffproj.geometry.camera import Camera, as_camera
 
 
 def save_camera(path: PathLike, camera: Camera | PinholeCamera | Calibration, format: FormatName | None = None) -> None:  # noqa: A002
     """Save a camera or a calibration.
 
+    A file is written whole or not at all. What a format cannot hold is refused, not dropped: a pose, a batch, skew, the
+    last coefficients of a lens. This package's own JSON holds all, and whole calibrations.
+
     Args:
         path: the file to write; its folder must exist.
         camera: what to save.
-        format: `"opencv"` or `"json"`; by the suffix if left out.
+        format: one of those that `diffproj.files` lists as written; by the suffix if left out, `.json` for this
+            package's own, `.yaml`, `.yml` and `.xml` for OpenCV's.
 
     Raises:
-        TypeError: it is neither a camera nor a calibration.
+        TypeError: it is neither a camera nor a calibration, the path is none, or the format is no string.
         ValueError: unknown suffix or format, or something that the format cannot hold.
         OSError: the file cannot be written.
 
@@ -36,5 +39,11 @@ def save_camera(path: PathLike, camera: Camera | PinholeCamera | Calibration, fo
         raise TypeError(f"camera: want dp.Camera or dp.Calibration, got {type(camera).__name__}")
     if isinstance(camera, PinholeCamera):
         camera = as_camera(camera)
-    path = Path(path)
-    write_whole(path, format_of(path, format).dumps(path, camera))
+    path = file_path("path", path)
+    try:
+        contents = format_to_write(path, format).write(path, camera)
+    except ValueError as error:
+        said = str(error)
+        raise ValueError(said if said.startswith("format:") else f"{path}: {said}") from error
+    for file, content in contents.items():
+        write_whole(file, content)

@@ -26,6 +26,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.linalg import vector_norm
 
+from diffproj._core.arguments import Array, tensor_of
 from diffproj._core.batched import register_pytree
 from diffproj._core.copying import Copied
 from diffproj._core.numerics import (
@@ -33,16 +34,20 @@ from diffproj._core.numerics import (
     check_same_kind,
     dot,
     entries,
+    has_values,
     in_blocks,
     in_float64,
     interleaved,
     linear,
     rounding,
 )
+from diffproj._core.shown import Shown
+from diffproj._core.warn import warn_caller
+from diffproj.geometry import description
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.geometry.intrinsics import pixel_to_normalized
-from diffproj.geometry.plane import Plane
+from diffproj.geometry.plane import Plane, as_plane
 from diffproj.lens.slopes import by_direction
 
 
@@ -63,7 +68,7 @@ class Reason(enum.IntEnum):
     """The ray meets the plane behind the camera."""
 
 
-class PlaneMap(Copied):
+class PlaneMap(Copied, Shown):
     """The map from pixels to points of a plane, built once for a camera and a plane and then applied at will.
 
     `back_project` builds one for each call; keep one where camera and plane stay as they are. It is a PyTree.
@@ -105,9 +110,7 @@ class PlaneMap(Copied):
         return plane_map
 
     def _build(self, camera: Camera | PinholeCamera, plane: Plane, warn: bool) -> None:
-        camera = as_camera(camera)
-        if not isinstance(plane, Plane):
-            raise TypeError(f"plane: want a dp.Plane, got {type(plane).__name__}")
+        camera, plane = as_camera(camera), as_plane(plane)
         plane = plane.like(camera.K)
         check_same_kind(camera=camera.K, plane=plane.normal)
         if plane.is_per_point:
@@ -124,7 +127,7 @@ class PlaneMap(Copied):
         return plane_map
 
     def __call__(
-        self, pixels: Float[Tensor, "*#batch n 2"]
+        self, pixels: Float[Tensor, "*#batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
         """Points `(*B, N, 3)` and `valid (*B, N)` of pixels `(*B, N, 2)`; see `back_project`."""
         rows = entries(self.matrix)
@@ -136,7 +139,7 @@ class PlaneMap(Copied):
         return (points.squeeze(-2), valid.squeeze(-1)) if self.is_per_point else (points, valid)
 
     def resolution(
-        self, pixels: Float[Tensor, "*#batch n 2"]
+        self, pixels: Float[Tensor, "*#batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*#batch n"], Bool[Tensor, "*#batch n"]]:
         """World units that a pixel covers `(*B, N)`, and `valid (*B, N)`; see the function `ground_resolution`."""
         rows = entries(self.matrix)
@@ -147,10 +150,14 @@ class PlaneMap(Copied):
         found, valid = in_blocks(resolution, self._checked(pixels), self.matrix, *self.camera.tensors())
         return (found.squeeze(-1), valid.squeeze(-1)) if self.is_per_point else (found, valid)
 
-    def explain(self, pixels: Float[Tensor, "*#batch n 2"]) -> Int[Tensor, "*#batch n"]:
+    def explain(self, pixels: Float[Tensor, "*#batch n 2"] | Array) -> Int[Tensor, "*#batch n"]:
         """`Reason` codes `(*B, N)` of pixels `(*B, N, 2)`; see the function `explain`."""
         (reasons,) = in_blocks(self._explain, self._checked(pixels), self.matrix, *self.camera.tensors())
         return reasons.squeeze(-1) if self.is_per_point else reasons
+
+    def _facts(self) -> list[str]:
+        planes = "a plane for each point" if self.is_per_point else ""
+        return [repr(self.camera), planes]
 
     def _to_plane(self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
         _, points, _, valid = self._intersection(pixels, rows)
@@ -217,16 +224,17 @@ class PlaneMap(Copied):
         direction, seen = self.camera.directions(pixels)
         return list(direction.unbind(-1)), seen
 
-    def _checked(self, pixels: Tensor) -> Tensor:
-        if self.is_per_point and isinstance(pixels, Tensor) and pixels.ndim >= 2:
-            pixels = pixels.unsqueeze(-2)
+    def _checked(self, pixels: Tensor | Array) -> Tensor:
+        if self.is_per_point:
+            pixels = tensor_of("pixels", pixels, self.camera.K)
+            pixels = pixels.unsqueeze(-2) if pixels.ndim >= 2 else pixels
         pixels = self.camera._checked("pixels", pixels, 2)
         batch = broadcast_batches(map=self.matrix.shape[:-2], pixels=pixels.shape[:-2])
         return pixels.expand(*batch, *pixels.shape[-2:])
 
 
 def back_project(
-    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane
+    pixels: Float[Tensor, "*#batch n 2"] | Array, camera: Camera | PinholeCamera, plane: Plane
 ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
     """Intersect the viewing rays of pixels with a plane.
 
@@ -242,10 +250,11 @@ def back_project(
     Returns:
         World points `(*B, N, 3)` in the dtype of the camera, and `valid (*B, N)`: false where the pixel is not finite,
         the lens has no inverse, the ray is parallel to the plane or within rounding of it, or meets it behind the
-        camera. Points are (0, 0, 0) there, and their gradient is zero.
+        camera. Points are (0, 0, 0) there, and their gradient is zero. A camera without a pose, whose world is its own
+        frame, lies in planes through the origin: a warning says so.
 
     Raises:
-        TypeError: tensors of integers or of mixed dtypes.
+        TypeError: not pixels, a camera and a plane in this order, or tensors of integers or of mixed dtypes.
         ValueError: wrong shapes, mixed devices, or batch shapes that do not broadcast.
 
     Example:
@@ -259,11 +268,17 @@ def back_project(
         >>> K.grad[0, 0].item()  # millimetres for one pixel more of focal length
         -0.2
     """
-    return PlaneMap(camera, plane)(pixels)
+    to_plane = PlaneMap(camera, plane)
+    if _lacks_pose(to_plane):
+        warn_caller(
+            "camera: want one with a pose, got one whose world is its own frame (R = I, t = 0) and lies in the plane, "
+            "so that no pixel has a point; calibration.cameras[view] and dp.locate(...).cameras have poses"
+        )
+    return to_plane(pixels)
 
 
 def explain(
-    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane
+    pixels: Float[Tensor, "*#batch n 2"] | Array, camera: Camera | PinholeCamera, plane: Plane
 ) -> Int[Tensor, "*#batch n"]:
     """Say for each pixel why it has no point on the plane, or that it has one.
 
@@ -291,7 +306,7 @@ def explain(
 
 
 def ground_resolution(
-    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane
+    pixels: Float[Tensor, "*#batch n 2"] | Array, camera: Camera | PinholeCamera, plane: Plane
 ) -> tuple[Float[Tensor, "*#batch n"], Bool[Tensor, "*#batch n"]]:
     """World units that a pixel covers on the plane along its worst direction.
 
@@ -326,6 +341,14 @@ def warn_if_rounded(camera: Camera, plane: Plane) -> None:
             length = plane.length
             height = (dot(plane.normal, camera.center) - plane.offset).abs()
             warn_of_rounding(plane.offset.abs() + length * vector_norm(camera.t, dim=-1), height)
+
+
+def _lacks_pose(to_plane: PlaneMap) -> bool:
+    """Whether all cameras are where the world's origin is, in the plane, and look along its axes; false if not told."""
+    R, t = to_plane.camera.R, to_plane.camera.t
+    if t.device.type != "cpu" or not has_values(t, to_plane.matrix) or bool(t.any()) or t.numel() == 0:
+        return False
+    return not bool(to_plane.matrix[..., 3, :].any()) and description.without_pose(R, t)
 
 
 def _largest_singular_value(by_u: Tensor, by_v: Tensor) -> Tensor:

@@ -19,10 +19,10 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
+from diffproj._core.arguments import Array, flag, instance, meeting, number, whole_number
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
     broadcast_batches,
-    check_number,
     check_same_kind,
     check_tensor,
     dot,
@@ -33,6 +33,7 @@ from diffproj._core.numerics import (
     linear,
     transform,
 )
+from diffproj.geometry import description
 from diffproj.geometry.exchange import Exchange
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounded_pixels
 from diffproj.geometry.grid import checked_size, inside
@@ -79,9 +80,9 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
 
     def __init__(
         self,
-        K: Float[Tensor, "*#batch 3 3"],
-        R: Float[Tensor, "*#batch 3 3"] | None = None,
-        t: Float[Tensor, "*#batch 3"] | None = None,
+        K: Float[Tensor, "*#batch 3 3"] | Array,
+        R: Float[Tensor, "*#batch 3 3"] | Array | None = None,
+        t: Float[Tensor, "*#batch 3"] | Array | None = None,
         distortion: Lens | None = None,
         size: tuple[int, int] | None = None,
     ) -> None:
@@ -99,13 +100,11 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             ValueError: wrong shapes or devices, a K without inverse, an R that is no rotation to 1e-5, or values
                 that are not finite. Values are checked where they can be read, not while compiling or under `vmap`.
         """
-        K = check_tensor("K", K, 3, 3)
-        R = torch.eye(3, dtype=K.dtype, device=K.device) if R is None else check_tensor("R", R, 3, 3)
-        t = torch.zeros(3, dtype=K.dtype, device=K.device) if t is None else check_tensor("t", t, 3)
-        if distortion is not None and not hasattr(distortion, "unproject"):  # dynamo knows no protocols
-            raise TypeError(
-                f"distortion: want a lens such as dp.BrownConrady(coefficients), got {type(distortion).__name__}"
-            )
+        K = check_tensor("K", K, 3, 3, like=None if isinstance(K, Tensor) else meeting(R, t, distortion))
+        R = torch.eye(3, dtype=K.dtype, device=K.device) if R is None else check_tensor("R", R, 3, 3, like=K)
+        t = torch.zeros(3, dtype=K.dtype, device=K.device) if t is None else check_tensor("t", t, 3, like=K)
+        if distortion is not None:
+            check_lens(distortion)
         if has_values(K, R, t):
             check_intrinsics(K)
             _check_pose(R, t)
@@ -138,9 +137,11 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         camera._assign(**({name: getattr(self, name) for name in self.__slots__} | changes))
         return camera
 
-    def __repr__(self) -> str:
-        lens = "pinhole" if self.distortion is None else type(self.distortion).__name__
-        return f"Camera(batch_shape={tuple(self.batch_shape)}, {lens}, size={self.size}, {self.dtype}, {self.device})"
+    def _facts(self) -> list[str]:
+        return description.facts(self.K, self.R, self.t, self.distortion, self.size)
+
+    def _columns(self) -> dict[str, list[Any]]:
+        return description.columns(self.K, self.distortion)
 
     # ------------------------------------------------------------------------------------------------ other cameras
 
@@ -149,7 +150,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         """The centre of projection in the world, `C = -R^T t`, in world units."""
         return -dot(self.R.mT, self.t.unsqueeze(-2))
 
-    def at(self, R: Float[Tensor, "*#batch 3 3"], t: Float[Tensor, "*#batch 3"]) -> "Camera":
+    def at(self, R: Float[Tensor, "*#batch 3 3"] | Array, t: Float[Tensor, "*#batch 3"] | Array) -> "Camera":
         """The same intrinsics and lens at another pose, or at many: the batch shapes broadcast.
 
         Args:
@@ -160,7 +161,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             TypeError: no floating-point tensors, or other dtypes than the camera's.
             ValueError: wrong shapes or devices, or an R that is no rotation.
         """
-        R, t = check_tensor("R", R, 3, 3), check_tensor("t", t, 3)
+        R, t = check_tensor("R", R, 3, 3, like=self.K), check_tensor("t", t, 3, like=self.K)
         if has_values(R, t):
             _check_pose(R, t)
         return self._with(R=R, t=t)
@@ -191,6 +192,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             >>> wide.K.tolist()
             [[1000.0, 0.0, 639.5], [0.0, 1000.0, 359.5], [0.0, 0.0, 1.0]]
         """
+        stretched = flag("stretched", stretched)
         if self.size is None:
             raise ValueError(
                 "resized: want a camera with a size, got size=None; give Camera(..., size=(width, height))"
@@ -219,12 +221,12 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             TypeError: `left` or `top` is no number, or width and height are not whole.
             ValueError: `left` or `top` is not finite, or width or height is not positive.
         """
-        for name, number in (("left", left), ("top", top)):
-            check_number(name, number)
+        left, top = (number(name, side, "a finite number of px") for name, side in (("left", left), ("top", top)))
+        width, height = (whole_number(name, side, least=1) for name, side in (("width", width), ("height", height)))
         shift = self.K.new_tensor([[0, 0, left], [0, 0, top], [0, 0, 0]])
         return self._with(K=self.K - shift, size=checked_size((width, height)))
 
-    def warped(self, matrix: Float[Tensor, "*#batch 3 3"], size: tuple[int, int] | None = None) -> "Camera":
+    def warped(self, matrix: Float[Tensor, "*#batch 3 3"] | Array, size: tuple[int, int] | None = None) -> "Camera":
         """The camera of the same image warped, as a geometric augmentation does: pixels `p` go to `matrix p`.
 
         An affine matrix changes K alone: turned, mirrored, sheared, scaled and shifted images stay exact, behind a lens
@@ -252,11 +254,17 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
             >>> pixels.tolist()  # 639 - 370
             [[[269.0, 240.0]]]
         """
-        matrix = check_tensor("matrix", matrix, 3, 3)
-        check_same_kind(camera=self.K, matrix=matrix)
-        broadcast_batches(camera=self.batch_shape, matrix=matrix.shape[:-2])
+        return self.warped_by("matrix", matrix, size)
+
+    def warped_by(
+        self, name: str, matrix: Float[Tensor, "*#batch 3 3"] | Array, size: tuple[int, int] | None = None
+    ) -> "Camera":
+        """The same, for an argument of that name."""
+        matrix = check_tensor(name, matrix, 3, 3, like=self.K)
+        check_same_kind(**{"camera": self.K, name: matrix})
+        broadcast_batches(**{"camera": self.batch_shape, name: matrix.shape[:-2]})
         if has_values(matrix):
-            check_warp(matrix, self.K, behind_lens=self.distortion is not None)
+            check_warp(name, matrix, self.K, behind_lens=self.distortion is not None)
         ahead = self.K[..., :2, 2]
         if self.size is not None:
             ahead = self.K.new_tensor([(side - 1) / 2 for side in self.size])
@@ -266,7 +274,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
 
     # ------------------------------------------------------------------------------------------- points and pixels
 
-    def in_image(self, pixels: Float[Tensor, "*shape 2"]) -> Bool[Tensor, "*shape"]:
+    def in_image(self, pixels: Float[Tensor, "*shape 2"] | Array) -> Bool[Tensor, "*shape"]:
         """Whether pixels lie on the image: from -0.5 to `width - 0.5` and `height - 0.5`; false where not finite.
 
         Args:
@@ -282,10 +290,10 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         """
         if self.size is None:
             raise ValueError("in_image: want a camera with a size, got None; give Camera(..., size=(width, height))")
-        return inside(check_tensor("pixels", pixels, 2), self.size)
+        return inside(check_tensor("pixels", pixels, 2, like=self.K), self.size)
 
     def project(
-        self, points: Float[Tensor, "*#batch n 3"]
+        self, points: Float[Tensor, "*#batch n 3"] | Array
     ) -> tuple[Float[Tensor, "*#batch n 2"], Bool[Tensor, "*#batch n"]]:
         """Project world points to pixels.
 
@@ -327,7 +335,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         return pixels, valid
 
     def directions(
-        self, pixels: Float[Tensor, "*#batch n 2"]
+        self, pixels: Float[Tensor, "*#batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
         """Viewing directions in the camera frame, of any length: (x, y, 1) for a perspective camera.
 
@@ -352,7 +360,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         return direction, valid & finite
 
     def rays(
-        self, pixels: Float[Tensor, "*#batch n 2"]
+        self, pixels: Float[Tensor, "*#batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*#batch n 3"], Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
         """Viewing rays in the world frame.
 
@@ -374,7 +382,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
 
     def _checked(self, name: str, value: object, length: int) -> Tensor:
         """Check points or pixels against the camera, lift half precision, expand to the common batch shape."""
-        tensor = check_tensor(name, value, "N", length)
+        tensor = check_tensor(name, value, "N", length, like=self.K)
         if tensor is not value:  # lifted: any precision of the camera holds a half exactly
             tensor = tensor.to(self.dtype)
         check_same_kind(**{"camera": self.K, name: tensor})
@@ -387,7 +395,7 @@ class Camera(Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distor
         return [self.K, self.R, self.t, *lens]
 
 
-def as_camera(camera: Camera | PinholeCamera) -> Camera:
+def as_camera(camera: Camera | PinholeCamera, name: str = "camera") -> Camera:
     """A `Camera` as it is, Kornia's `PinholeCamera` converted.
 
     Raises:
@@ -395,10 +403,23 @@ def as_camera(camera: Camera | PinholeCamera) -> Camera:
     """
     if isinstance(camera, Camera):
         return camera
-    if isinstance(camera, PinholeCamera):
-        return Camera.from_kornia(camera)
-    remedy = "; load it with dp.load_camera(path)" if isinstance(camera, str | os.PathLike) else ""
-    raise TypeError(f"camera: want dp.Camera or kornia's PinholeCamera, got {type(camera).__name__}{remedy}")
+    remedy = ""
+    if isinstance(camera, str | os.PathLike):
+        remedy = "load it with dp.load_camera(path)"
+    elif not isinstance(camera, type) and isinstance(getattr(camera, "cameras", None), Camera):
+        remedy = "give its .camera, or its .cameras for the poses"
+    return Camera.from_kornia(instance(name, camera, PinholeCamera, "dp.Camera or kornia's PinholeCamera", remedy))
+
+
+def check_lens(distortion: object) -> None:
+    """Check that something is a lens, by the two maps that a camera needs, for `torch.compile` knows no protocols.
+
+    Raises:
+        TypeError: it is none.
+    """
+    maps = hasattr(distortion, "project_direction") and hasattr(distortion, "unproject")
+    if isinstance(distortion, type) or not maps:
+        instance("distortion", distortion, (), "a lens such as dp.BrownConrady(coefficients)")
 
 
 def _pinhole(direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:

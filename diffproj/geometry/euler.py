@@ -17,11 +17,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.numerics import check_same_kind, check_tensor
+from diffproj._core.arguments import Array, meeting
+from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor
 
 
 def rotation_from_euler(
-    psi: Float[Tensor, "*#batch"], phi: Float[Tensor, "*#batch"], theta: Float[Tensor, "*#batch"]
+    psi: Float[Tensor, "*#batch"] | Array | float,
+    phi: Float[Tensor, "*#batch"] | Array | float,
+    theta: Float[Tensor, "*#batch"] | Array | float,
 ) -> Float[Tensor, "*#batch 3 3"]:
     """Compose `R_x(psi) R_y(phi) R_z(theta)`.
 
@@ -34,7 +37,8 @@ def rotation_from_euler(
         Rotation matrices `(*B, 3, 3)`.
 
     Raises:
-        TypeError: an argument is no floating-point tensor, or dtypes differ.
+        TypeError: an argument is no floating-point tensor and no array, or dtypes differ.
+        ValueError: shapes do not broadcast, or devices differ.
 
     Example:
         >>> quarter = torch.tensor(torch.pi / 2, dtype=torch.float64)
@@ -44,8 +48,12 @@ def rotation_from_euler(
                 [ 1,  0,  0],
                 [ 0,  0,  1]], dtype=torch.int32)
     """
-    psi, phi, theta = check_tensor("psi", psi), check_tensor("phi", phi), check_tensor("theta", theta)
+    kind = meeting(*(angle for angle in (psi, phi, theta) if isinstance(angle, Tensor)))
+    kind = torch.empty(0, dtype=torch.float64, device="cpu") if kind is None else kind
+    psi, phi = check_tensor("psi", psi, like=kind), check_tensor("phi", phi, like=kind)
+    theta = check_tensor("theta", theta, like=kind)
     check_same_kind(psi=psi, phi=phi, theta=theta)
+    broadcast_batches(psi=psi.shape, phi=phi.shape, theta=theta.shape)
     sin_x, cos_x = psi.sin(), psi.cos()
     sin_y, cos_y = phi.sin(), phi.cos()
     sin_z, cos_z = theta.sin(), theta.cos()
@@ -58,7 +66,7 @@ def rotation_from_euler(
 
 
 def euler_from_rotation(
-    R: Float[Tensor, "*batch 3 3"],
+    R: Float[Tensor, "*batch 3 3"] | Array,
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Recover `psi`, `phi`, `theta` from `R = R_x(psi) R_y(phi) R_z(theta)`.
 

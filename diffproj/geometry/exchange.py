@@ -7,6 +7,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from diffproj._core.arguments import flag, instance
 from diffproj._core.numerics import dot, has_values
 from diffproj.geometry import interop
 from diffproj.geometry.interop import ArrayLike
@@ -46,7 +47,8 @@ class Exchange:
         """A camera from what OpenCV's calibration returns.
 
         Args:
-            K: camera matrix `(*B, 3, 3)`. Arrays become float64 tensors; a tensor keeps its dtype, device and graph.
+            K: camera matrix `(*B, 3, 3)`. Arrays are copied to float64 tensors, or to such as K where that is a tensor;
+                a tensor keeps its dtype, device and graph.
             dist: 4, 5, 8, 12 or 14 coefficients in OpenCV's order (fisheye: 4), as `(*B, k)` or as OpenCV's row or
                 column; `None` or an empty array for a pinhole.
             rvec: rotation vector world to camera `(*B, 3)` in radians, or OpenCV's `(3, 1)` column.
@@ -55,16 +57,21 @@ class Exchange:
             fisheye: whether `dist` belongs to OpenCV's fisheye model.
 
         Raises:
+            TypeError: an argument is none of these, or tensors of mixed dtypes.
             ValueError: wrong shapes or values, as the constructor says.
 
         Example:
             >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
             >>> import diffproj as dp
             >>> dp.Camera.from_opencv(K, [-0.2, 0.1, 0, 0, 0], np.zeros(3), [0, 0, 800], size=(640, 480))
-            Camera(batch_shape=(), BrownConrady, size=(640, 480), torch.float64, cpu)
+            Camera(f 500.0, 500.0 px, c 320.0, 240.0 px, BrownConrady, 640 x 480 px, torch.float64)
         """
+        fisheye = flag("fisheye", fisheye)
         K, coefficients, R, t = interop.tensors_from_opencv(K, dist, rvec, tvec)
         lens = KannalaBrandt if fisheye else BrownConrady
+        if coefficients is not None and coefficients.shape[-1] not in lens.counts:
+            counts = ", ".join(map(str, lens.counts))
+            raise ValueError(f"dist: want {counts} coefficients, got {coefficients.shape[-1]}")
         return cls(K, R, t, None if coefficients is None else lens(coefficients), size)  # type: ignore[call-arg]
 
     def upright(self: C) -> C:
@@ -123,8 +130,10 @@ class Exchange:
         """A camera of batch shape `(B,)` from Kornia's `PinholeCamera`, whose conventions are the same.
 
         Raises:
+            TypeError: it is no `PinholeCamera`.
             ValueError: the cameras of the batch have images of different sizes, or values are not a camera's.
         """
+        instance("pinhole", pinhole, PinholeCamera, "kornia's PinholeCamera")
         K, R, t, size = interop.tensors_from_kornia(pinhole)
         return cls(K, R, t, size=size)  # type: ignore[call-arg]
 

@@ -4,9 +4,6 @@ Both share diffproj's conventions (world to camera, pixel centres at integers), 
 rotation vectors are axis times angle in radians. This file handles tensors only; `Camera` is built from them elsewhere.
 """
 
-from collections.abc import Sequence
-from typing import Any
-
 import cv2
 import numpy as np
 import torch
@@ -14,9 +11,10 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from diffproj._core.numerics import at_least_float32, has_values
+from diffproj._core.arguments import Array
+from diffproj._core.numerics import at_least_float32, check_tensor, has_values
 
-ArrayLike = Tensor | np.ndarray | Sequence[Any]
+ArrayLike = Tensor | Array
 
 
 def tensors_from_opencv(
@@ -29,19 +27,20 @@ def tensors_from_opencv(
     Raises:
         ValueError: a vector is neither `(*B, k)` nor a row or column.
     """
-    kind = K if isinstance(K, Tensor) else torch.empty(0, dtype=torch.float64, device="cpu")
-    K = _tensor(K, kind)
-    batch = K.shape[:-2]
-    coefficients = None if dist is None else _vector("dist", _tensor(dist, kind), batch)
+    K = check_tensor("K", K, 3, 3, like=torch.empty(0, dtype=torch.float64, device="cpu"))
+    coefficients = None if dist is None else _vector("dist", dist, K)
     if coefficients is not None and coefficients.shape[-1] == 0:
         coefficients = None
     R = None
     if rvec is not None:
-        rotation_vector = _vector("rvec", _tensor(rvec, kind), batch)
-        if rotation_vector.shape[-1] != 3:
-            raise ValueError(f"rvec: want 3 numbers, got {rotation_vector.shape[-1]}")
-        R = axis_angle_to_rotation_matrix(rotation_vector)
-    t = None if tvec is None else _vector("tvec", _tensor(tvec, kind), batch)
+        rotation_vector = _three("rvec", _vector("rvec", rvec, K))
+        if rotation_vector.shape[:-1].numel():
+            R = axis_angle_to_rotation_matrix(rotation_vector)
+            if has_values(R) and not bool(R.isfinite().all()):
+                raise ValueError("rvec: want angles in radians, got numbers too large for any")
+        else:  # which Kornia refuses
+            R = rotation_vector.new_empty(*rotation_vector.shape, 3)
+    t = None if tvec is None else _three("tvec", _vector("tvec", tvec, K))
     return K, coefficients, R, t
 
 
@@ -96,18 +95,21 @@ def pinhole_from_tensors(K: Tensor, R: Tensor, t: Tensor, size: tuple[int, int])
     return PinholeCamera(intrinsics, extrinsics, height, width)
 
 
-def _tensor(value: ArrayLike, kind: Tensor) -> Tensor:
-    if isinstance(value, Tensor):
-        return value
-    return torch.tensor(np.asarray(value, dtype=np.float64), dtype=kind.dtype, device=kind.device)
-
-
 def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().to("cpu", torch.float64).numpy().copy()
 
 
-def _vector(name: str, value: Tensor, batch: torch.Size) -> Tensor:
+def _three(name: str, vector: Tensor) -> Tensor:
+    if vector.shape[-1] != 3:
+        raise ValueError(f"{name}: want 3 numbers, got {vector.shape[-1]}")
+    return vector
+
+
+def _vector(name: str, given: ArrayLike, K: Tensor) -> Tensor:
     """A vector `(*B, k)` from one that OpenCV may give as a row `(1, k)` or a column `(k, 1)`."""
+    value, batch = check_tensor(name, given, like=K), K.shape[:-2]
+    if has_values(value) and not bool(value.isfinite().all()):
+        raise ValueError(f"{name}: want finite numbers, got NaN or infinity")
     if value.ndim >= 2 and value.shape[-1] == 1:
         return value.squeeze(-1)
     if value.ndim == len(batch) + 2 and value.shape[-2] == 1:

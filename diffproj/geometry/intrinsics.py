@@ -108,21 +108,21 @@ def check_intrinsics(K: Tensor) -> None:
         raise ValueError("K: want an invertible matrix, got a singular one; are both focal lengths set?")
 
 
-def check_warp(matrix: Tensor, K: Tensor, behind_lens: bool) -> None:
+def check_warp(name: str, matrix: Tensor, K: Tensor, behind_lens: bool) -> None:
     """Check values of a warp of a camera's image.
 
     Raises:
         ValueError: not finite, singular, or a projective warp for a camera with a lens.
     """
     if not bool(matrix.isfinite().all()):
-        raise ValueError("matrix: want finite values, got NaN or infinity")
+        raise ValueError(f"{name}: want finite values, got NaN or infinity")
     # Multiplied by K, the entries of a row have similar magnitudes, whatever the warp's shift and scale.
     rows = (in_float64(matrix).unsqueeze(-1) * in_float64(K).unsqueeze(-3)).sum(-2)
     rows = rows / rows.norm(dim=-1, keepdim=True)
     if not bool((torch.linalg.det(rows).abs() > 8 * torch.finfo(matrix.dtype).eps).all()):
-        raise ValueError("matrix: want an invertible one, got a singular one")
+        raise ValueError(f"{name}: want an invertible one, got a singular one")
     if behind_lens and bool((matrix[..., 2, :2] != 0).any()):
         raise ValueError(
-            "matrix: want an affine one (last row 0, 0, 1) for a camera with a lens, got a projective one: no lens "
+            f"{name}: want an affine one (last row 0, 0, 1) for a camera with a lens, got a projective one: no lens "
             "model describes the image that it makes; rectify the image first"
         )

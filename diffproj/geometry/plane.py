@@ -7,24 +7,23 @@ A plane made of Python numbers alone, such as `Plane.z(0.0)`, has no dtype of it
 in PyTorch's arithmetic it takes on the dtype and device of the camera or points that it meets.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffproj._core.arguments import Array, called, instance, meeting, tensor_of
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
     broadcast_batches,
-    check_number,
     check_same_kind,
     check_tensor,
     dot,
     has_values,
 )
 
-Numbers = Sequence[float] | float
+Numbers = Array | float
 
 
 class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_point", "adopts")):
@@ -88,7 +87,7 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
     # ------------------------------------------------------------------------------------------------ ways to make
 
     @classmethod
-    def z(cls, offset: Float[Tensor, "*batch"] | float = 0.0) -> "Plane":
+    def z(cls, offset: Float[Tensor, "*batch"] | Numbers = 0.0) -> "Plane":
         """The plane `z = offset`, in world units: `Plane.z(0.0)` is the chessboard's.
 
         Example:
@@ -97,6 +96,7 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         """
         if not isinstance(offset, Tensor):
             return cls([0.0, 0.0, 1.0], offset)
+        offset = check_tensor("offset", offset)
         return cls(torch.tensor([0.0, 0.0, 1.0], dtype=offset.dtype, device=offset.device), offset)
 
     @classmethod
@@ -125,7 +125,7 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         return plane
 
     @classmethod
-    def from_points(cls, points: Float[Tensor, "*batch n 3"]) -> "Plane":
+    def from_points(cls, points: Float[Tensor, "*batch n 3"] | Array) -> "Plane":
         """The plane through points in the sense of least squared orthogonal distances; `rms` gives its fit error.
 
         The unit normal's largest component is positive. Derivatives with respect to the points are exact to second
@@ -159,6 +159,12 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         normal = normal * sign
         return cls.unchecked(normal, dot(normal, centroid))
 
+    @classmethod
+    def _alike(cls, items: list[Any]) -> list[Any]:
+        """Those made of Python numbers take on the dtype and device of the others."""
+        firm = [item.normal for item in items if not item.adopts]
+        return [item.like(firm[0]) for item in items] if firm else items
+
     # ------------------------------------------------------------------------------------------------- as a tensor
 
     def to(self, *args: Any, **kwargs: Any) -> "Plane":
@@ -168,6 +174,8 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
 
     def like(self, tensor: Tensor) -> "Plane":
         """The plane ready to meet `tensor`: one made of Python numbers takes on its dtype and device."""
+        if not (isinstance(tensor, Tensor) and tensor.is_floating_point()):
+            raise TypeError(f"tensor: want one of floating-point type, got {getattr(tensor, 'dtype', called(tensor))}")
         if not self.adopts:
             return self
         return self.unchecked(self.normal.to(tensor), self.offset.to(tensor), self.is_per_point)
@@ -182,10 +190,10 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
             raise IndexError("plane: want a batch of planes to index, got planes per point; index normal and offset")
         return super().__getitem__(index)
 
-    def __repr__(self) -> str:
+    def _facts(self) -> list[str]:
         if self.batch_shape or not has_values(self.normal):
-            return f"Plane(batch_shape={tuple(self.batch_shape)}, per_point={self.is_per_point}, {self.dtype})"
-        return f"Plane(normal={self.normal.tolist()}, offset={self.offset.item():g})"
+            return [f"batch_shape={tuple(self.batch_shape)}", f"per_point={self.is_per_point}", str(self.dtype)]
+        return [f"normal={self.normal.tolist()}", f"offset={self.offset.item():g}"]
 
     # ---------------------------------------------------------------------------------------------------- geometry
 
@@ -227,38 +235,48 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         second = torch.nn.functional.normalize(torch.linalg.cross(normal, first), dim=-1)
         return torch.stack([first, second], dim=-1)
 
-    def parallel(self, distance: Float[Tensor, "*#batch"] | float) -> "Plane":
+    def parallel(self, distance: Float[Tensor, "*#batch"] | Array | float) -> "Plane":
         """The parallel plane at a signed distance along the normal, in world units.
 
         Raises:
-            TypeError: the distance is no number and no tensor.
-            ValueError: it is not finite (checked where values can be read).
+            TypeError: no number, array or tensor of the plane's dtype.
+            ValueError: it is not finite, or does not broadcast to the planes.
 
         Example:
             >>> Plane([0.0, 0.0, -2.0], 0.0).parallel(3.0)  # the normal points down
             Plane(normal=[0.0, 0.0, -2.0], offset=6)
         """
-        if not isinstance(distance, Tensor):
-            check_number("distance", distance)
-        elif has_values(distance) and not bool(distance.isfinite().all()):
+        given = check_tensor("distance", distance, like=self.normal)
+        plane = self.like(given) if isinstance(distance, Tensor) else self
+        check_same_kind(plane=plane.normal, distance=given)
+        broadcast_batches(plane=plane.batch_shape, distance=given.shape)
+        if has_values(given) and not bool(given.isfinite().all()):
             raise ValueError("distance: want finite numbers, got NaN or infinity")
-        offset = self.offset + distance * self.length
-        normal = self.normal.expand(*offset.shape, 3)
+        offset = plane.offset + given * plane.length
+        normal = plane.normal.expand(*offset.shape, 3)
         return self.unchecked(normal, offset, self.is_per_point, self.adopts and not isinstance(distance, Tensor))
 
-    def distance(self, points: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*#batch n"]:
+    def distance(self, points: Float[Tensor, "*#batch n 3"] | Array) -> Float[Tensor, "*#batch n"]:
         """Signed orthogonal distances of points `(*B, N, 3)`, positive on the normal's side, in world units."""
+        points = check_tensor("points", points, "N", 3, like=None if self.adopts else self.normal)
         plane = self.like(points)
-        points = check_tensor("points", points, "N", 3)
         check_same_kind(plane=plane.normal, points=points)
+        broadcast_batches(plane=self.batch_shape, points=points.shape[:-1] if self.is_per_point else points.shape[:-2])
         normal, offset = plane.normalised()
         if not self.is_per_point:
             normal, offset = normal.unsqueeze(-2), offset.unsqueeze(-1)
         return dot(points, normal) - offset
 
-    def rms(self, points: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*#batch"]:
-        """Root mean square of the points' distances, in world units: the fit error of `from_points`."""
+    def rms(self, points: Float[Tensor, "*#batch n 3"] | Array) -> Float[Tensor, "*#batch"]:
+        """Root mean square of the points' distances, in world units: the fit error of `from_points`.
+
+        Raises:
+            TypeError: no floating-point tensor or array, or another dtype than the plane's.
+            ValueError: no points, or a wrong shape.
+        """
         distance = self.distance(points)
+        if distance.shape[-1] == 0:
+            raise ValueError("points: want at least one, got none")
         size = distance.detach().abs().amax(-1, keepdim=True)
         size = torch.where(size > 0, size, 1.0)
         squared = (distance / size).square().mean(dim=-1)
@@ -266,22 +284,23 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         return torch.where(some, torch.where(some, squared, 1.0).sqrt(), 0.0) * size.squeeze(-1)
 
 
-def _as_tensors(normal: Any, offset: Any) -> tuple[Any, Any]:
+def as_plane(plane: Plane) -> Plane:
+    """A plane as it is.
+
+    Raises:
+        TypeError: it is none.
+    """
+    if isinstance(plane, Plane):
+        return plane
+    remedy = "dp.Plane(normal, offset) makes one, dp.Plane.z(0.0) the board's"
+    return instance("plane", plane, Plane, "a dp.Plane", remedy)
+
+
+def _as_tensors(normal: Any, offset: Any) -> tuple[Tensor, Tensor]:
     """Python numbers in the dtype and on the device of the tensor beside them, in float64 if there is none."""
-    given = normal if isinstance(normal, Tensor) else offset if isinstance(offset, Tensor) else None
-    if given is None or not given.is_floating_point():
-        given = torch.empty(0, dtype=torch.float64, device="cpu")
-    kind = given
-
-    def convert(name: str, value: Any) -> Any:
-        if isinstance(value, Tensor):
-            return value
-        try:
-            return torch.tensor(value, dtype=kind.dtype, device=kind.device)
-        except (TypeError, ValueError, RuntimeError):
-            raise TypeError(f"{name}: want a tensor or numbers, got {type(value).__name__}") from None
-
-    return convert("normal", normal), convert("offset", offset)
+    kind = meeting(*(value for value in (normal, offset) if isinstance(value, Tensor)))
+    kind = torch.empty(0, dtype=torch.float64, device="cpu") if kind is None else kind
+    return tensor_of("normal", normal, kind), tensor_of("offset", offset, kind)
 
 
 def _smallest_eigenvector(scatter: Tensor) -> Tensor:

@@ -21,17 +21,23 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from diffproj._core.numerics import BLOCK_POINTS, broadcast_batches, check_tensor
+from diffproj._core.arguments import called, number, numbers
+from diffproj._core.numerics import BLOCK_POINTS, broadcast_batches, check_same_kind, check_tensor
 from diffproj.geometry.back_projection import back_project, warn_if_rounded
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.grid import checked_size, inside, pixel_grid
-from diffproj.geometry.plane import Plane
+from diffproj.geometry.plane import Plane, as_plane
 
 LookUp = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Maps places in the target `(N, 2)`, in pixels from its first corner, to positions in the source `(*B, N, 2)`, in
 pixels from the centre of its first pixel, and `valid (*B, N)`."""
 MAX_SUPERSAMPLING = 128
 """Maximum number of samples along each side of a pixel."""
+MOST_PIXELS = 2**31
+"""Of an image to be made: more would not fit into memory, and is a resolution in the wrong unit."""
+
+Axes = tuple[Tensor, Tensor, Tensor]
+"""`(origin, axis_s, axis_t)` of a top view, each `(*B, 3)` in the world."""
 
 
 def plane_axes(plane: Plane) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
@@ -44,12 +50,15 @@ def plane_axes(plane: Plane) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "
     Args:
         plane: of batch shape `*B`.
 
+    Raises:
+        TypeError: it is no plane.
+
     Example:
         >>> origin, s, t = plane_axes(Plane(torch.tensor([0.0, 0.0, 2.0]), torch.tensor(6.0)))
         >>> origin.tolist(), s.tolist(), t.tolist()
         ([0.0, 0.0, 3.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     """
-    n, distance = plane.normalised()
+    n, distance = as_plane(plane).normalised()
     origin = n * distance.unsqueeze(-1)
     n = torch.where(n[..., 2:] < 0, -n, n)
     x, y = (torch.zeros_like(n).index_fill(-1, torch.tensor(i, device=n.device), 1.0) for i in range(2))
@@ -65,7 +74,7 @@ def rectify(
     plane: Plane,
     extent: Sequence[float],
     resolution: float,
-    axes: tuple[Tensor, Tensor, Tensor] | None = None,
+    axes: Axes | None = None,
 ) -> tuple[Float[Tensor, "*out c rows columns"], Bool[Tensor, "*out rows columns"]]:
     """The metric top view of a plane.
 
@@ -83,8 +92,9 @@ def rectify(
         pixel's samples are in the image.
 
     Raises:
-        TypeError: the image is no floating-point tensor.
-        ValueError: an empty or infinite extent, a resolution that is not positive, or shapes that do not fit.
+        TypeError: the image is no floating-point tensor, or another argument is of the wrong kind.
+        ValueError: an empty or infinite extent, a resolution that is not positive or too fine, or shapes or devices
+            that do not fit.
 
     Example:
         >>> import diffproj as dp
@@ -94,11 +104,8 @@ def rectify(
         >>> top.shape, bool(valid.all())
         (torch.Size([3, 50, 100]), True)
     """
-    image, camera = check_tensor("image", image, "C", "H", "W"), as_camera(camera)
+    image, camera, plane, (origin, along_s, along_t) = _checked("image", image, camera, plane, axes)
     rows, columns = _shape(extent, resolution)
-    plane = plane.like(camera.K)
-    origin, along_s, along_t = axes or plane_axes(plane)
-    broadcast_batches(image=image.shape[:-3], camera=camera.batch_shape, plane=plane.batch_shape)
     warn_if_rounded(camera, plane)
     H, W = image.shape[-2:]
     low, unit = _corner_and_pixel(extent, (rows, columns), camera.K)
@@ -119,7 +126,7 @@ def render(
     plane: Plane,
     extent: Sequence[float],
     size: tuple[int, int] | None = None,
-    axes: tuple[Tensor, Tensor, Tensor] | None = None,
+    axes: Axes | None = None,
 ) -> tuple[Float[Tensor, "*out c h w"], Bool[Tensor, "*out h w"]]:
     """Render a plane's texture into a camera's image: the inverse of `rectify`.
 
@@ -136,8 +143,8 @@ def render(
         on the texture.
 
     Raises:
-        TypeError: the texture is no floating-point tensor.
-        ValueError: an empty or infinite extent, no size, or shapes that do not fit.
+        TypeError: the texture is no floating-point tensor, or another argument is of the wrong kind.
+        ValueError: an empty or infinite extent, no size, or shapes or devices that do not fit.
 
     Example:
         >>> import diffproj as dp
@@ -147,16 +154,15 @@ def render(
         >>> image.shape, int(valid.sum())  # 200 x 100 world units at 2 per pixel
         (torch.Size([1, 480, 640]), 5000)
     """
-    texture, camera = check_tensor("texture", texture, "C", "rows", "columns"), as_camera(camera)
+    texture, camera, plane, (origin, along_s, along_t) = _checked("texture", texture, camera, plane, axes)
     size = checked_size(size) or camera.size
     if size is None:
         raise ValueError("size: want (width, height), got None, and the camera has none")
     _checked_extent(extent)
-    plane = plane.like(camera.K)
-    origin, along_s, along_t = axes or plane_axes(plane)
     width, height = size
+    if width * height > MOST_PIXELS:
+        raise ValueError(f"size: want one that fits into memory, got {width} x {height} px")
     rows, columns = texture.shape[-2:]
-    broadcast_batches(texture=texture.shape[:-3], camera=camera.batch_shape, plane=plane.batch_shape)
     low, unit = _corner_and_pixel(extent, (rows, columns), camera.K)
 
     def look_up(places: Tensor) -> tuple[Tensor, Tensor]:
@@ -245,19 +251,61 @@ def _sampled(
     return torch.where(seen.unsqueeze(-3), sampled, 0.0), seen
 
 
+def _checked(
+    name: str, image: Tensor, camera: Camera | PinholeCamera, plane: Plane, axes: Axes | None
+) -> tuple[Tensor, Camera, Plane, Axes]:
+    """The image or texture, camera, plane and axes, known to fit together.
+
+    Raises:
+        TypeError: one of them is of the wrong kind, or dtypes of camera, plane and axes differ.
+        ValueError: shapes or devices do not fit.
+    """
+    if not isinstance(image, Tensor):
+        raise TypeError(
+            f"{name}: want a tensor (*B, C, H, W), got {called(image)}; kornia.utils.image_to_tensor(array) makes one "
+            "of an image as OpenCV has it"
+        )
+    image, camera = check_tensor(name, image, "C", "H", "W"), as_camera(camera)
+    if 0 in image.shape[-3:]:
+        raise ValueError(f"{name}: want at least one channel and one pixel, got shape {tuple(image.shape)}")
+    plane = as_plane(plane).like(camera.K)
+    check_same_kind(camera=camera.K, plane=plane.normal)
+    if image.device != camera.device:  # of another dtype it may be
+        raise ValueError(f"{name}: want device {camera.device} as camera has, got {image.device}")
+    shapes = {name: image.shape[:-3], "camera": camera.batch_shape, "plane": plane.batch_shape}
+    if plane.is_per_point:
+        raise ValueError("plane: want one plane for the whole image, got one for each point (Plane.per_point)")
+    if axes is None:
+        axes = plane_axes(plane)
+    elif isinstance(axes, list | tuple) and len(axes) == 3:
+        origin, along_s, along_t = (check_tensor("axes", axis, 3, like=camera.K) for axis in axes)
+        axes = origin, along_s, along_t
+        for axis in axes:
+            check_same_kind(camera=camera.K, axes=axis)
+            shapes["axes"] = broadcast_batches(axes=shapes.get("axes", ()), axis=axis.shape[:-1])
+    else:
+        raise TypeError(f"axes: want (origin, axis_s, axis_t) as plane_axes gives them, got {called(axes)}")
+    broadcast_batches(**shapes)
+    return image, camera, plane, axes
+
+
 def _checked_extent(extent: Sequence[float]) -> tuple[float, float]:
     """The sides of an extent along s and t, in world units."""
-    numbers = tuple(extent)
-    if len(numbers) == 4 and all(map(math.isfinite, numbers)):
-        s_min, t_min, s_max, t_max = numbers
-        if s_max > s_min and t_max > t_min:
-            return s_max - s_min, t_max - t_min
-    raise ValueError(f"extent: want finite (s_min, t_min, s_max, t_max) with room between, got {numbers}")
+    want = "finite (s_min, t_min, s_max, t_max) with room between"
+    s_min, t_min, s_max, t_max = numbers("extent", extent, want, 4)
+    if not (s_max > s_min and t_max > t_min and math.isfinite(s_max - s_min) and math.isfinite(t_max - t_min)):
+        raise ValueError(f"extent: want {want}, got {tuple(extent)}")
+    return s_max - s_min, t_max - t_min
 
 
 def _shape(extent: Sequence[float], resolution: float) -> tuple[int, int]:
     """`(rows, columns)` of the top view whose pixels fill the extent."""
     width, height = _checked_extent(extent)
-    if not 0 < resolution < math.inf:
-        raise ValueError(f"resolution: want world units per pixel, above 0, got {resolution}")
-    return max(1, round(height / resolution)), max(1, round(width / resolution))
+    resolution = number("resolution", resolution, "world units per pixel, above 0", above=0)
+    rows, columns = (max(1.0, side / resolution) for side in (height, width))
+    if rows * columns > MOST_PIXELS:
+        raise ValueError(
+            f"resolution: want world units per pixel that give a top view of an image's size, got {resolution:g}, and "
+            f"{columns:.3g} x {rows:.3g} px for the extent"
+        )
+    return max(1, round(rows)), max(1, round(columns))

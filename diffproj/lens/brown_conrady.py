@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.arguments import Array
 from diffproj._core.numerics import in_blocks, least_depth, rounding
 from diffproj.lens import brown_domain
 from diffproj.lens.brown_equations import COUNTS, Terms, bend, by_coefficients, radial, tilted
@@ -62,7 +63,9 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
         """
         return self._domain()
 
-    def distort(self, xy: Float[Tensor, "*batch n 2"]) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
+    def distort(
+        self, xy: Float[Tensor, "*batch n 2"] | Array
+    ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
         """Distort points of the normalised plane.
 
         Args:
@@ -88,7 +91,7 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
         return in_blocks(forward, xy, self.coefficients)  # type: ignore[return-value]
 
     def undistort(
-        self, xy_distorted: Float[Tensor, "*batch n 2"]
+        self, xy_distorted: Float[Tensor, "*batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
         """Undistort points of the normalised plane: the exact inverse of `distort`.
 
@@ -118,7 +121,7 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
         return in_blocks(backward, xy_distorted, self.coefficients)  # type: ignore[return-value]
 
     def project_direction(
-        self, direction: Float[Tensor, "*batch n 3"]
+        self, direction: Float[Tensor, "*batch n 3"] | Array
     ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
         """Project directions of the camera frame to distorted points on the normalised plane.
 
@@ -138,7 +141,7 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
         return torch.where(valid.unsqueeze(-1), xy_distorted, 0), valid
 
     def unproject(
-        self, xy_distorted: Float[Tensor, "*batch n 2"]
+        self, xy_distorted: Float[Tensor, "*batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*out n 3"], Bool[Tensor, "*out n"]]:
         """Directions `(x, y, 1)` whose projections are the distorted points; (0, 0, 1) where not valid."""
         xy, valid = self.undistort(xy_distorted)

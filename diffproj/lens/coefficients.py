@@ -5,12 +5,14 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.arguments import Array
 from diffproj._core.batched import Batched, Rearrange
 from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, has_values
 from diffproj.lens.plan import AXES, Plan, Recipe, domain_of, plan_of, register_recipe
+from diffproj.lens.protocol import distorted, undistorted
 
 L = TypeVar("L", bound="CoefficientLens")
 
@@ -25,7 +27,7 @@ class CoefficientLens(Batched, ABC):
     coefficients: Tensor
     _key: str  # of the class, among the recipes of `plan`
 
-    def __init__(self, coefficients: Float[Tensor, "*lens k"]):
+    def __init__(self, coefficients: Float[Tensor, "*lens k"] | Array):
         coefficients = check_tensor("coefficients", coefficients, "k")
         if coefficients.shape[-1] not in self.counts:
             counts = ", ".join(map(str, self.counts))
@@ -50,8 +52,8 @@ class CoefficientLens(Batched, ABC):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self).unchecked, (self.coefficients,)
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}(coefficients {tuple(self.coefficients.shape)}, {self.dtype}, {self.device})"
+    def _facts(self) -> list[str]:
+        return [f"coefficients {tuple(self.coefficients.shape)}", str(self.dtype), str(self.device)]
 
     def to(self: L, *args: Any, **kwargs: Any) -> L:
         """The lens in another dtype or on another device; see `Batched.to`. It works its plan out anew."""
@@ -81,6 +83,16 @@ class CoefficientLens(Batched, ABC):
     @abstractmethod
     def unproject(self, xy_distorted: Tensor) -> tuple[Tensor, Tensor]:
         """Distorted points to directions; see `Lens`."""
+
+    def distort(self, xy: Float[Tensor, "*batch n 2"]) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
+        """Distorted points of undistorted ones; see `Lens`."""
+        return distorted(self.project_direction, check_tensor("xy", xy, "N", 2))
+
+    def undistort(
+        self, xy_distorted: Float[Tensor, "*batch n 2"]
+    ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
+        """Undistorted points of distorted ones, those in front of the camera; see `Lens`."""
+        return undistorted(self.unproject, xy_distorted)
 
     @abstractmethod
     def by_direction(self, direction: Tensor) -> Tensor:
@@ -139,9 +151,9 @@ class CoefficientLens(Batched, ABC):
         """The coefficients, zero where the lens is of no use, so that no NaN gets into a gradient."""
         return torch.where((domain > 0).unsqueeze(-1), self.coefficients, 0)
 
-    def _checked(self, name: str, points: Tensor, size: int) -> Tensor:
+    def _checked(self, name: str, points: Tensor | Array, size: int) -> Tensor:
         """Points in the lens's own kind, with all batch axes."""
-        points = check_tensor(name, points, "N", size)
+        points = check_tensor(name, points, "N", size, like=self.coefficients)
         check_same_kind(coefficients=self.coefficients, **{name: points})
         batch = broadcast_batches(lens=self.batch_shape, **{name: points.shape[:-2]})
         return points.expand(*batch, *points.shape[-2:])

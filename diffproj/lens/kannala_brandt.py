@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.arguments import Array
 from diffproj._core.numerics import has_values, in_blocks, in_float64, least_depth
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.compiling import coordinates, derivative_wanted, with_batch_in_front
@@ -74,7 +75,7 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
         return self._domain()
 
     def project_direction(
-        self, direction: Float[Tensor, "*batch n 3"]
+        self, direction: Float[Tensor, "*batch n 3"] | Array
     ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
         """Project directions of the camera frame to distorted points on the normalised plane.
 
@@ -92,7 +93,7 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
             x, y, z = (directions / _largest_component(directions)).unbind(-1)
             x, y, z = torch.where(valid, x, 0), torch.where(valid, y, 0), torch.where(valid, z, 1)
             side_squared = x * x + y * y
-            k = self._columns()
+            k = self._by_power()
             ratio = angle_over_side(side_squared, z)
             scale = ratio * _profile(k, ratio * ratio * side_squared)
             return torch.stack([x * scale, y * scale], dim=-1), valid
@@ -100,7 +101,7 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
         return in_blocks(forward, self._checked("direction", direction, 3), self.coefficients)  # type: ignore[return-value]
 
     def unproject(
-        self, xy_distorted: Float[Tensor, "*batch n 2"]
+        self, xy_distorted: Float[Tensor, "*batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*out n 3"], Bool[Tensor, "*out n"]]:
         """Directions whose projections are the distorted points: the exact inverse of `project_direction`.
 
@@ -134,7 +135,7 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
         """Derivatives of the distorted points by valid directions `(*B, N, 3)`: `(*B, N, 2, 3)`."""
         size = _largest_component(direction)
         x, y, z = (direction / size).unbind(-1)
-        k = self._columns()
+        k = self._by_power()
         side_squared = x * x + y * y
         ratio = angle_over_side(side_squared, z)
         by_square, by_z = angle_over_side_slopes(side_squared, z, ratio)
@@ -161,7 +162,7 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
         powers = torch.stack([angle_squared**n for n in range(1, 5)], dim=-1) * ratio.unsqueeze(-1)
         return torch.stack([x.unsqueeze(-1) * powers, y.unsqueeze(-1) * powers], dim=-2)
 
-    def _columns(self) -> list[Tensor]:
+    def _by_power(self) -> list[Tensor]:
         return list(self._usable(self._domain()).unsqueeze(-2).unbind(-1))
 
     def turned(

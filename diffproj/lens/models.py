@@ -6,19 +6,18 @@ of another package needs no entry, only what `Lens` asks for, and `register_lens
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeVar, get_args
+from typing import TypeVar, get_args
 
 import torch.utils._pytree as torch_pytree
 from torch import Tensor
 
+from diffproj._core.arguments import called, instance, words
 from diffproj._core.batched import register_pytree
 from diffproj.lens.brown_conrady import BrownConrady
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.kannala_brandt import KannalaBrandt
+from diffproj.lens.names import LensModel
 from diffproj.lens.protocol import Lens
-
-LensModel = Literal["none", "brown4", "brown5", "brown8", "brown12", "brown14", "fisheye"]
-"""The lenses that can be fitted: none, Brown-Conrady by its number of coefficients, Kannala-Brandt."""
 
 T = TypeVar("T")
 
@@ -67,8 +66,8 @@ def model_named(name: object) -> Model:
     Raises:
         ValueError: there is none.
     """
-    if name not in MODELS:
-        raise ValueError(f"distortion: want one of {', '.join(get_args(LensModel))}, got {name!r}")
+    if not isinstance(name, str) or name not in MODELS:
+        raise ValueError(f"distortion: want one of {', '.join(get_args(LensModel))}, got {called(name)}")
     return MODELS[name]  # type: ignore[index]
 
 
@@ -113,7 +112,7 @@ def register_lens(kind: type[T], tensors: Sequence[str], constants: Sequence[str
         The class.
 
     Raises:
-        TypeError: it lacks something that `Lens` asks for.
+        TypeError: it is no class, or lacks something that `Lens` asks for; or names that are no strings.
         ValueError: it was registered before.
 
     Example:
@@ -147,6 +146,8 @@ def register_lens(kind: type[T], tensors: Sequence[str], constants: Sequence[str
         >>> torch.vmap(lambda camera: camera.project(torch.tensor([[1.0, 1.0, 2.0]]))[0])(cameras).tolist()
         [[[0.5, 0.5]], [[1.0, 0.5]]]
     """
+    instance("kind", kind, type, "a class")
+    tensors, constants = words("tensors", tensors, "several names"), words("constants", constants, "several names")
     lacking = [name for name in _MEMBERS if not hasattr(kind, name)]
     if lacking:
         raise TypeError(f"kind: want a lens, got {kind.__name__} without {', '.join(lacking)}; see dp.Lens")
@@ -162,4 +163,6 @@ def register_lens(kind: type[T], tensors: Sequence[str], constants: Sequence[str
     return register_pytree(kind, children=tensors, constants=constants, build=build)
 
 
-_MEMBERS = (*(name for name in vars(Lens) if not name.startswith("_")), "__getitem__")
+_BROUGHT_ALONG = ("distort", "undistort")
+"""What a lens may leave out, for no camera calls it: see `Lens`."""
+_MEMBERS = (*(name for name in vars(Lens) if not name.startswith("_") and name not in _BROUGHT_ALONG), "__getitem__")

@@ -1,10 +1,26 @@
 """`Lens`: the interface between cameras and lens models, which a user's own lens can implement too."""
 
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+Mapping = Callable[[Tensor], tuple[Tensor, Tensor]]
+
+
+def distorted(project_direction: Mapping, xy: Tensor) -> tuple[Tensor, Tensor]:
+    """Points of the normalised plane through a lens that projects directions."""
+    return project_direction(torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1))
+
+
+def undistorted(unproject: Mapping, xy_distorted: Tensor) -> tuple[Tensor, Tensor]:
+    """And back; (0, 0) where there is no point, or none in front."""
+    direction, valid = unproject(xy_distorted)
+    valid = valid & (direction[..., 2] > 0)
+    x, y, z = torch.where(valid.unsqueeze(-1), direction, 1.0).unbind(-1)
+    return torch.where(valid.unsqueeze(-1), torch.stack([x / z, y / z], dim=-1), 0.0), valid
 
 
 @runtime_checkable
@@ -16,8 +32,9 @@ class Lens(Protocol):
     is false (outside the model's domain) the result is a constant with zero gradient; where it is true the result is
     twice differentiable by the points and by the lens's parameters.
 
-    **A custom lens** needs no base class: a camera accepts any object with these attributes and methods. Tensors of
-    the lens have its batch axes in front (`coefficients (*B, k)`), which broadcast against those of the points. For
+    **A custom lens** needs no base class: a camera accepts any object with these attributes and methods. One that
+    inherits from this class has `distort` and `undistort` from it, by the other two. Tensors of the lens have its batch
+    axes in front (`coefficients (*B, k)`), which broadcast against those of the points. For
     `vmap`, `torch.func` and `torch.compile` along with its camera, the class must be registered with
     `dp.register_lens`.
 
@@ -61,6 +78,16 @@ class Lens(Protocol):
     ) -> tuple[Float[Tensor, "*out n 3"], Bool[Tensor, "*out n"]]:
         """Directions whose projections are these points; and which are valid."""
         ...
+
+    def undistort(
+        self, xy_distorted: Float[Tensor, "*batch n 2"]
+    ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
+        """Undistorted points `(x / z, y / z)` of distorted ones; and which are valid: those in front, at z > 0."""
+        return undistorted(self.unproject, xy_distorted)
+
+    def distort(self, xy: Float[Tensor, "*batch n 2"]) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
+        """Distorted points of undistorted ones `(x / z, y / z)`; and which are valid."""
+        return distorted(self.project_direction, xy)
 
     def to(self, *args: Any, **kwargs: Any) -> "Lens":
         """The lens in another dtype or on another device: arguments as `torch.Tensor.to`."""

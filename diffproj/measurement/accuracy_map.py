@@ -10,21 +10,27 @@ standard deviation grows there with what a lens of that model may do, and is inf
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core import arguments
+from diffproj._core.arguments import called, numbers, whole_number
+from diffproj._core.shown import Shown, number
 from diffproj.calibration.region import in_region
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.result import Calibration, as_calibration
 from diffproj.geometry.back_projection import ground_resolution
 from diffproj.geometry.grid import pixel_grid
-from diffproj.geometry.plane import Plane
-from diffproj.measurement.measure import measure, view_number
+from diffproj.geometry.plane import Plane, as_plane
+from diffproj.measurement.choices import chosen_view
+from diffproj.measurement.measure import measure
+from diffproj.targets.views import view_number
 
 
-@dataclass(frozen=True, eq=False)
-class AccuracyMap:
+@dataclass(frozen=True, eq=False, repr=False)
+class AccuracyMap(Shown):
     """How well points of a plane are measured, on a grid of rows and columns.
 
     Attributes:
@@ -50,41 +56,57 @@ class AccuracyMap:
         """Where a point is measured outside of the corners `(H, W)`: only its model tells the lens there."""
         return self.valid & ~self.covered
 
+    def _facts(self) -> list[str]:
+        def ranged(values: Tensor) -> str:
+            known = values[values.isfinite()]
+            return number(known, ".3g") if known.numel() else "not known"
+
+        rows, columns = self.valid.shape
+        return [
+            f"{rows} x {columns} places",
+            f"{100 * float(self.valid.double().mean()):.0f} % on the plane",
+            f"{100 * float(self.covered.double().mean()):.0f} % covered",
+            f"deviation {ranged(self.deviation)}",
+            f"resolution {ranged(self.resolution)} a pixel",
+        ]
+
     @classmethod
     def over_image(
         cls,
         calibration: Calibration,
         plane: Plane | None = None,
-        view: int | str = 0,
+        view: int | str | None = None,
         step: float = 8.0,
-        pixel_sigma: float | None = None,
+        pixel_sigma: float | Literal["detector"] = "detector",
     ) -> "AccuracyMap":
         """The map over the whole image.
 
         Args:
             calibration: of one camera, with its covariance.
             plane: in the frame of the board that the view saw; the board's own, z = 0, if left out.
-            view: the number or the name of the view whose pose holds.
+            view: the number or the name of the view whose pose holds; may be left out where there is one only.
             step: about how far apart the places are in px; the first and the last row and column lie on the image's
                 edge.
-            pixel_sigma: standard deviation of each coordinate of a measured pixel; the calibration's residual level if
-                left out.
+            pixel_sigma: standard deviation of each coordinate of a measured pixel in px; that of the calibration's
+                corners, `"detector"`, if left out.
 
         Raises:
+            TypeError: it is no calibration, or another argument is of the wrong kind.
             ValueError: many cameras or planes, no size, no such view, or a step that is not positive.
 
         Example:
             >>> import diffproj as dp
             >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-            >>> accuracy = dp.AccuracyMap.over_image(calibration, step=40)
+            >>> accuracy = dp.AccuracyMap.over_image(calibration, view=0, step=40)
             >>> accuracy.deviation.shape, bool(accuracy.covered[6, 8])
             (torch.Size([13, 17]), True)
         """
-        size = calibration.camera.size
+        size = as_calibration(calibration).camera.size
         if calibration.views.batch_shape or size is None:
             raise ValueError("calibration: want one camera of known size; index the views, or give them a size")
-        if not step > 0:
-            raise ValueError(f"step: want a positive distance in px, got {step}")
+        step = arguments.number("step", step, "a positive distance in px", above=0)
+        if (size[0] / step) * (size[1] / step) > MOST_PLACES:
+            raise ValueError(f"step: want a positive distance in px that gives at most 10^8 places, got {step:g}")
         columns, rows = (math.ceil((side - 1) / step) + 1 for side in size)
         pixels = _grid(rows, columns, (0.0, 0.0, size[0] - 1.0, size[1] - 1.0), calibration.points)
         return _mapped(pixels, calibration, _single(plane), view, pixel_sigma)
@@ -95,9 +117,9 @@ class AccuracyMap:
         calibration: Calibration,
         extent: Sequence[float],
         plane: Plane | None = None,
-        view: int | str = 0,
+        view: int | str | None = None,
         shape: Sequence[int] = (60, 80),
-        pixel_sigma: float | None = None,
+        pixel_sigma: float | Literal["detector"] = "detector",
     ) -> "AccuracyMap":
         """The map over a rectangle of the board's x and y, on a plane that is a height over them.
 
@@ -105,36 +127,36 @@ class AccuracyMap:
             calibration: of one camera, with its covariance.
             extent: `(x_min, y_min, x_max, y_max)` in world units of the board's frame.
             plane: in that frame, not at right angles to the board; the board's own, z = 0, if left out.
-            view: the number or the name of the view whose pose holds.
+            view: the number or the name of the view whose pose holds; may be left out where there is one only.
             shape: rows, along y, and columns, along x.
-            pixel_sigma: standard deviation of each coordinate of a measured pixel; the calibration's residual level if
-                left out.
+            pixel_sigma: standard deviation of each coordinate of a measured pixel in px; that of the calibration's
+                corners, `"detector"`, if left out.
 
         Raises:
-            ValueError: many cameras or planes, no such view, an empty extent, or an upright plane.
+            TypeError: it is no calibration, or another argument is of the wrong kind.
+            ValueError: many cameras or planes, no such view, an empty extent or shape, or an upright plane.
 
         Example:
             >>> import diffproj as dp
             >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-            >>> accuracy = dp.AccuracyMap.over_plane(calibration, (0, 0, 200, 125), shape=(6, 9))
+            >>> accuracy = dp.AccuracyMap.over_plane(calibration, (0, 0, 200, 125), view=0, shape=(6, 9))
             >>> bool(accuracy.valid.all()), bool((accuracy.deviation < 0.2).all())  # millimetres
             (True, True)
         """
-        if calibration.views.batch_shape:
+        if as_calibration(calibration).views.batch_shape:
             raise ValueError(f"calibration: want one camera, got batch shape {tuple(calibration.views.batch_shape)}")
-        if len(extent) != 4:
-            raise ValueError(f"extent: want (x_min, y_min, x_max, y_max), got {tuple(extent)}")
-        x_min, y_min, x_max, y_max = extent
+        want = "finite (x_min, y_min, x_max, y_max) with room between"
+        x_min, y_min, x_max, y_max = numbers("extent", extent, want, 4)
         if not (x_max > x_min and y_max > y_min):
-            raise ValueError(f"extent: want (x_min, y_min, x_max, y_max) with room between, got {tuple(extent)}")
+            raise ValueError(f"extent: want {want}, got {tuple(extent)}")
         plane = _single(plane)
         if abs(float(plane.unit_normal[2])) < UPRIGHT:
             raise ValueError("plane: want one that is a height over the board's x and y, got an upright one")
-        rows, columns = shape
+        rows, columns = _checked_shape(shape)
         xy = _grid(rows, columns, (x_min, y_min, x_max, y_max), calibration.points)
         z = (plane.offset - (plane.normal[:2] * xy).sum(-1)) / plane.normal[2]
         points = torch.cat([xy, z.unsqueeze(-1)], dim=-1)
-        camera = calibration.cameras[view_number(calibration, view)]
+        camera = calibration.cameras[view_number(chosen_view(calibration, view), calibration.views.names)]
         pixels, seen = camera.project(points.flatten(0, 1))
         if camera.size is not None:
             seen = seen & camera.in_image(pixels)
@@ -144,11 +166,25 @@ class AccuracyMap:
 
 UPRIGHT = 1e-9
 """The z of a unit normal below which a plane is at right angles to the board."""
+MOST_PLACES = 10**8
+"""Of a map: more would not fit into memory, and are a step in the wrong unit."""
+
+
+def _checked_shape(shape: Sequence[int]) -> tuple[int, int]:
+    want = "(rows, columns), whole numbers of at least 1"
+    if not isinstance(shape, list | tuple) or len(shape) != 2:
+        raise TypeError(f"shape: want {want}, got {called(shape)}")
+    rows, columns = (whole_number("shape", side, want, least=1) for side in shape)
+    if rows * columns > MOST_PLACES:
+        raise ValueError(f"shape: want at most 10^8 places, got {rows} x {columns}")
+    return rows, columns
 
 
 def _single(plane: Plane | None) -> Plane:
     """One plane in float64; the board's where none was given."""
-    plane = (plane or Plane.z(0.0)).to(torch.float64)
+    plane = (Plane.z(0.0) if plane is None else as_plane(plane)).to(torch.float64)
+    if plane.normal.is_meta:
+        raise ValueError("plane: want one with values, got one on the device meta")
     if plane.batch_shape:
         raise ValueError(f"plane: want one plane, got batch shape {tuple(plane.batch_shape)}")
     return plane
@@ -162,13 +198,18 @@ def _grid(rows: int, columns: int, extent: tuple[float, float, float, float], li
 
 
 def _mapped(
-    pixels: Tensor, calibration: Calibration, plane: Plane, view: int | str, pixel_sigma: float | None
+    pixels: Tensor,
+    calibration: Calibration,
+    plane: Plane,
+    view: int | str | None,
+    pixel_sigma: float | Literal["detector"],
 ) -> AccuracyMap:
     """The map at pixels `(H, W, 2)`; NaN stands for a place without a pixel."""
     shape = pixels.shape[:2]
     flat = pixels.flatten(0, 1)
     measured = measure(flat, calibration, plane, view, pixel_sigma)
-    resolution, valid = ground_resolution(flat, calibration.cameras[view_number(calibration, view)], plane)
+    seen_in = view_number(chosen_view(calibration, view), calibration.views.names)
+    resolution, valid = ground_resolution(flat, calibration.cameras[seen_in], plane)
 
     def shown(values: Tensor) -> Tensor:
         return torch.where(valid, values, torch.nan).reshape(shape)

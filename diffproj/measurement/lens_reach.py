@@ -54,6 +54,7 @@ def stretch(
         normal, offset = plane.normal.expand(*plane.batch_shape, 3), plane.offset.expand(plane.batch_shape)
         plane = Plane.unchecked(normal[..., some, :], offset[..., some], is_per_point=True)
     batch, L = points.shape[:-2], root(known)
+    L = L.expand(*batch, *L.shape[-2:])
     s, shared = parameters.size, parameters.pack(camera).expand(*batch, parameters.size)
     R = camera.R.expand(*batch, 3, 3)
     arm = torch.zeros_like(camera.t) if middle is None else middle

@@ -26,6 +26,7 @@ from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from diffproj._core.arguments import Array
 from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64, transform
 from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.region import in_region
@@ -33,23 +34,25 @@ from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project, warn_if_rounded
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.intrinsics import pixel_to_normalized
-from diffproj.geometry.plane import Plane
+from diffproj.geometry.plane import Plane, as_plane
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.slopes import by_direction
 from diffproj.measurement import lens_reach
+from diffproj.measurement.choices import PixelSigma, chosen_view, doubts, pixel_noise
 from diffproj.measurement.doubt import of_the_pose
 from diffproj.measurement.measurement import Measurement
 from diffproj.measurement.propagation import Noise
 from diffproj.measurement.sight import Sight
+from diffproj.targets.views import view_number
 
 
 def measure(
-    pixels: Float[Tensor, "*#batch n 2"],
+    pixels: Float[Tensor, "*#batch n 2"] | Array,
     calibration: Calibration | Camera | PinholeCamera,
     plane: Plane,
-    view: int | str = 0,
-    pixel_sigma: float | Tensor | None = None,
-    plane_covariance: Float[Tensor, "*#batch 4 4"] | None = None,
+    view: int | str | None = None,
+    pixel_sigma: PixelSigma = None,
+    plane_covariance: Float[Tensor, "*#batch 4 4"] | Array | None = None,
 ) -> Measurement:
     """Measure pixels on a plane, with error bars.
 
@@ -58,41 +61,53 @@ def measure(
         calibration: of batch shape `*B`, from `calibrate` or `refine`, or from `locate` for a new photograph; or a
             camera at its pose, whose own uncertainty is then not included.
         plane: in the frame of the board that the view saw.
-        view: the number or the name of the view whose pose holds.
-        pixel_sigma: standard deviation of each coordinate of the measured pixels, a number or `(*B, N)`; the
-            calibration's residual level if left out.
+        view: the number or the name of the view whose pose holds, in whose photograph the pixels are; may be left out
+            where there is one only.
+        pixel_sigma: standard deviation of each coordinate of the measured pixels in px, a number or `(*B, N)`: about
+            0.5 for points that a hand picked. `"detector"` stands for that of the calibration's corners, as its
+            residuals tell it. It is that if left out, too, with a `PixelNoiseWarning` unless the pixels are corners of
+            that view.
         plane_covariance: of the plane's normal and offset as they are given, `(*B, 4, 4)`; exact if left out.
 
     Returns:
         The measured points, in float64; gradients flow to pixels, plane, sigma and, where they carry one, the camera.
         A calibration's covariance, and how much larger deviations are where the lens is extrapolated, count as given.
+        In a photograph that the calibration does not fit, as one of another camera, zoom or focus, deviations are as
+        much larger as it takes to explain its corners; `doubts` and a `CameraMismatchWarning` say so.
 
     Raises:
-        ValueError: no such view, or a camera without `pixel_sigma`.
-        TypeError: `pixels` are no floating-point tensor.
+        TypeError: not pixels, a calibration or a camera, and a plane in this order, or another argument is of the wrong
+            kind.
+        ValueError: no such view, none said of several, a camera without `pixel_sigma`, or shapes, devices or values
+            that cannot be.
 
     Example:
         >>> import diffproj as dp
         >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
         >>> ends = calibration.views.pixels[0, [0, 8]]
-        >>> length = dp.measure(ends, calibration, dp.Plane.z(0.0)).lengths()
+        >>> length = dp.measure(ends, calibration, dp.Plane.z(0.0), view=0, pixel_sigma="detector").lengths()
         >>> print(f"{length.value[0]:.1f} ± {length.deviation[0]:.1f} mm")
         199.9 ± 0.2 mm
     """
-    pixels = in_float64(check_tensor("pixels", pixels, "N", 2))
+    pixels, plane = in_float64(check_tensor("pixels", pixels, "N", 2)), as_plane(plane)
+    known, middle, doubtful, number = None, None, "", 0
     if isinstance(calibration, Calibration):
-        camera, known, level, middle = _at_view(calibration, view)
+        number = view_number(chosen_view(calibration, view), calibration.views.names)
+        camera, known, middle = _at_view(calibration, number)
         parameters = replace(calibration.parameters, bow=False)
+        doubtful = doubts(calibration, number)
     else:
-        camera, known, level, middle = as_camera(calibration).upright(), None, None, None
+        camera = as_camera(calibration, "calibration").upright()
         parameters = Parametrisation.of(camera)
-    if pixel_sigma is None and level is None:
-        source = "this calibration" if isinstance(calibration, Calibration) else "a camera alone"
-        raise ValueError(f"pixel_sigma: want the noise of the pixels, for {source} does not know it")
+    noise, estimated = pixel_noise(
+        pixels, pixel_sigma, calibration if isinstance(calibration, Calibration) else None, number
+    )
     warn_if_rounded(camera, plane)
     camera, plane = camera.to(torch.float64), plane.to(torch.float64)
     if plane_covariance is not None:
         plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
+        if plane_covariance.device != camera.device:
+            raise ValueError(f"plane_covariance: want device {camera.device}, got {plane_covariance.device}")
         _check_covariance(plane_covariance.detach())
         if plane.is_per_point:
             raise ValueError("plane_covariance: want one plane for all points, got one for each (Plane.per_point)")
@@ -100,7 +115,7 @@ def measure(
         pixels = pixels.expand(*many, *pixels.shape[-2:])
     points, valid = back_project(pixels, camera, plane)
     batch = points.shape[:-2]
-    sigma = _expanded(level if pixel_sigma is None else pixel_sigma, like=points)
+    sigma = _expanded(noise, like=points)
     by_theta, by_point = _projection_derivatives(pixels, points, valid, camera, parameters, known, middle)
     tangents = plane.tangents()
     T = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)  # (*B, N, 3, 2)
@@ -123,7 +138,7 @@ def measure(
         covariances.append(in_float64(plane_covariance))
     away = [points.new_zeros(*points.shape, 0)]
     if isinstance(calibration, Calibration) and calibration.has_alternatives:
-        doubt = of_the_pose(pixels, calibration, view_number(calibration, view), plane, points, valid)
+        doubt = of_the_pose(pixels, calibration, number, plane, points, valid)
         away, covariances = [doubt.columns], [*covariances, doubt.covariance]
     if bool(beyond.any()):  # a parameter of which nothing is known, and no two points follow it alike
         unlike = torch.linspace(1, 2, points.shape[-2], dtype=points.dtype, device=points.device).unsqueeze(-1)
@@ -132,16 +147,16 @@ def measure(
     beside = torch.cat(away, dim=-1)
     common = torch.where(valid[..., None, None], torch.cat([*blocks, beside], dim=-1), 0.0)
     sight = Sight(pixels.expand(*batch, *pixels.shape[-2:]), sigma, camera, plane, by_theta, beside)
-    noise = Noise(
+    errors = Noise(
         sight,
         common,
         _block_diagonal(covariances, batch),
         sigma[..., None, None] * D,
         _degrees_of_freedom(calibration, like=points),
-        pixels_too=pixel_sigma is None,
+        pixels_too=estimated,
     )
     includes_intrinsics = isinstance(calibration, Calibration) and known is not None and calibration.knows_intrinsics
-    return Measurement(points, valid, includes_intrinsics, noise, region)
+    return Measurement(points, valid, includes_intrinsics, errors, region, doubtful)
 
 
 def _degrees_of_freedom(calibration: Calibration | Camera | PinholeCamera, like: Tensor) -> Tensor:
@@ -150,37 +165,28 @@ def _degrees_of_freedom(calibration: Calibration | Camera | PinholeCamera, like:
     return like.new_full(like.shape[:-2], torch.inf) if found is None else found.to(like).expand(like.shape[:-2])
 
 
-def view_number(calibration: Calibration, view: int | str) -> int:
-    """The number of a view, from 0, by its number or its name."""
-    names = calibration.views.names
-    if isinstance(view, str):
-        if view not in names:
-            raise ValueError(f"view: want one of {', '.join(names)}, got {view!r}")
-        return names.index(view)
-    if not -len(names) <= view < len(names):
-        raise ValueError(f"view: want a number below {len(names)}, got {view}")
-    return view % len(names)
+def _at_view(calibration: Calibration, number: int) -> tuple[Camera, Tensor | None, Tensor | None]:
+    """The camera at the pose of a view, the covariance of both, and the point `(3,)` that the pose turns about in it.
 
-
-def _at_view(calibration: Calibration, view: int | str) -> tuple[Camera, Tensor | None, Tensor | None, Tensor | None]:
-    """The camera at the pose of a view, the covariance of both, the noise of a pixel `(*B, 1)`, and a point `(3,)`.
-
-    In the covariance the pose turns about that point. What is not known is `None`.
+    What is not known is `None`. The covariance is larger where the calibration does not fit the view.
     """
-    number = view_number(calibration, view)
     if not bool(calibration.used[..., number, :].any(-1).all()):
-        raise ValueError(f"view: want one whose pose is known, got {view!r}, of which no corner was used")
+        name = calibration.views.names[number]
+        raise ValueError(f"view: want one whose pose is known, got {number} ({name}), of which no corner was used")
     known, middle = None, None
     if calibration.has_covariance:
         covariance = calibration.covariance_of_kept_poses
         known, middle = covariance.about_middle.view(number), covariance.middle
-    level = None if calibration.pixel_sigma is None else calibration.pixel_sigma.unsqueeze(-1)
-    return calibration.cameras[..., number], known, level, middle
+        known = calibration.mismatch.scale[..., number, None, None].square() * known
+    return calibration.cameras[..., number], known, middle
 
 
-def _expanded(pixel_sigma: float | Tensor | None, like: Tensor) -> Tensor:
+def _expanded(pixel_sigma: float | Tensor | Array | None, like: Tensor) -> Tensor:
     """The standard deviation of each pixel `(*B, N)`, for points `(*B, N, 3)`."""
-    sigma = torch.as_tensor(pixel_sigma, dtype=torch.float64, device=like.device)
+    sigma = check_tensor("pixel_sigma", pixel_sigma, like=like)
+    if sigma.is_meta:
+        raise ValueError("pixel_sigma: want values, got a tensor on the device meta")
+    sigma = sigma.to(like)
     try:
         sigma = sigma.expand(like.shape[:-1])
     except RuntimeError:

@@ -4,14 +4,18 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core import arguments
 from diffproj._core.copying import Copied
+from diffproj._core.shown import Shown, counted, rounded
 from diffproj.calibration.covariance import zero_where_infinite
 from diffproj.calibration.region import in_region
+from diffproj.geometry.back_projection import Reason, explain
 from diffproj.measurement.folded import longest_first, norm_variance
 from diffproj.measurement.intervals import angle_interval, curved_interval, norm_interval
 from diffproj.measurement.propagation import Noise, Propagated, kink_variance
@@ -26,8 +30,8 @@ NONLINEAR = "Nonlinear: close to the horizon or to zero, where the deviation mis
 """What the summary says of points and lengths that it marks so."""
 
 
-@dataclass(frozen=True, eq=False)
-class Measurement(Copied):
+@dataclass(frozen=True, eq=False, repr=False)
+class Measurement(Copied, Shown):
     """Points measured on a plane, with their joint covariance.
 
     Attributes:
@@ -37,6 +41,8 @@ class Measurement(Copied):
             and lens. They do for a calibration with its covariance. For a camera alone, or a calibration from a file
             without a covariance, they hold the pixels' noise only; for a pose that `locate` found with a camera alone,
             the pixels' noise and the pose's uncertainty.
+        doubts: what makes the pose that they were measured from doubtful, in words: that the calibration does not fit
+            the photograph, as if it were another camera's, or that two poses fit it. Empty where nothing does.
     """
 
     points: Float[Tensor, "*batch n 3"]
@@ -44,6 +50,7 @@ class Measurement(Copied):
     includes_intrinsics: bool
     _noise: Noise = field(repr=False)
     _region: Tensor | None = field(default=None, repr=False)
+    doubts: str = ""
 
     @property
     def degrees_of_freedom(self) -> Float[Tensor, "*batch"]:
@@ -130,19 +137,32 @@ class Measurement(Copied):
             which: the numbers of the k points of each of M quantities, `(M, k)`.
 
         Raises:
+            TypeError: no function, or no whole numbers.
+            ValueError: not of shape `(M, k)`, or the function gives something else than a number with a gradient.
             IndexError: there is no such point.
 
         Example:
             >>> import diffproj as dp
             >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
-            >>> measured = dp.measure(calibration.views.pixels[0, :3], calibration, dp.Plane.z(0.0))
+            >>> measured = dp.measure(calibration.views.pixels[0, :3], calibration, dp.Plane.z(0.0), view=0)
             >>> middle = measured.quantity(lambda p: p.mean(dim=0)[0], [[0, 1, 2]])
             >>> print(f"{middle.value[0]:.1f} mm")  # x of the centroid of three corners in a row
             25.0 mm
         """
-        index = self._numbers(which)
+        index = self._numbers("which", which)
+        given = arguments.function("function", function, "a function of k points (k, 3)")
         chosen = self.points[..., index, :]  # (*B, M, k, 3)
-        gradient, value = torch.func.vmap(torch.func.grad_and_value(function))(chosen.flatten(0, -3))
+
+        def checked(points: Tensor) -> Tensor:
+            found = given(points)
+            if not isinstance(found, Tensor) or found.ndim or not found.is_floating_point():
+                raise ValueError(
+                    "function: want one that gives a number, a tensor without axes of floating-point type, got "
+                    f"{arguments.called(found)}"
+                )
+            return found
+
+        gradient, value = torch.func.vmap(torch.func.grad_and_value(checked))(chosen.flatten(0, -3))
         gradient, value = gradient.reshape(chosen.shape), value.reshape(chosen.shape[:-2])
         spread = Propagated.of(self._noise, index, gradient.nan_to_num(0.0, 0.0, 0.0).unsqueeze(-3))
         with torch.no_grad():
@@ -152,15 +172,14 @@ class Measurement(Copied):
 
     def lengths(self, pairs: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
         """Distances between points in world units: of successive points, or of `pairs (M, 2)`."""
-        return self._norms(difference, self._successive(2) if pairs is None else _sets("pairs", pairs, 2))
+        return self._norms(difference, self._successive(2) if pairs is None else self._numbers("pairs", pairs, 2))
 
     def angles(self, triples: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
         """Angles at the second of three points in radians: of successive points, or of `triples (M, 3)`.
 
         Where an arm has no length the deviation is infinite, and where an arm may have none any angle is possible.
         """
-        index = self._successive(3) if triples is None else _sets("triples", triples, 3)
-        index = self._numbers(index)
+        index = self._successive(3) if triples is None else self._numbers("triples", triples, 3)
         arms = [self._norms(difference, index[:, [1, end]]) for end in (0, 2)]
         undefined = (arms[0].value == 0) | (arms[1].value == 0)
         found = self._norms(turn, index, limit=torch.pi, undefined=undefined)
@@ -171,8 +190,17 @@ class Measurement(Copied):
 
         Parts of an outline that crosses itself cancel.
         """
-        every = list(range(self.points.shape[-2])) if corners is None else list(corners)
-        return self._norms(area_vector, [every])
+        if corners is None:
+            every = torch.arange(self.points.shape[-2], device=self.points.device).unsqueeze(0)
+        else:
+            want = "the numbers of the corners of one polygon, as [0, 1, 2]"
+            index = arguments.whole_numbers("corners", corners, want)
+            if index.ndim != 1:
+                raise ValueError(f"corners: want {want}, got shape {tuple(index.shape)}")
+            every = self._numbers("corners", index.unsqueeze(0))
+        if every.shape[-1] < 3:
+            raise ValueError(f"corners: want at least 3, got {every.shape[-1]}")
+        return self._norms(area_vector, every)
 
     def summary(self) -> str:
         """Points and successive lengths with their standard deviations, as a text for people; for one camera.
@@ -197,20 +225,73 @@ class Measurement(Copied):
             lines.append(EXTRAPOLATED)
         if any(bent):
             lines.append(NONLINEAR)
+        if self.doubts:
+            lines.append(f"Doubtful: {self.doubts}.".replace("?.", "?"))
         if not self.includes_intrinsics:
             known = "pixels and the pose" if self._noise.sigma.shape[-1] else "pixels alone"
             lines.append(f"The deviations hold the noise of the {known}: the camera came without a covariance.")
         return "\n".join(lines)
 
+    def to_dict(self) -> dict[str, list[Any]]:
+        """The points as columns of Python's own numbers, of many cameras with theirs: `pandas.DataFrame` takes it.
+
+        `reason` is the name of a `Reason`; where a point is not `valid`, its numbers are NaN.
+
+        Example:
+            >>> import diffproj as dp
+            >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+            >>> corners = calibration.views.pixels[0, :2]
+            >>> found = dp.measure(corners, calibration, dp.Plane.z(0.0), view=0).to_dict()
+            >>> found["point"], found["reason"], [round(x) for x in found["x"]]
+            ([0, 1], ['VALID', 'VALID'], [0, 25])
+        """
+        sight, batch = self._noise.sight, self.points.shape[:-2]
+        reasons = explain(sight.pixels, sight.camera, sight.plane).expand(self.valid.shape)
+        places = torch.where(self.valid.unsqueeze(-1), self.points, torch.nan)
+        beyond = self.extrapolated
+        columns: dict[str, Tensor] = {}
+        if batch:
+            cameras = torch.arange(batch.numel()).reshape(*batch, 1)
+            columns["camera"] = cameras.expand(self.valid.shape)
+        columns["point"] = torch.arange(self.valid.shape[-1]).expand(self.valid.shape)
+        columns |= dict(zip("uv", sight.pixels.unbind(-1), strict=True)) | {"valid": self.valid}
+        columns |= dict(zip("xyz", places.unbind(-1), strict=True))
+        columns |= {f"{axis}_deviation": part for axis, part in zip("xyz", self.deviations.unbind(-1), strict=True)}
+        columns |= {"nonlinear": self.nonlinear} | ({} if beyond is None else {"extrapolated": beyond})
+        found: dict[str, list[Any]] = {name: values.detach().flatten().tolist() for name, values in columns.items()}
+        return found | {"reason": [Reason(code).name for code in reasons.flatten().tolist()]}
+
+    def _facts(self) -> list[str]:
+        count = self.valid.shape[-1]
+        lost = int((~self.valid).sum())
+        return [
+            counted(self.valid.shape[:-1], "camera"),
+            f"{count} point{'s' * (count != 1)}",
+            f"{lost} not on the plane" if lost else "",
+            "doubtful" if self.doubts else "",
+        ]
+
+    def _columns(self) -> dict[str, Sequence[Any]]:
+        found = self.to_dict()
+        shown: dict[str, Sequence[Any]] = {name: found[name] for name in ("camera", "point", "u", "v") if name in found}
+        for axis in "xyz":
+            pairs = [rounded(*pair) for pair in zip(found[axis], found[f"{axis}_deviation"], strict=True)]
+            shown[axis], shown[f"\u00b1 {axis}"] = ([pair[side] for pair in pairs] for side in (0, 1))
+        flags = [name for name in ("nonlinear", "extrapolated") if any(found.get(name, []))]
+        flags += [] if all(found["valid"]) else ["reason"]
+        return shown | {name: found[name] for name in flags}
+
+    def _note(self) -> str:
+        return self.doubts
+
     def _norms(
         self,
         function: Callable[[Tensor], tuple[Tensor, Tensor]],
-        which: Sequence[Sequence[int]] | Tensor,
+        index: Tensor,
         limit: float = torch.inf,
         undefined: Tensor | None = None,
     ) -> Quantity:
         """Lengths of vectors that depend on the points, or what they lack to the limit: see `shapes`."""
-        index = self._numbers(which)
         chosen = self.points[..., index, :]
 
         def twice(points: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
@@ -267,14 +348,16 @@ class Measurement(Copied):
             found.append(self._number(spread, partial(_coordinate, axis), value, torch.zeros_like(value)))
         return found
 
-    def _numbers(self, which: Sequence[Sequence[int]] | Tensor) -> Tensor:
+    def _numbers(self, name: str, which: Sequence[Sequence[int]] | Tensor, k: int | None = None) -> Tensor:
         """The numbers of points `(M, k)`, from 0."""
-        index, N = torch.as_tensor(which, device=self.points.device), self.points.shape[-2]
-        if index.ndim != 2 or index.is_floating_point():
-            raise ValueError(f"which: want the numbers of k points for each of M quantities, got {tuple(index.shape)}")
+        want = f"point numbers of shape (M, {'k' if k is None else k})"
+        index = arguments.whole_numbers(name, which, want).to(self.points.device)
+        N = self.points.shape[-2]
+        if index.ndim != 2 or index.shape[-1] != (index.shape[-1] if k is None else k) or index.shape[-1] == 0:
+            raise ValueError(f"{name}: want {want}, got shape {tuple(index.shape)}")
         if bool(((index < -N) | (index >= N)).any()):
-            raise IndexError(f"which: want numbers of the {N} points, got {index.flatten().tolist()}")
-        return index % N
+            raise IndexError(f"{name}: want numbers of the {N} points, got {index.flatten().tolist()}")
+        return index % max(1, N)
 
     def _successive(self, k: int) -> Tensor:
         N = self.points.shape[-2]
@@ -282,13 +365,6 @@ class Measurement(Copied):
             raise ValueError(f"points: want at least {k}, got {N}")
         first, following = (torch.arange(count, device=self.points.device) for count in (N - k + 1, k))
         return first.unsqueeze(-1) + following
-
-
-def _sets(name: str, which: Sequence[Sequence[int]] | Tensor, k: int) -> Tensor:
-    index = which if isinstance(which, Tensor) else torch.as_tensor(which, device="cpu")
-    if index.ndim != 2 or index.shape[-1] != k:
-        raise ValueError(f"{name}: want point numbers of shape (M, {k}), got {tuple(index.shape)}")
-    return index
 
 
 def _coordinate(axis: int, points: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj._core.copying import Copied
+from diffproj._core.shown import Shown, rounded
 from diffproj.measurement.student import normal_reach, student_reach
 
 SIGNIFICANT = 0.9973
@@ -16,12 +17,15 @@ SIGNIFICANT = 0.9973
 BENT = 0.1
 """By how much of its half width an interval has to differ from `value -+ reach * deviation` to be called nonlinear."""
 
+FEW = 4
+"""Values that one line shows."""
+
 Bounds = Callable[[float, Tensor], tuple[Tensor, Tensor]]
 """From a level and the number of deviations that it takes to lower and upper bounds."""
 
 
-@dataclass(frozen=True, eq=False)
-class Quantity(Copied):
+@dataclass(frozen=True, eq=False, repr=False)
+class Quantity(Copied, Shown):
     """Measured values with their standard deviations.
 
     Attributes:
@@ -75,6 +79,25 @@ class Quantity(Copied):
         value, half = self.value.detach(), self._reach(0.95) * self.deviation.detach()
         off = torch.maximum((low - value + half).abs(), (high - value - half).abs())
         return off > BENT * half + 1e-9 * value.abs()
+
+    def to_dict(self) -> dict[str, list[float]]:
+        """Values, deviations and 95 % intervals as columns of Python's own numbers: `pandas.DataFrame` takes it.
+
+        Example:
+            >>> Quantity(torch.tensor([200.0]), torch.tensor([0.5])).to_dict()
+            {'value': [200.0], 'deviation': [0.5], 'low_95': [199.02001953125], 'high_95': [200.97998046875]}
+        """
+        columns = self.value, self.deviation, *self.interval()
+        names = "value", "deviation", "low_95", "high_95"
+        return {name: part.detach().flatten().tolist() for name, part in zip(names, columns, strict=True)}
+
+    def _facts(self) -> list[str]:
+        values = zip(self.value.detach().flatten().tolist(), self.deviation.detach().flatten().tolist(), strict=True)
+        texts = [" ± ".join(filter(None, rounded(*pair))) for pair in values]
+        return [*texts[:FEW], f"{len(texts) - FEW} more" if len(texts) > FEW else ""]
+
+    def _columns(self) -> dict[str, list[float]]:
+        return self.to_dict()
 
     def _reach(self, level: float) -> Tensor:
         """How many deviations an interval of that level takes."""

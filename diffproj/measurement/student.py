@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffproj._core.arguments import number
+
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(64)
 NEARLY_NORMAL = 1000.0
 """Degrees of freedom from which on a series in their reciprocal is exact to rounding."""
@@ -20,11 +22,14 @@ def check_level(level: float) -> float:
     """The level of an interval, known to be a probability.
 
     Raises:
-        ValueError: the level is not between 0 and 1.
+        TypeError: the level is no number.
+        ValueError: it is not between 0 and 1.
     """
-    if not 0 < level < 1:
-        raise ValueError(f"level: want a probability between 0 and 1, got {level}")
-    return level
+    want = "a probability between 0 and 1"
+    found = number("level", level, want, above=0)
+    if found >= 1:
+        raise ValueError(f"level: want {want}, got {level}")
+    return found
 
 
 def normal_reach(level: float) -> float:

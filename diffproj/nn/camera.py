@@ -13,16 +13,17 @@ All parameters are zero at first, which gives the camera that the module was mad
 buffers, which are saved and moved along.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
+from diffproj._core.arguments import flag
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.cayley import turned
 from diffproj.lens.models import coefficients_of, model_of
-from diffproj.nn.partial import PARTS, GeometryModule, Learn, add_parameter, learned, learned_parts
+from diffproj.nn.partial import PARTS, GeometryModule, Learn, add_parameter, check_has_values, learned, learned_parts
 
 _PARAMETERS = {
     "focal": ("log_focal",),
@@ -76,6 +77,8 @@ class LearnableCamera(GeometryModule):
     ) -> None:
         super().__init__()
         camera = as_camera(camera).detach()
+        check_tied(tied_intrinsics)
+        check_has_values("camera", camera.K)
         self._model = model_of(camera.distortion)
         available = [part for part in PARTS if self._model.count or part != "distortion"]
         chosen = learned_parts(available if learn is None else learn, available)
@@ -120,9 +123,22 @@ class LearnableCamera(GeometryModule):
             lens = self._model.kind.unchecked(coefficients).expand(*self.batch_shape)
         return Camera.unchecked(K, R, t, lens, self.size)
 
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward
+
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""
         return f"batch_shape={tuple(self.batch_shape)}, lens={self._model.name}, learn={self.learn}"
+
+
+def check_tied(tied: bool | None) -> None:
+    """Check the argument `tied_intrinsics`.
+
+    Raises:
+        TypeError: it is neither True nor False nor `None`.
+    """
+    if tied is not None:
+        flag("tied_intrinsics", tied)
 
 
 def tied_axes(camera: Camera, tied: bool | None) -> list[int]:
@@ -137,7 +153,7 @@ def tied_axes(camera: Camera, tied: bool | None) -> list[int]:
         return []
     batch = camera.batch_shape
     axes = [axis for axis in range(len(batch)) if batch[axis] and all(_is_constant(part, axis) for part in parts)]
-    if tied and batch and len(batch) - 1 not in axes:
+    if tied and batch and batch[-1] and len(batch) - 1 not in axes:
         raise ValueError("tied_intrinsics: want one K and one lens for all poses, got different ones")
     return axes
 

@@ -3,11 +3,12 @@
 from typing import Any
 
 import torch
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.numerics import has_values
 from diffproj.geometry.back_projection import PlaneMap
-from diffproj.geometry.camera import Camera
+from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.models import coefficients_of, model_of
@@ -47,8 +48,9 @@ class FixedMap(GeometryModule):
     offset: Tensor
     matrix: Tensor
 
-    def __init__(self, camera: Camera, plane: Plane) -> None:
+    def __init__(self, camera: Camera | PinholeCamera, plane: Plane) -> None:
         super().__init__()
+        camera = as_camera(camera)
         matrix = PlaneMap(camera, plane).matrix  # which also checks that they fit together
         check_one_plane(plane)
         self._model, self._size = model_of(camera.distortion), camera.size

@@ -1,5 +1,6 @@
 """`LearnableMap`: the map of a camera and a plane of which something is learned."""
 
+import math
 from typing import Any
 
 import torch
@@ -9,6 +10,7 @@ from diffproj.geometry.back_projection import PlaneMap
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
 from diffproj.nn.camera import LearnableCamera
+from diffproj.nn.partial import check_has_values
 from diffproj.nn.plane import LearnablePlane
 
 
@@ -39,11 +41,14 @@ class LearnableMap(nn.Module):
     ) -> None:
         super().__init__()
         PlaneMap(camera, plane)  # checks that they fit together
+        check_has_values("camera", camera.K)
         plane = plane.like(camera.K)
         distance = plane.distance(camera.center.unsqueeze(-2)).abs()
         of_camera = {part: where for part, where in learn.items() if part != "plane"}
         self.camera = LearnableCamera(camera, of_camera, tied_intrinsics)
-        self.plane = LearnablePlane(plane, float(distance.mean()) or 1.0, learn.get("plane", False))
+        # Without a distance, as of a camera on the plane or of none at all, steps are in world units.
+        scale = float(distance.mean())
+        self.plane = LearnablePlane(plane, scale if 0 < scale < math.inf else 1.0, learn.get("plane", False))
 
     @property
     def device(self) -> torch.device:

@@ -1,13 +1,15 @@
 """`PlaneLoss`: a loss in world units over the points that are valid."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from diffproj._core.arguments import Array, booleans
 from diffproj._core.numerics import check_tensor
-from diffproj.calibration.losses import Loss
+from diffproj.calibration.losses import Loss, check_loss
 
 
 class PlaneLoss(nn.Module):
@@ -31,17 +33,16 @@ class PlaneLoss(nn.Module):
 
     def __init__(self, loss: Loss | None = None) -> None:
         super().__init__()
-        if loss is not None and not isinstance(loss, Loss):
-            raise TypeError(f"loss: want one such as dp.Huber(5.0), got {type(loss).__name__}")
+        check_loss(loss)
         self.loss = loss
 
     def forward(
         self,
-        points: Float[Tensor, "*batch n 3"],
-        target: Float[Tensor, "*#batch n 3"],
-        valid: Bool[Tensor, "*#batch n"] | None = None,
-        weights: Float[Tensor, "*#batch n"] | None = None,
-        resolution: Float[Tensor, "*#batch n"] | None = None,
+        points: Float[Tensor, "*batch n 3"] | Array,
+        target: Float[Tensor, "*#batch n 3"] | Array,
+        valid: Bool[Tensor, "*#batch n"] | Array | None = None,
+        weights: Float[Tensor, "*#batch n"] | Array | None = None,
+        resolution: Float[Tensor, "*#batch n"] | Array | None = None,
     ) -> Float[Tensor, ""]:
         """The loss, a tensor without axes, in squared world units (in squared pixels with `resolution`).
 
@@ -61,31 +62,40 @@ class PlaneLoss(nn.Module):
                 boolean.
             ValueError: points or target without three coordinates, or something that does not broadcast to the points.
         """
-        points, target = check_tensor("points", points, "N", 3), check_tensor("target", target, "N", 3)
-        _check_fits("target", target, points.shape)
-        counts = torch.ones_like(points[..., 0], dtype=torch.bool) if valid is None else valid
-        if counts.dtype != torch.bool:
-            raise TypeError(f"valid: want booleans, got {counts.dtype}")
-        for name, tensor in (("valid", counts), ("weights", weights), ("resolution", resolution)):
-            if tensor is not None:
-                _check_fits(name, tensor, points.shape[:-1])
+        points = check_tensor("points", points, "N", 3, like=target if isinstance(target, Tensor) else None)
+        target = _fitting("target", check_tensor("target", target, "N", 3, like=points), points, points.shape)
+        each = points.shape[:-1]
+        if valid is None:
+            counts = torch.ones_like(points[..., 0], dtype=torch.bool)
+        else:
+            counts = _fitting("valid", booleans("valid", valid, points.device), points, each)
         off = torch.where(counts.unsqueeze(-1), points - target.to(points), 0.0)
         if resolution is not None:
+            resolution = _fitting("resolution", check_tensor("resolution", resolution, like=points), points, each)
             off = off / torch.where(counts, resolution, 1.0).detach().unsqueeze(-1).to(off)
         value = off.square().sum(-1)
         value = value if self.loss is None else self.loss.value(value)
         if weights is not None:
+            weights = _fitting("weights", check_tensor("weights", weights, like=points), points, each)
             value = value * torch.where(counts, weights, 0.0).to(value)
         return value.sum() / max(value.numel(), 1)
 
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward
 
-def _check_fits(name: str, tensor: Tensor, shape: Sequence[int]) -> None:
-    """Check that a tensor broadcasts to a shape, along its last axis only from one number for all.
+
+def _fitting(name: str, tensor: Tensor, points: Tensor, shape: Sequence[int]) -> Tensor:
+    """A tensor on the points' device that broadcasts to a shape, along its last axis only from one number for all.
 
     Raises:
-        ValueError: it does not, or would stretch the points.
+        ValueError: it does not, or would stretch the points; or it is elsewhere.
     """
-    whole = tensor.ndim < 1 or tensor.shape[-1] == shape[-1]
-    behind = tensor.shape[::-1]
-    if not whole or len(behind) > len(shape) or any(a not in (1, b) for a, b in zip(behind, shape[::-1], strict=False)):
-        raise ValueError(f"{name}: want a shape that broadcasts to {tuple(shape)}, got {tuple(tensor.shape)}")
+    if tensor.shape != shape:
+        whole = tensor.ndim < 1 or tensor.shape[-1] == shape[-1]
+        behind, want = tensor.shape[::-1], shape[::-1]
+        if not whole or len(behind) > len(want) or any(a not in (1, b) for a, b in zip(behind, want, strict=False)):
+            got = tuple(tensor.shape)
+            raise ValueError(f"{name}: want a shape that broadcasts to {tuple(shape)} as points has, got {got}")
+    if tensor.device != points.device:
+        raise ValueError(f"{name}: want device {points.device} as points has, got {tensor.device}")
+    return tensor

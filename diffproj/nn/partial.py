@@ -6,6 +6,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from diffproj._core.arguments import booleans, words
+
 PARTS = ("focal", "principal_point", "distortion", "pose")
 """The parts of a camera that can be learned."""
 
@@ -45,6 +47,16 @@ class GeometryModule(nn.Module):
             return super()._apply(convert, recurse)
 
 
+def check_has_values(name: str, tensor: Tensor) -> None:
+    """Check that what is to be learned starts somewhere.
+
+    Raises:
+        ValueError: it is on the meta device.
+    """
+    if tensor.is_meta:
+        raise ValueError(f"{name}: want values to start from, got one on the device meta")
+
+
 def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
     """From each part that is learned to True, or to the booleans that say for which elements of the batch.
 
@@ -53,18 +65,16 @@ def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
         available: the parts that there are.
 
     Raises:
+        TypeError: no names, or no booleans for one.
         ValueError: a part that is not available.
     """
-    names = (learn,) if isinstance(learn, str) else tuple(learn)
+    given = tuple(learn) if isinstance(learn, Mapping) else learn
+    names = (given,) if isinstance(given, str) else words("learn", given, "names of parts")
     unknown = [part for part in names if part not in available]
     if unknown:
         raise ValueError(f"learn: want parts of {', '.join(available)}, got {unknown[0]!r}")
     wanted = {part: learn[part] for part in names} if isinstance(learn, Mapping) else dict.fromkeys(names, True)
-    return {part: where for part, where in wanted.items() if _anywhere(where)}
-
-
-def _anywhere(where: Any) -> bool:
-    return bool((where if isinstance(where, Tensor) else torch.as_tensor(where, device="cpu")).any())
+    return {part: where for part, where in wanted.items() if bool(booleans("learn", where).any())}
 
 
 def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, batch: torch.Size) -> None:
@@ -84,9 +94,9 @@ def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, b
         ValueError: `where` does not broadcast to the batch shape, or differs along an axis with one shared value.
     """
     zero = torch.zeros_like(like, memory_format=torch.contiguous_format)
-    mask = torch.as_tensor(where, device=like.device)
+    mask = booleans("learn", where).cpu()
     try:
-        mask = mask.bool().expand(batch)
+        mask = mask.expand(batch)
     except RuntimeError:
         raise ValueError(
             f"learn: want booleans that broadcast to the batch shape {tuple(batch)}, got shape {tuple(mask.shape)}"
@@ -107,7 +117,7 @@ def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, b
                 )
             mask = first
     module.masked.add(name)
-    module.register_buffer(f"{name}_learned", mask.unsqueeze(-1).to(like.dtype))
+    module.register_buffer(f"{name}_learned", mask.unsqueeze(-1).to(like))
 
 
 def learned(module: GeometryModule, name: str) -> Tensor:

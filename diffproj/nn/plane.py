@@ -1,12 +1,13 @@
 """`LearnablePlane`: a plane that a PyTorch optimiser moves."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from diffproj.geometry.plane import Plane
-from diffproj.nn.partial import GeometryModule, add_parameter, learned
+from diffproj._core.arguments import number
+from diffproj.geometry.plane import Plane, as_plane
+from diffproj.nn.partial import GeometryModule, add_parameter, check_has_values, learned
 
 
 class LearnablePlane(GeometryModule):
@@ -24,7 +25,9 @@ class LearnablePlane(GeometryModule):
         learn: True, False, or booleans that broadcast to the batch shape: the planes that are learned.
 
     Raises:
-        ValueError: one plane for each point (`Plane.per_point`), or booleans that do not broadcast.
+        TypeError: it is no plane, or another argument is of the wrong kind.
+        ValueError: one plane for each point (`Plane.per_point`), a scale that is not positive, or booleans that do not
+            broadcast.
 
     Example:
         >>> learnable = LearnablePlane(Plane(torch.tensor([0.0, 0.0, 2.0]), torch.tensor(8.0)))
@@ -44,8 +47,10 @@ class LearnablePlane(GeometryModule):
         super().__init__()
         check_one_plane(plane)
         plane = plane.detach()
+        check_has_values("plane", plane.normal)
         length, (unit, distance) = plane.length, plane.normalised()
-        self.register_buffer("scale", torch.as_tensor(scale, dtype=length.dtype, device=length.device))
+        scale = number("scale", scale, "a distance in world units, above 0", above=0)
+        self.register_buffer("scale", length.new_tensor(scale))
         self.register_buffer("length_0", length)
         self.register_buffer("unit_0", unit)
         self.register_buffer("distance_0", distance)
@@ -60,12 +65,16 @@ class LearnablePlane(GeometryModule):
         distance = self.distance_0 + self.scale * learned(self, "shift").squeeze(-1)
         return Plane.unchecked(normal, self.length_0 * distance)
 
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward
+
 
 def check_one_plane(plane: Plane) -> None:
     """Check that a plane does not stand for one plane for each point.
 
     Raises:
+        TypeError: it is no plane.
         ValueError: it does.
     """
-    if plane.is_per_point:
+    if as_plane(plane).is_per_point:
         raise ValueError("plane: want one plane for all points, got one for each (Plane.per_point)")

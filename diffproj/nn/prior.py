@@ -1,6 +1,7 @@
 """`CalibrationPrior`: how far a camera may move from its calibration, given the calibration's covariance."""
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -10,10 +11,11 @@ from torch import Tensor
 
 from diffproj._core.numerics import in_float64
 from diffproj.calibration.parametrisation import POSE
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.result import Calibration, as_calibration
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.lens.models import model_of
 from diffproj.nn.partial import GeometryModule
+from diffproj.targets.views import view_number
 
 RANK_TOLERANCE = 1e-13
 """Eigenvalue of the correlation matrix at and below which it is rounding error. Measured on the bundled views with
@@ -37,10 +39,11 @@ class CalibrationPrior(GeometryModule):
 
     Args:
         calibration: of one camera, with its covariance.
-        view: the view whose pose counts as well; none if left out.
+        view: the number or the name of the view whose pose counts as well; none if left out.
 
     Raises:
-        ValueError: more than one camera, or a calibration without covariance.
+        TypeError: it is no calibration, or the view neither a number nor a name.
+        ValueError: more than one camera, a calibration without covariance, or no such view.
 
     Example:
         >>> import diffproj as dp
@@ -57,10 +60,11 @@ class CalibrationPrior(GeometryModule):
     R_0: Tensor
     middle: Tensor
 
-    def __init__(self, calibration: Calibration, view: int | None = None) -> None:
+    def __init__(self, calibration: Calibration, view: int | str | None = None) -> None:
         super().__init__()
-        if calibration.views.batch_shape or not calibration.has_covariance:
+        if as_calibration(calibration).views.batch_shape or not calibration.has_covariance:
             raise ValueError("calibration: want one camera with its covariance, as calibrate gives it")
+        view = None if view is None else view_number(view, calibration.views.names)
         camera = (calibration.camera if view is None else calibration.cameras[view]).detach()
         known, parameters = calibration.covariance.about_middle, replace(calibration.parameters, bow=False)
         middle = calibration.covariance.middle
@@ -89,8 +93,13 @@ class CalibrationPrior(GeometryModule):
         lens, wanted = model_of(camera.distortion).name, self.parametrisation.lens
         if lens != wanted:
             raise ValueError(f"camera: want the calibration's lens model {wanted!r}, got {lens!r}")
+        if camera.device != self.center.device:
+            raise ValueError(f"camera: want device {self.center.device} as the prior has, got {camera.device}")
         off = self._vector(camera) - self.center
         return (off * (self.precision * off.unsqueeze(-2)).sum(-1)).sum(-1) / 2
+
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward
 
     def _vector(self, camera: Camera) -> Tensor:
         """The parameters of a camera `(*B, p)`: intrinsics and lens, with a pose its turn from R_0 and its place."""

@@ -1,14 +1,17 @@
 """`PlaneProjector`: pixels to points on a plane, as a layer."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
+from diffproj._core.arguments import Array
 from diffproj.geometry.back_projection import PlaneMap
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
-from diffproj.nn.camera import tied_axes
+from diffproj.nn.camera import check_tied, tied_axes
 from diffproj.nn.fixed_map import FixedMap
 from diffproj.nn.learnable_map import LearnableMap
 from diffproj.nn.partial import PARTS, Learn, learned_parts
@@ -54,6 +57,7 @@ class PlaneProjector(nn.Module):
     ) -> None:
         super().__init__()
         camera = as_camera(camera).detach()
+        check_tied(tied_intrinsics)
         chosen = learned_parts(learn, (*PARTS, "plane"))
         self.learn = tuple(chosen)
         if chosen:
@@ -78,8 +82,8 @@ class PlaneProjector(nn.Module):
 
     def forward(
         self,
-        pixels: Float[Tensor, "*#batch n 2"],
-        warp: Float[Tensor, "*#batch 3 3"] | None = None,
+        pixels: Float[Tensor, "*#batch n 2"] | Array,
+        warp: Float[Tensor, "*#batch 3 3"] | Array | None = None,
         plane: Plane | None = None,
     ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
         """Points on the plane.
@@ -100,8 +104,11 @@ class PlaneProjector(nn.Module):
         with torch.autocast(self.geometry.device.type, enabled=False):
             if warp is None and plane is None:
                 return self.geometry()(pixels)
-            camera = self.camera if warp is None else self.camera.warped(warp)
+            camera = self.camera if warp is None else self.camera.warped_by("warp", warp)
             return PlaneMap(camera, self.plane if plane is None else plane)(pixels)
+
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""

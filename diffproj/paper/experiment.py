@@ -10,19 +10,22 @@ import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.arguments import flag
+from diffproj._core.shown import Shown
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.plane import Plane
 from diffproj.lens.models import LensModel
-from diffproj.targets.chessboard import Chessboard
-from diffproj.targets.views import Views
+from diffproj.targets.chessboard import Chessboard, as_board
+from diffproj.targets.views import Views, as_views
 
 
 @dataclass(frozen=True)
@@ -42,8 +45,8 @@ class Row:
     deviation: tuple[float, float, float]
 
 
-@dataclass(frozen=True, eq=False)
-class Experiment:
+@dataclass(frozen=True, eq=False, repr=False)
+class Experiment(Shown):
     """The outcome of the experiment.
 
     Attributes:
@@ -77,17 +80,30 @@ class Experiment:
         rows = [_row(name, errors[measured]) for name, errors, measured in views]
         return [*rows, _row("all", self.errors[self.measured])]
 
+    def to_dict(self) -> dict[str, list[Any]]:
+        """Table 1 as columns of Python's own numbers: `pandas.DataFrame` takes it."""
+        rows = self.rows
+        columns: dict[str, list[Any]] = {"view": [row.view for row in rows], "corners": [row.corners for row in rows]}
+        for axis, name in enumerate(("E_x", "E_y", "E_z")):
+            columns[f"mean_{name}"] = [row.mean[axis] for row in rows]
+            columns[f"deviation_{name}"] = [row.deviation[axis] for row in rows]
+        return columns
+
     def to_csv(self) -> str:
         """Table 1 as comma-separated values, with a header line."""
         text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(
-            ["view", "corners", *(f"{of}_{axis}" for axis in ("E_x", "E_y", "E_z") for of in ("mean", "deviation"))]
-        )
-        for row in self.rows:
-            pairs = zip(row.mean, row.deviation, strict=True)
-            writer.writerow([row.view, row.corners, *(f"{value:.6g}" for pair in pairs for value in pair)])
+        writer, columns = csv.writer(text, lineterminator="\n"), self.to_dict()
+        writer.writerow(columns)
+        for view, corners, *numbers in zip(*columns.values(), strict=True):
+            writer.writerow([view, corners, *(f"{value:.6g}" for value in numbers)])
         return text.getvalue()
+
+    def _facts(self) -> list[str]:
+        mean = ", ".join(f"{value:.3g}" for value in self.rows[-1].mean)
+        return [f"{len(self.fit.views)} views fit", f"{len(self.test.views)} test", f"mean E_x, E_y, E_z {mean}"]
+
+    def _columns(self) -> dict[str, list[Any]]:
+        return self.to_dict()
 
 
 def run_experiment(
@@ -107,6 +123,7 @@ def run_experiment(
         The outcome, in the board's unit.
 
     Raises:
+        TypeError: not views, views and a board in this order, or another argument is of the wrong kind.
         ValueError: views and board do not fit together, or too few views or corners.
         CalibrationError: the fitting views do not determine the camera.
 
@@ -117,6 +134,15 @@ def run_experiment(
         >>> outcome.rows[-1].view, max(outcome.rows[-1].mean) < 0.09  # millimetres
         ('all', True)
     """
+    as_views(fit, "fit")
+    if as_views(test, "test").batch_shape or fit.batch_shape:
+        batch = tuple(fit.batch_shape), tuple(test.batch_shape)
+        raise ValueError(f"fit, test: want views of one camera, got batch shapes {batch[0]} and {batch[1]}")
+    for name, views in (("fit", fit), ("test", test)):
+        if len(views) == 0:
+            raise ValueError(f"{name}: want at least one view, got none")
+    as_board(board)
+    strict = flag("strict", strict)
     calibration = calibrate(fit, board, distortion)
     held_out = torch.zeros(test.pixels.shape[-2], dtype=torch.bool, device=test.device)
     if strict:
@@ -153,9 +179,9 @@ def parse_split(text: str, count: int) -> tuple[list[int], list[int]]:
     """
     try:
         if "/" in text:
-            fit, test = (_positions(part) for part in text.split("/"))
+            fit, test = (_positions(part, count) for part in text.split("/"))
         else:
-            fit = list(range(int(text)))
+            fit = list(range(min(int(text), count + 1)))
             test = list(range(len(fit), count))
     except ValueError:
         raise ValueError(f"split: want a number such as 8, or lists such as 1-5,9/6-8, got {text!r}") from None
@@ -169,11 +195,12 @@ def parse_split(text: str, count: int) -> tuple[list[int], list[int]]:
     return fit, test
 
 
-def _positions(text: str) -> list[int]:
+def _positions(text: str, count: int) -> list[int]:
+    """Positions from 0; of those beyond the last view, one."""
     positions: list[int] = []
     for part in text.split(","):
         first, _, last = part.partition("-")
-        positions += range(int(first) - 1, int(last or first))
+        positions += range(int(first) - 1, min(int(last or first), max(count, int(first) - 1) + 1))
     return positions
 
 

@@ -11,13 +11,17 @@ from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from diffproj._core.numerics import transform
+from diffproj._core.arguments import Array, number
+from diffproj._core.numerics import broadcast_batches, check_same_kind, transform
 from diffproj.geometry.camera import Camera, as_camera
-from diffproj.geometry.plane import Plane
+from diffproj.geometry.plane import Plane, as_plane
 
 
 def paper_route(
-    pixels: Float[Tensor, "*#batch n 2"], camera: Camera | PinholeCamera, plane: Plane, focal_length: float = 1.0
+    pixels: Float[Tensor, "*#batch n 2"] | Array,
+    camera: Camera | PinholeCamera,
+    plane: Plane,
+    focal_length: float = 1.0,
 ) -> Float[Tensor, "*#batch n 3"]:
     """Back-project pixels exactly as the paper does, which has neither a lens nor invalid rays.
 
@@ -31,7 +35,9 @@ def paper_route(
         World points `(*B, N, 3)`; infinite or NaN where `n . v = 0`.
 
     Raises:
-        ValueError: the camera has a lens, which the paper neglects.
+        TypeError: as `back_project`, or the focal length is no number.
+        ValueError: as `back_project`, the camera has a lens, which the paper neglects, or the focal length is not
+            positive.
 
     Example:
         >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
@@ -42,7 +48,11 @@ def paper_route(
     camera = as_camera(camera)
     if camera.distortion is not None:
         raise ValueError("camera: want a pinhole, for the paper neglects the lens; undistort the pixels first")
-    plane = plane.like(camera.K)
+    plane = as_plane(plane).like(camera.K)
+    check_same_kind(camera=camera.K, plane=plane.normal)
+    pixels = camera._checked("pixels", pixels, 2)
+    broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape, pixels=pixels.shape[:-2])
+    focal_length = number("focal_length", focal_length, "a length in world units, above 0", above=0)
     n, d = plane.normal.unsqueeze(-2), plane.offset.unsqueeze(-1)
     R, T = camera.R, camera.t.unsqueeze(-2)
     f_x, f_y = camera.K[..., 0, 0, None], camera.K[..., 1, 1, None]

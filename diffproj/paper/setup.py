@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from diffproj.geometry.camera import Camera
+from diffproj.geometry.camera import Camera, check_lens
 from diffproj.geometry.euler import rotation_from_euler
 from diffproj.lens.protocol import Lens
 from diffproj.targets.chessboard import Chessboard
@@ -70,8 +70,10 @@ def paper_setup(distortion: Lens | None = None) -> PaperSetup:
 
     Example:
         >>> paper_setup().test
-        Camera(batch_shape=(5,), pinhole, size=(640, 480), torch.float64, cpu)
+        Camera(5 cameras, f 700.0, 702.0 px, c 322.0, 238.0 px, pinhole, 640 x 480 px, torch.float64)
     """
+    if distortion is not None:
+        check_lens(distortion)
     board = Chessboard(columns=9, rows=6, square=25.0, axes="paper")
     K = torch.tensor([[700.0, 0, 322], [0, 702, 238], [0, 0, 1]], dtype=torch.float64, device="cpu")
     camera = Camera(K, distortion=distortion, size=(640, 480))

@@ -1,7 +1,5 @@
 """The chessboard target: positions of its inner corners in the world, in the frame of OpenCV or of the paper."""
 
-import math
-import operator
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -9,8 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffproj._core.arguments import choice, instance, number, whole_number
+
 Axes = Literal["opencv", "paper"]
 """The board's two world frames; see `Chessboard`."""
+MOST = 10_000
+"""Inner corners in a row or a column that a board may have, more than any that can be photographed."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,9 @@ class Chessboard:
         axes: `"opencv"` or `"paper"`.
 
     Raises:
-        TypeError: columns or rows are not integers, or square is not a number.
-        ValueError: fewer than 2 columns or rows, a square that is not positive and finite, or unknown axes.
+        TypeError: columns or rows are not integers, square is not a number, or axes no string.
+        ValueError: fewer than 2 columns or rows or more than 10,000, a square that is not positive and finite, or
+            unknown axes.
 
     Example:
         >>> board = Chessboard(columns=4, rows=3, square=10.0)
@@ -55,9 +58,9 @@ class Chessboard:
     def __post_init__(self) -> None:
         object.__setattr__(self, "columns", _count("columns", self.columns))
         object.__setattr__(self, "rows", _count("rows", self.rows))
-        object.__setattr__(self, "square", _length("square", self.square))
-        if self.axes not in get_args(Axes):
-            raise ValueError(f"axes: want one of {', '.join(map(repr, get_args(Axes)))}, got {self.axes!r}")
+        want = "a positive, finite side"
+        object.__setattr__(self, "square", number("square", self.square, want, above=0))
+        choice("axes", self.axes, get_args(Axes))
 
     def __len__(self) -> int:
         """The number of inner corners, N."""
@@ -129,23 +132,15 @@ def origin_doubt(board: Chessboard) -> str:
     )
 
 
+def as_board(board: Chessboard) -> Chessboard:
+    """A board as it is.
+
+    Raises:
+        TypeError: it is none.
+    """
+    return instance("board", board, Chessboard, "a dp.Chessboard", "dp.Chessboard(columns, rows, square) makes one")
+
+
 def _count(name: str, value: object) -> int:
-    try:
-        count = operator.index(value)  # type: ignore[arg-type]  # floats and strings raise TypeError
-    except TypeError:
-        raise TypeError(f"{name}: want a whole number of inner corners, got {value!r}") from None
-    if isinstance(value, bool):
-        raise TypeError(f"{name}: want a whole number of inner corners, got {value!r}")
-    if count < 2:
-        raise ValueError(f"{name}: want at least 2 inner corners (one less than the squares), got {count}")
-    return count
-
-
-def _length(name: str, value: object) -> float:
-    try:
-        length = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise TypeError(f"{name}: want the side of a square as a number, got {value!r}") from None
-    if not (math.isfinite(length) and length > 0):
-        raise ValueError(f"{name}: want a positive, finite side, got {value!r}")
-    return length
+    want = f"at least 2 inner corners (one less than the squares), a whole number up to {MOST:,}"
+    return whole_number(name, value, want, least=2, most=MOST)

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from diffproj.targets.chessboard import Chessboard
+from diffproj._core.arguments import function, whole_number
+from diffproj.targets.chessboard import Chessboard, as_board
 from diffproj.targets.corners import refine_grid
 from diffproj.targets.images import Orientation, Photograph, Source, as_8_bit, grey, listed
 from diffproj.targets.numbering import follow, in_order
@@ -106,15 +107,15 @@ def detect(
         [[69.5, 69.5], [109.5, 69.5]]
     """
     _check_board(board)
-    if progress is not None and not callable(progress):
-        raise TypeError(f"progress: want a function of (done, total), got {type(progress).__name__}")
+    if progress is not None:
+        function("progress", progress, "a function of (done, total)")
     if orientation not in get_args(Orientation):
         raise ValueError(f"orientation: want 'sensor' or 'upright', got {orientation!r}")
     raster: Orientation = "upright" if orientation == "upright" else "sensor"
     if executor is not None and not callable(getattr(executor, "submit", None)):
         raise TypeError(f"executor: want a concurrent.futures.Executor, got {type(executor).__name__}")
-    if frames is not None and (isinstance(frames, bool) or not isinstance(frames, int) or frames < 1):
-        raise ValueError(f"frames: want a whole number from 1 on, got {frames!r}")
+    if frames is not None:
+        frames = whole_number("frames", frames, "a whole number from 1 on", least=1)
     listing = listed(photographs, frames)
     size = _common_size(listing, results_of(functools.partial(_size, orientation=raster), listing, executor))
     find = functools.partial(_find, board=board, orientation=raster)
@@ -164,9 +165,8 @@ def _find(photograph: Photograph, board: Chessboard, orientation: Orientation) -
         raise RuntimeError(f"{photograph.label}: {type(error).__name__} while searching it: {error}") from error
 
 
-def _check_board(board: object) -> None:
-    if not isinstance(board, Chessboard):
-        raise TypeError(f"board: want a Chessboard, got {type(board).__name__}")
+def _check_board(board: Chessboard) -> None:
+    as_board(board)
     if min(board.size) < 3:
         got = f"{board.columns} x {board.rows}"
         raise ValueError(f"board: want at least 3 x 3 inner corners for OpenCV's detector, got {got}")

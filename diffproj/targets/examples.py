@@ -15,6 +15,7 @@ from typing import Literal, get_args
 import cv2
 import numpy as np
 
+from diffproj._core.arguments import choice
 from diffproj._core.atomic import write_whole
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.detection import detect
@@ -49,7 +50,8 @@ def example_views(side: Side | str) -> Views:
         The views, float64, named by their photographs.
 
     Raises:
-        ValueError: another side.
+        TypeError: the side is no string.
+        ValueError: it is another one.
 
     Example:
         >>> views = example_views("left")
@@ -58,8 +60,7 @@ def example_views(side: Side | str) -> Views:
         >>> views[2:5].names
         ('left03.jpg', 'left04.jpg', 'left05.jpg')
     """
-    if side not in get_args(Side):
-        raise ValueError(f"side: want one of {', '.join(map(repr, get_args(Side)))}, got {side!r}")
+    choice("side", side, get_args(Side))
     record = json.loads(
         resources.files("diffproj.targets").joinpath("data", f"{side}.json").read_text(encoding="utf-8")
     )

@@ -154,6 +154,8 @@ def _channels_last(label: str, image: Tensor) -> np.ndarray:
     """An RGB tensor in OpenCV's layout: `(H, W)` or `(H, W, C)` in BGR."""
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[0] not in (1, 3, 4)):
         raise ValueError(f"{label}: want {LAYOUTS}, got a tensor of shape {tuple(image.shape)}")
+    if image.is_meta:
+        raise ValueError(f"{label}: want values, got a tensor on the device meta")
     image = image.detach().cpu()
     array = (image.float() if image.is_floating_point() else image).numpy()
     if array.ndim == 2:

@@ -8,11 +8,12 @@ from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from diffproj._core.numerics import broadcast_batches
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
-from diffproj.targets.target import Target
-from diffproj.targets.views import Views
+from diffproj.targets.target import Target, points_of
+from diffproj.targets.views import Views, as_views
 
 
 def image_residuals(
@@ -28,6 +29,10 @@ def image_residuals(
     Returns:
         Residuals `(*B, V, N, 2)`, zero with zero gradient where not valid; and `valid`: seen, and projected.
 
+    Raises:
+        TypeError: not a camera, views and a target in this order.
+        ValueError: other numbers of poses or corners than the views have.
+
     Example:
         >>> import diffproj as dp
         >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
@@ -35,8 +40,8 @@ def image_residuals(
         >>> torch.equal(error, calibration.residuals)
         True
     """
-    camera = _posed(camera, views)
-    return projected_minus_seen(camera, target.points.to(camera.K), views.pixels.to(camera.K), views.visible)
+    camera, points = _posed(camera, views, target)
+    return projected_minus_seen(camera, points.to(camera.K), views.pixels.to(camera.K), views.visible)
 
 
 def plane_residuals(
@@ -52,6 +57,10 @@ def plane_residuals(
     Returns:
         Residuals `(*B, V, N, 3)`, zero with zero gradient where not valid; and `valid`: seen, and put back.
 
+    Raises:
+        TypeError: not a camera, views and a target in this order.
+        ValueError: other numbers of poses or corners than the views have.
+
     Example:
         >>> import diffproj as dp
         >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
@@ -59,8 +68,8 @@ def plane_residuals(
         >>> bool(valid.all()), bool(error.norm(dim=-1).mean() < 0.2)  # millimetres
         (True, True)
     """
-    camera = _posed(camera, views)
-    return put_back_minus_known(camera, target.points.to(camera.K), views.pixels.to(camera.K), views.visible)
+    camera, points = _posed(camera, views, target)
+    return put_back_minus_known(camera, points.to(camera.K), views.pixels.to(camera.K), views.visible)
 
 
 def projected_minus_seen(
@@ -100,11 +109,17 @@ def put_back_minus_known(
     return torch.where(valid.unsqueeze(-1), landed - points, 0.0), valid
 
 
-def _posed(camera: Camera | PinholeCamera, views: Views) -> Camera:
-    camera = as_camera(camera)
+def _posed(camera: Camera | PinholeCamera, views: Views, target: Target) -> tuple[Camera, Tensor]:
+    """The camera, and the target's points `(N, 3)`, known to fit the views."""
+    camera, views, points = as_camera(camera), as_views(views), points_of(target)
     if camera.batch_shape[-1:] != (len(views),):
         raise ValueError(
             f"camera: want a pose for each of the {len(views)} views, batch shape (*B, {len(views)}), "
             f"got {tuple(camera.batch_shape)}"
         )
-    return camera
+    if len(points) != views.pixels.shape[-2]:
+        raise ValueError(f"views: want {len(points)} corners in each as the target has, got {views.pixels.shape[-2]}")
+    broadcast_batches(camera=camera.batch_shape[:-1], views=views.batch_shape)
+    if camera.K.is_meta != views.pixels.is_meta:
+        raise ValueError(f"camera, views: want both with values, got devices {camera.device} and {views.device}")
+    return camera, points

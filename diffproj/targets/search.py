@@ -26,6 +26,9 @@ HINT = 0.3
 FINEST = 5.5
 """Least mean step in px of a pattern: finer ones are cloth, grilles and screens, whose corners nobody could place."""
 
+NARROWEST = 16
+"""Shorter side in px of an image that is searched: less has no room for a board."""
+
 SMALLEST = 12
 """Corners of the smallest whole pattern that is taken for a board of its own."""
 
@@ -52,6 +55,8 @@ def find_pattern(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Pattern:
     nothing is found. Where a part of a pattern is found, but no board, OpenCV's two detectors are asked as well.
     """
     seen, partial, other_boards = (0, 0), None, []
+    if min(image.shape) < NARROWEST:
+        return Pattern(None)
     for small in _copies(image):
         saddles = saddle_points(small)
         grids = [as_grid(cells, saddles.points) for cells in lattices(saddles)]

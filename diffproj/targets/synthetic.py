@@ -13,6 +13,7 @@ from kornia.filters import gaussian_blur2d
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from diffproj._core.arguments import checked_seed, number, numbers, whole_number
 from diffproj._core.numerics import transform
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.euler import rotation_from_euler
@@ -20,7 +21,7 @@ from diffproj.geometry.grid import pixel_grid
 from diffproj.geometry.intrinsics import pixel_to_normalized
 from diffproj.geometry.plane import Plane
 from diffproj.geometry.rectification import render
-from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.chessboard import Chessboard, as_board
 from diffproj.targets.views import Views
 
 BLACK, WHITE, TABLE = 0.12, 0.88, 0.55
@@ -50,14 +51,18 @@ def board_texture(board: Chessboard, texels: int = 32) -> Texture:
         board: in either frame.
         texels: per side of a square; edges are between texels.
 
+    Raises:
+        TypeError: it is no board, or texels no whole number.
+        ValueError: fewer than 1 texel, or more than 10,000.
+
     Example:
         >>> import diffproj as dp
         >>> texture = board_texture(dp.Chessboard(columns=4, rows=3, square=10.0), texels=2)
         >>> texture.image.shape, texture.extent
         (torch.Size([1, 16, 18]), (-30.0, -30.0, 60.0, 50.0))
     """
-    if texels < 1:
-        raise ValueError(f"texels: want at least 1 along a square, got {texels}")
+    as_board(board)
+    texels = whole_number("texels", texels, "at least 1 along a square", least=1, most=10_000)
     # Indices of squares: 0 follows the first inner corner.
     row, column = (torch.arange(-3, count + 2, device="cpu") for count in (board.rows, board.columns))
     row = row.unsqueeze(-1)
@@ -95,6 +100,7 @@ def photograph(
         Images `(*B, H, W)`.
 
     Raises:
+        TypeError: an argument is of the wrong kind.
         ValueError: the camera has no size, or an argument is out of its range.
 
     Example:
@@ -103,13 +109,11 @@ def photograph(
         >>> photograph(setup.test[0], setup.board).shape
         torch.Size([480, 640])
     """
-    camera = as_camera(camera)
-    if camera.size is None:
-        raise ValueError("camera: want a size, got None; give Camera(..., size=(width, height))")
-    if blur_px < 0 or noise < 0 or not 0 <= vignetting <= 1:
-        given = f"{blur_px}, {noise} and {vignetting}"
-        raise ValueError(f"photograph: want blur_px >= 0, noise >= 0 and vignetting from 0 to 1, got {given}")
-    generator = torch.Generator().manual_seed(seed)
+    camera, board = _sized(camera), as_board(board)
+    blur_px = number("blur_px", blur_px, "a number from 0 to 1000 px", least=0, most=1000)
+    noise = number("noise", noise, "a part of the grey values' range of at least 0", least=0)
+    vignetting = number("vignetting", vignetting, "a number from 0 to 1", least=0, most=1)
+    generator = _generator(seed)
     cameras = [camera] if not camera.batch_shape else [camera[i] for i in _indices(camera.batch_shape)]
     images = []
     for single in cameras:
@@ -123,7 +127,10 @@ def photograph(
             image = gaussian_blur2d(image[None, None], (kernel, kernel), image.new_tensor([[blur_px, blur_px]]))[0, 0]
         image = image + noise * torch.randn(image.shape, generator=generator, dtype=image.dtype, device="cpu")
         images.append((image.clamp(0, 1) * 255).round().to(torch.uint8))
-    return torch.stack(images).reshape(*camera.batch_shape, *images[0].shape)
+    width, height = camera.size or (0, 0)
+    if not images:
+        return torch.zeros(*camera.batch_shape, height, width, dtype=torch.uint8, device="cpu")
+    return torch.stack(images).reshape(*camera.batch_shape, height, width)
 
 
 def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px: float = 0.2, seed: int = 0) -> Views:
@@ -139,7 +146,8 @@ def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px:
         Views `(*B, V, N, 2)`; corners outside the image, or without a valid projection, are marked as not visible.
 
     Raises:
-        ValueError: the camera has no batch axis.
+        TypeError: an argument is of the wrong kind.
+        ValueError: the camera has no batch axis, or negative noise.
 
     Example:
         >>> import diffproj as dp
@@ -147,11 +155,12 @@ def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px:
         >>> corner_views(setup.fit, setup.board).pixels.shape
         torch.Size([10, 54, 2])
     """
-    camera = as_camera(camera)
+    camera, board = as_camera(camera), as_board(board)
+    noise_px = number("noise_px", noise_px, "a standard deviation of at least 0 px", least=0)
     if not camera.batch_shape:
         raise ValueError("camera: want a batch of views (V,), got a single camera; camera.at(R, t) makes one")
     pixels, visible = camera.project(board.points.to(camera.dtype))
-    generator = torch.Generator().manual_seed(seed)
+    generator = _generator(seed)
     pixels = pixels + noise_px * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype, device="cpu")
     if camera.size is not None:
         visible = visible & camera.in_image(pixels)
@@ -178,7 +187,9 @@ def random_cameras(
         seed: of the random draws.
 
     Raises:
-        ValueError: the camera has no size, or too few of the drawn poses have the whole board in view.
+        TypeError: an argument is of the wrong kind.
+        ValueError: the camera has no size, or too few of the drawn poses have the whole board in view, or an argument
+            is out of its range.
 
     Example:
         >>> import diffproj as dp
@@ -186,10 +197,14 @@ def random_cameras(
         >>> random_cameras(setup.fit[0], setup.board, 20).batch_shape
         torch.Size([20])
     """
-    camera = as_camera(camera)
-    if camera.size is None:
-        raise ValueError("camera: want a size, got None; give Camera(..., size=(width, height))")
-    generator = torch.Generator().manual_seed(seed)
+    camera, board = _sized(camera), as_board(board)
+    views = whole_number("views", views, "a number of views from 1 to 100,000", least=1, most=100_000)
+    tilt = number("tilt", tilt, "an angle of at least 0 radians", least=0)
+    want = "(nearest, farthest) in sides of the board, above 0"
+    distance = numbers("distance", distance, want, 2)  # type: ignore[assignment]
+    if min(distance) <= 0:
+        raise ValueError(f"distance: want {want}, got {distance}")
+    generator = _generator(seed)
     points = board.points.to(camera.dtype)
     middle, extent = points.mean(dim=0), float((points.amax(dim=0) - points.amin(dim=0)).amax())
     upright = torch.eye(3, dtype=camera.dtype, device="cpu")
@@ -217,12 +232,30 @@ def random_cameras(
             if len(R) >= views:
                 break
         else:
-            raise ValueError("distance: the camera sees the whole board from hardly any such pose; move it away")
+            raise ValueError(
+                f"distance: want poses from which the whole board is in view, got {len(R)} of {views} views from "
+                f"{100 * 8 * views} poses drawn at {distance[0]:g} to {distance[1]:g} sides of the board; a larger "
+                "distance, a smaller tilt, or a camera with a wider view gives more"
+            )
         rotations.append(R[:views])
         shifts.append(t[:views])
-    R = torch.stack(rotations).reshape(*camera.batch_shape, views, 3, 3)
-    t = torch.stack(shifts).reshape(*camera.batch_shape, views, 3)
+    R = torch.cat([upright.new_zeros(0, 3, 3), *rotations]).reshape(*camera.batch_shape, views, 3, 3)
+    t = torch.cat([upright.new_zeros(0, 3), *shifts]).reshape(*camera.batch_shape, views, 3)
     return (camera if not camera.batch_shape else camera[..., None]).at(R, t)
+
+
+def _sized(camera: Camera | PinholeCamera) -> Camera:
+    """A camera that knows its size."""
+    camera = as_camera(camera)
+    if camera.size is None:
+        raise ValueError("camera: want a size, got None; give Camera(..., size=(width, height))")
+    if camera.K.is_meta:
+        raise ValueError("camera: want one with values, got one on the device meta")
+    return camera
+
+
+def _generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(checked_seed(seed))
 
 
 def _texels(camera: Camera, board: Chessboard) -> int:

@@ -8,12 +8,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffproj._core.arguments import Array, booleans, called, instance, position
 from diffproj._core.batched import Batched, check_index
 from diffproj._core.numerics import broadcast_batches, check_tensor, has_values
+from diffproj._core.shown import counted, in_pixels
 from diffproj.geometry.grid import checked_size
 
-ArrayLike = Tensor | np.ndarray | Sequence[Any]
-"""What tensors are made of here; nested lists become float64."""
+ArrayLike = Tensor | Array
+"""What tensors are made of here."""
 
 
 class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "size")):
@@ -68,7 +70,7 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
             ValueError: shapes or lengths do not fit, devices differ, or a visible corner is not finite (checked where
                 values can be read).
         """
-        points = check_tensor("pixels", _as_tensor("pixels", pixels), "V", "N", 2)
+        points = check_tensor("pixels", pixels, "V", "N", 2)
         mask = _check_visible(visible, points)
         self.names = _check_names(names, points.shape[-3])
         self.size = checked_size(size)
@@ -86,14 +88,18 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
         views.pixels, views.visible, views.names, views.size = pixels, visible, names, size
         return views
 
-    def __repr__(self) -> str:
-        batch = f"{' x '.join(map(str, self.batch_shape))} cameras, " if self.batch_shape else ""
+    def _facts(self) -> list[str]:
         views = f"{len(self)} view{'' if len(self) == 1 else 's'} of {self.pixels.shape[-2]} corners"
         hidden = ""
         if has_values(self.visible) and not self.visible.all():
             hidden = f" ({int((~self.visible).sum())} hidden)"
-        size = f", {self.size[0]} x {self.size[1]} px" if self.size is not None else ""
-        return f"Views({batch}{views}{hidden}{size}, {self.dtype})"
+        return [counted(self.batch_shape, "camera"), views + hidden, in_pixels(self.size), str(self.dtype)]
+
+    def _columns(self) -> dict[str, list[Any]]:
+        seen = self.visible.sum(-1)
+        if self.batch_shape or not has_values(self.visible):
+            return {}
+        return {"view": list(self.names), "corners": seen.tolist()}
 
     # ----------------------------------------------------------------------------------------------- what it is
 
@@ -146,9 +152,7 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
             >>> fit
             Views(5 views of 54 corners (135 hidden), torch.float32)
         """
-        hidden = _as_tensor("mask", mask).to(self.device)
-        if hidden.dtype != torch.bool:
-            raise TypeError(f"mask: want booleans, got {hidden.dtype}")
+        hidden = booleans("mask", mask, self.device).to(self.device)
         try:
             visible = self.visible & ~hidden.expand(self.visible.shape)
         except RuntimeError:
@@ -160,17 +164,27 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
 # ------------------------------------------------------------------------------------------------------ the checks
 
 
-def _as_tensor(name: str, value: Any) -> Tensor:
-    """A tensor as it is, an array with its dtype, and Python's numbers, which have none to defend, as float64."""
-    if isinstance(value, Tensor):
-        return value
-    try:
-        array = np.asarray(value)
-        if array is not value and np.issubdtype(array.dtype, np.integer):
-            array = array.astype(np.float64)
-        return torch.tensor(array, device="cpu")
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name}: want a tensor or an array, got {type(value).__name__} ({error})") from None
+def as_views(views: Views, name: str = "views") -> Views:
+    """Views as they are.
+
+    Raises:
+        TypeError: they are none.
+    """
+    return instance(name, views, Views, "dp.Views", "dp.Views(pixels, size=...) makes them")
+
+
+def view_number(view: int | str, names: Sequence[str]) -> int:
+    """The number of a view, from 0, by its number or its name.
+
+    Raises:
+        TypeError: neither a whole number nor a string.
+        ValueError: there is no such view.
+    """
+    if not isinstance(view, str):
+        return position("view", view, len(names), "views")
+    if view not in names:
+        raise ValueError(f"view: want one of {', '.join(names)}, got {view!r}")
+    return list(names).index(view)
 
 
 def _masked(pixels: Tensor, visible: Tensor) -> Tensor:
@@ -182,9 +196,7 @@ def _check_visible(visible: Any, pixels: Tensor) -> Tensor:
     shape = pixels.shape[-3:-1]
     if visible is None:
         return torch.ones(shape, dtype=torch.bool, device=pixels.device)
-    tensor = _as_tensor("visible", visible)
-    if tensor.dtype != torch.bool:
-        raise TypeError(f"visible: want booleans, got {tensor.dtype}")
+    tensor = booleans("visible", visible)
     if tensor.shape[-2:] != shape:
         raise ValueError(f"visible: want shape (*B, {shape[0]}, {shape[1]}) as pixels, got {tuple(tensor.shape)}")
     if isinstance(visible, Tensor) and tensor.device != pixels.device:
@@ -196,7 +208,7 @@ def _check_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:
     if names is None:
         return tuple(f"view {i}" for i in range(1, count + 1))
     if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
-        raise TypeError(f"names: want {count} strings, got {names!r}")
+        raise TypeError(f"names: want {count} strings, got {called(names)}")
     if len(names) != count:
         raise ValueError(f"names: want {count}, one for each view, got {len(names)}")
     return tuple(names)
@@ -219,11 +231,14 @@ def _positions(index: Any, count: int) -> list[int]:
     index = list(index) if isinstance(index, tuple | range) else index
     check_index(index)
     if isinstance(index, slice):
-        return list(range(count))[index]
+        try:
+            return list(range(count))[index]
+        except (TypeError, ValueError) as error:
+            raise IndexError(f"index: want a slice of whole numbers, got {index!r} ({error})") from None
     try:
-        array = index.detach().cpu().numpy() if isinstance(index, Tensor) else np.asarray(index)
-    except ValueError:
-        raise IndexError(f"index: want a number, a slice, a list of numbers or a mask, got {index!r}") from None
+        array = index.numpy(force=True) if isinstance(index, Tensor) else np.asarray(index)
+    except (TypeError, ValueError, RuntimeError, NotImplementedError):
+        array = np.asarray(None)
     if array.size == 0 and array.ndim == 1:
         return []
     if array.dtype == np.bool_:
@@ -231,8 +246,8 @@ def _positions(index: Any, count: int) -> list[int]:
             raise IndexError(f"index: want a mask of {count} booleans, one for each view, got shape {array.shape}")
         return np.flatnonzero(array).tolist()
     if not np.issubdtype(array.dtype, np.integer) or array.ndim > 1:
-        raise IndexError(f"index: want a number, a slice, a list of numbers or a mask, got {index!r}")
-    for position in array.reshape(-1).tolist():
-        if not -count <= position < count:
-            raise IndexError(f"index: want a view from {-count} to {count - 1}, got {position}")
+        raise IndexError(f"index: want a number, a slice, a list of numbers or a mask, got {called(index)}")
+    for number in array.reshape(-1).tolist():
+        if not -count <= number < count:
+            raise IndexError(f"index: want a view from {-count} to {count - 1}, got {number}")
     return (array.reshape(-1) % max(count, 1)).tolist()

@@ -252,7 +252,7 @@ def test_few_corners_alone_claim_no_more_than_they_know() -> None:
 def test_noise_that_contradicts_the_calibration_is_not_its_own(calibration: dp.Calibration) -> None:
     """Ten times the calibration's noise: its level would make every wrong pose certain."""
     pixels, truth = leaning(pinhole(800.0), marker(120.0), 200, 800.0, (20.0, 20.0), noise=10 * SIGMA)
-    with pytest.warns(dp.AmbiguousPoseWarning):
+    with pytest.warns(dp.AmbiguousPoseWarning), pytest.warns(dp.CameraMismatchWarning, match="times the|exceed the"):
         found = dp.locate(dp.Views(pixels), marker(120.0), calibration)
     wrong = tilt_error(found.alternatives, truth) < tilt_error(found.cameras, truth)
     assert int(wrong.sum()) > 10
@@ -344,7 +344,7 @@ def test_measured_points_hold_the_doubt(plane: dp.Plane, calibration: dp.Calibra
     on = plane.tangents() @ torch.tensor([[0.0, 200, 500], [0, 100, 0]], dtype=D)
     known = middle + on.mT
     # Their own noise is tiny: what is left is the pose's.
-    measured = dp.measure(truth.project(known)[0], found, plane, pixel_sigma=1e-6)
+    measured = dp.measure(truth.project(known)[0], found, plane, view=0, pixel_sigma=1e-6)
     sound = measured.valid & measured.deviations.isfinite().all(-1)
     assert sound.double().mean() > 0.95
     free = plane.normal.abs() < 0.5
@@ -368,7 +368,7 @@ def test_a_point_that_the_other_pose_puts_nowhere_is_not_determined(calibration:
     plane = dp.Plane(camera.R.mT @ down, 50.0 - down @ camera.t)
     u, v = torch.meshgrid(torch.arange(280.0, 920, 40), torch.arange(360.0, 840, 20), indexing="xy")
     seen = torch.stack([u, v], dim=-1).reshape(-1, 2).to(D)
-    measured = dp.measure(seen, found, plane, view)
+    measured = dp.measure(seen, found, plane, view, "detector")
     _, there = dp.back_project(seen, other, plane)
     lost = measured.valid & ~there
     assert bool(lost.any())
@@ -496,7 +496,7 @@ def test_files_of_before_are_read(tmp_path: Path) -> None:
     assert "poses" not in found.message
     assert found.summary()
     assert found.covariance.shared.isfinite().all()
-    assert dp.measure(found.views.pixels[0, :2], found, dp.Plane.z(0.0)).deviations.isfinite().all()
+    assert dp.measure(found.views.pixels[0, :2], found, dp.Plane.z(0.0), view=0).deviations.isfinite().all()
     with pytest.raises(ValueError, match="alternatives: want a calibration that was computed here"):
         _ = found.ambiguous
 

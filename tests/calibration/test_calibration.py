@@ -794,7 +794,15 @@ def test_bad_input_is_refused_by_name() -> None:
         [1.0, 0, 0]
     )
     other = type(
-        "Other", (), {"unproject": None, "dtype": D, "device": torch.device("cpu"), "batch_shape": torch.Size(())}
+        "Other",
+        (),
+        {
+            "unproject": None,
+            "project_direction": None,
+            "dtype": D,
+            "device": torch.device("cpu"),
+            "batch_shape": torch.Size(()),
+        },
     )
     tilted = dp.BrownConrady(torch.tensor([0.0] * 12 + [0.02, 0.03], dtype=D))
     turned = dp.Camera(truth.K[0][[1, 0, 2]], distortion=tilted)
@@ -818,7 +826,7 @@ def test_bad_input_is_refused_by_name() -> None:
             "weights: want finite numbers of at least 0",
             lambda: dp.calibrate(views, board, weights=-torch.ones(54)),
         ),
-        (ValueError, "objective: want one of image, plane", lambda: dp.calibrate(views, board, objective="both")),
+        (ValueError, "objective: want one of 'image', 'plane'", lambda: dp.calibrate(views, board, objective="both")),
         (
             ValueError,
             "bow: want False with objective='plane'",

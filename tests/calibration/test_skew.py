@@ -92,7 +92,7 @@ def test_a_skew_that_ends_at_exactly_0_stays_a_parameter() -> None:
     assert found.camera.K[0, 1] == 0
     assert len(found.shared) == len(found.covariance.names) == 5
     located = dp.locate(views, BOARD, found)
-    measured = dp.measure(views.pixels[0, :3], located, dp.Plane.z(0.0), pixel_sigma=0.2)
+    measured = dp.measure(views.pixels[0, :3], located, dp.Plane.z(0.0), view=0, pixel_sigma=0.2)
     assert measured.covariance.isfinite().all()
 
 
@@ -205,7 +205,7 @@ def test_covariance_of_the_skew_against_sampling() -> None:
     assert abs(float(standard.mean())) < 0.2
     assert 0.9 < float(standard.std()) < 1.1  # measured: 1.00
     clicks = exact[0, [0, 53]] + 0.2 * torch.randn(300, 2, 2, dtype=D, generator=torch.Generator().manual_seed(1))
-    length = dp.measure(clicks, found, dp.Plane.z(0.0), pixel_sigma=0.2).lengths()
+    length = dp.measure(clicks, found, dp.Plane.z(0.0), view=0, pixel_sigma=0.2).lengths()
     off = (length.value[..., 0] - (BOARD.points[53] - BOARD.points[0]).norm()) / length.deviation[..., 0]
     assert 0.9 < float(off.std()) < 1.1
 

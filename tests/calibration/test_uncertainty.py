@@ -208,13 +208,14 @@ def test_few_corners_are_located_with_the_noise_of_the_calibration(corners: int)
     assert float(pooled.double().mean()) > 0.97
     places = torch.tensor([[25.0, 25, 0], [175, 100, 0], [100, 60, 0]], dtype=D)
     pixels = cameras[10].project(places)[0] + SIGMA * torch.randn(600, 3, 2, generator=generator, dtype=D)
-    low, high = dp.measure(pixels, located, dp.Plane.z(0.0)).interval()
+    low, high = dp.measure(pixels, located, dp.Plane.z(0.0), pixel_sigma="detector").interval()
     inside = ((low <= places) & (places <= high))[..., :2].double().mean()
     assert 0.93 < float(inside) < 0.97
     # Corners that are far noisier than the calibration's tell their own noise.
     worse = exact[10:] + 20 * SIGMA * torch.randn(1, 54, 2, generator=generator, dtype=D)
     one = dp.calibrate(dp.Views(noisy[0, :10], size=(640, 480)), BOARD, "brown4")
-    own = dp.locate(dp.Views(worse, size=(640, 480)), BOARD, one)
+    with pytest.warns(dp.CameraMismatchWarning, match="times the calibration's"):
+        own = dp.locate(dp.Views(worse, size=(640, 480)), BOARD, one)
     assert own.pixel_sigma == pytest.approx(20 * SIGMA, rel=0.3)
 
 

@@ -95,9 +95,9 @@ def test_folds_that_did_not_converge_have_no_error() -> None:
 @pytest.mark.plain
 def test_wrong_numbers_and_lenses_are_named() -> None:
     views, board = dp.example_views("left"), dp.Chessboard()
-    with pytest.raises(ValueError, match="folds: want a whole number from 2 to"):
+    with pytest.raises(TypeError, match="folds: want a whole number from 2 to"):
         dp.cross_validate(views, board, folds=2.5)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"draws: want a whole number of at least 2, got 2\.5"):
+    with pytest.raises(TypeError, match=r"draws: want a whole number of at least 2, got 2\.5"):
         dp.bootstrap(views, board, draws=2.5)  # type: ignore[arg-type]
     for function in (dp.cross_validate, dp.bootstrap):
         with pytest.raises(ValueError, match="distortion: want the name of a lens, got 'auto'; calibrate with it"):

@@ -14,7 +14,7 @@ import torch
 
 import diffproj as dp
 from diffproj import cli
-from diffproj.cli import calibrate as calibrate_command
+from diffproj.cli import calibrating
 
 PHOTOGRAPHS = Path(os.environ.get("DIFFPROJ_PHOTOS", "/usr/share/doc/opencv-doc/examples/data"))
 needs_photographs = pytest.mark.skipif(
@@ -47,7 +47,9 @@ def test_calibrate_writes_the_whole_calibration(
     file = tmp_path / "camera.json"
     code, out, err = calibrate(capsys, photographs, "--distortion", "none", "-o", file)
     assert code == 0
-    assert "5.png: found no board with 8 x 5 inner corners; photograph skipped" in one_line(err)
+    left_out, missed = err.splitlines()
+    assert left_out == f"diffproj: {photographs}: skipped 1 file that is no photograph"
+    assert "5.png: found no board with 8 x 5 inner corners; photograph skipped" in missed
     calibration = dp.load_calibration(file)
     assert calibration.views.names == ("1.png", "2.png", "3.png", "4.png", "6.png")
     f_x = calibration.camera.K[0, 0]
@@ -103,13 +105,13 @@ def test_calibrate_names_rejected_corners(
     corner = 11
     shift = torch.zeros(5, 40, 2, dtype=torch.float64)
     shift[2, corner, 0] = 4.0
-    found = calibrate_command.find_corners
+    found = calibrating.find_corners
 
     def spoilt(*arguments: Any, **options: Any) -> dp.Views:
         views = found(*arguments, **options)
         return dp.Views(views.pixels + shift, names=views.names, size=views.size)
 
-    monkeypatch.setattr(calibrate_command, "find_corners", spoilt)
+    monkeypatch.setattr(calibrating, "find_corners", spoilt)
     code, out, _ = calibrate(capsys, folder, *options)
     assert code == 0
     assert "1 corner rejected as outlier\n" in out
@@ -167,7 +169,11 @@ def test_calibrate_refuses_photographs_by_name(
         (["--board", "9x6"], "the following arguments are required: --square"),
         (["--board", "9", "--square", "25"], "--board: want inner corners as COLUMNSxROWS, such as 9x6, got '9'"),
         (["--board", "9x2", "--square", "25"], "--board: want at least 3x3 inner corners"),
-        (["--board", "9x6", "--square", "25mm"], "--square: want the side of a square as a positive number"),
+        (
+            ["--board", "9x6", "--square", "25px"],
+            "--square: want one of the units um, µm, mm, cm, m, in, ft, such as 25mm",
+        ),
+        (["--board", "9x6", "--square", "2,5cm"], "--square: want the side of a square as a positive number"),
         (["--board", "9x6", "--square", "inf"], "--square: want the side of a square as a positive number"),
         (["--board", "9x6", "--square", "25", "--distortion", "brown6"], "invalid choice: 'brown6'"),
         (
@@ -227,7 +233,73 @@ def test_interrupting_is_no_traceback(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(calibrate_command, "find_corners", interrupt)
-    code, _, err = calibrate(capsys, photographs, "-o", tmp_path / "camera.json")
+    monkeypatch.setattr(calibrating, "find_corners", interrupt)
+    code, _, err = calibrate(capsys, photographs / "1.png", "-o", tmp_path / "camera.json")
     assert (code, one_line(err)) == (130, "diffproj: interrupted")
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_no_photograph_in_a_folder_is_left_out_and_told(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, file = tmp_path / "photographs", tmp_path / "camera.json"
+    shutil.copytree(photographs, folder)
+    whole = (folder / "1.png").read_bytes()
+    shutil.copy(folder / "2.png", folder / "copy of 2.png")
+    (folder / "half.png").write_bytes(whole[:100])
+    (folder / "empty.jpg").touch()
+    for name in ("._1.png", ".DS_Store", "film.mp4", "a.HEIC", "b.heic", "c.cr2"):
+        (folder / name).write_bytes(b"something")
+    (folder / "folder.png").mkdir()
+    code, _, err = calibrate(capsys, folder, "--distortion", "none", "-o", file)
+    assert code == 0
+    assert dp.load_calibration(file).views.names == ("1.png", "2.png", "3.png", "4.png", "6.png")
+    told = [
+        line.removeprefix("diffproj: ").replace(f"{folder}/", "").replace(str(folder), "folder")
+        for line in err.splitlines()
+    ]
+    assert told[:2] == [
+        "empty.jpg: cannot be read as an image; skipped",
+        "half.png: cannot be read as an image; skipped",
+    ]
+    assert told[2].startswith("folder: skipped 2 HEIC photographs, which OpenCV does not read: convert to JPEG in full")
+    assert told[3].startswith("folder: skipped 1 raw photograph, which OpenCV does not read: convert to TIFF or PNG")
+    assert told[4] == "folder: skipped 2 hidden files and 2 files that are no photographs"
+    assert told[5] == "copy of 2.png: the same photograph as 2.png; counted once"
+    assert "5.png: found no board" in told[6]
+    assert len(told) == 7
+
+
+def test_the_unit_is_kept(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "camera.json"
+    options = (str(photographs), "--distortion", "none", "--bow", "-o", str(file))
+    code, out, _ = run(capsys, *options, "--board", "8x5", "--square", "2.5cm")
+    assert code == 0
+    assert "board's bow along x, cm" in out
+    assert "world units" not in out
+    calibration = dp.load_calibration(file)
+    assert calibration.unit == "cm"
+    assert float(calibration.points[1, 0]) == 2.5
+
+
+def test_skew_is_fitted(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "camera.json"
+    code, out, _ = calibrate(capsys, photographs, "--distortion", "none", "--skew", "-o", file)
+    assert code == 0
+    assert re.search(r"skew, px +│ +-?[\d.]+ +│ +[\d.]+ +│", out)
+    calibration = dp.load_calibration(file)
+    skew = calibration.camera.K[0, 1]
+    assert 0 < abs(skew) < 5 * calibration.covariance.deviations["skew"]
+
+
+@pytest.mark.parametrize(("name", "start"), [("a.png", b"\x89PNG"), ("a.svg", b"<?xml"), ("a.pdf", b"%PDF")])
+def test_calibrate_draws(
+    name: str, start: bytes, photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / name
+    code, out, _ = calibrate(
+        capsys, photographs, "--distortion", "none", "-o", tmp_path / "camera.json", "--draw", file
+    )
+    assert code == 0
+    assert f"Drawn to {file}\n" in out
+    assert file.read_bytes().startswith(start)

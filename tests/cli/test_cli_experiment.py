@@ -83,7 +83,11 @@ def test_own_photographs(photographs: Path, tmp_path: Path, capsys: pytest.Captu
         (["--board", "8x5"], 1, "--board: want 9x6 for --data, got 8x5"),
         (["--split", "20"], 1, "split: want views from 1 to 13"),
         (["--board", "9x2"], 2, "want at least 3x3 inner corners"),
-        (["--square", "-1"], 2, "--square: want the side of a square as a positive number, such as 25, got '-1'"),
+        (
+            ["--square", "-1"],
+            2,
+            "--square: want the side of a square as a positive number, with its unit or without, such as 25mm, got '-1'",
+        ),
         (["--images", "nowhere.jpg"], 1, "nowhere.jpg"),
     ],
 )

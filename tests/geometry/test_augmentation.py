@@ -151,7 +151,7 @@ def test_bad_input_is_refused_by_name(camera: dp.Camera, lens_camera: dp.Camera)
     projective = eye + torch.tensor([[0.0, 0, 0], [0, 0, 0], [1e-4, 0, 0]], dtype=D)
     cases = [
         (TypeError, "matrix: want torch.float64 as camera has, got torch.float32", camera, eye.float()),
-        (TypeError, "matrix: want a torch.Tensor", camera, None),
+        (TypeError, "matrix: want a tensor, an array or numbers, got None", camera, None),
         (ValueError, r"matrix: want shape \(\*B, 3, 3\)", camera, eye[:2]),
         (ValueError, "matrix: want an invertible one", camera, eye - eye[0]),
         (ValueError, "matrix: want finite values", camera, eye * torch.nan),

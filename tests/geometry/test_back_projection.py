@@ -330,7 +330,11 @@ def test_a_camera_on_the_plane_sees_none_of_it(camera: dp.Camera, pixels: Tensor
 def test_bad_input_is_refused_by_name(camera: dp.Camera, pixels: Tensor) -> None:
     plane = dp.Plane.z(0.0)
     cases = [
-        (TypeError, "pixels: want a torch.Tensor, got ndarray", lambda: dp.back_project(pixels.numpy(), camera, plane)),
+        (
+            TypeError,
+            "pixels: want a tensor, an array or numbers, got 'uv'",
+            lambda: dp.back_project("uv", camera, plane),
+        ),
         (
             TypeError,
             "pixels: want a floating-point tensor, got torch.int64",
@@ -373,3 +377,12 @@ def test_bad_input_is_refused_by_name(camera: dp.Camera, pixels: Tensor) -> None
     for kind, message, call in cases:
         with pytest.raises(kind, match=message):
             call()
+
+
+def test_a_camera_without_a_pose_is_warned_of(camera: dp.Camera, pixels: Tensor) -> None:
+    for lost in (camera.without_pose(), dp.Camera.stack([camera.without_pose()] * 2)):
+        with pytest.warns(UserWarning, match=r"camera: want one with a pose.*calibration.cameras\[view\]"):
+            _, valid = dp.back_project(pixels, lost, dp.Plane.z(0.0))
+        assert not valid.any()
+    dp.back_project(pixels, camera.without_pose(), dp.Plane.z(900.0))  # a wall in front of it
+    dp.back_project(pixels, camera, dp.Plane.z(0.0))

@@ -81,7 +81,7 @@ def test_bad_planes_are_refused_by_name() -> None:
         (TypeError, "normal: want a floating-point tensor", lambda: dp.Plane(up.int(), 1.0)),
         (TypeError, "offset: want torch.float32 as normal has", lambda: dp.Plane(up, torch.tensor(1.0, dtype=D))),
         (ValueError, r"normal: want shape \(\*B, 3\), got \(2,\)", lambda: dp.Plane(up[:2], 1.0)),
-        (TypeError, "normal: want a tensor or numbers, got str", lambda: dp.Plane("up", 1.0)),
+        (TypeError, "normal: want a tensor, an array or numbers, got 'up'", lambda: dp.Plane("up", 1.0)),
         (ValueError, "batch shapes do not broadcast", lambda: dp.Plane(up.expand(2, 3), torch.zeros(3))),
         (ValueError, "per_point: want", lambda: dp.Plane.per_point(up, 1.0)),
         (ValueError, "points: want at least 3, got 2", lambda: dp.Plane.from_points(torch.rand(2, 3))),
@@ -134,7 +134,7 @@ def test_parallels_at_no_distance() -> None:
     for distance in (float("nan"), float("inf"), torch.tensor(float("nan"))):
         with pytest.raises(ValueError, match="distance: want (a )?finite numbers?, got"):
             dp.Plane.z(0.0).parallel(distance)
-    with pytest.raises(TypeError, match="distance: want a number, got"):
+    with pytest.raises(TypeError, match="distance: want a tensor, an array or numbers, got None"):
         dp.Plane.z(0.0).parallel(None)
 
 

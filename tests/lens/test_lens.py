@@ -490,7 +490,7 @@ def test_halves_are_lifted() -> None:
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: BrownConrady([0.0] * 5), TypeError, "coefficients: want a torch.Tensor, got list"),  # type: ignore[arg-type]
+        (lambda: BrownConrady("k1"), TypeError, "coefficients: want a tensor, an array or numbers, got 'k1'"),  # type: ignore[arg-type]
         (lambda: BrownConrady(torch.zeros(5, dtype=torch.int64)), TypeError, "coefficients: want a floating-point"),
         (lambda: BrownConrady(torch.zeros(6)), ValueError, "coefficients: want 4, 5, 8, 12, 14 of them"),
         (lambda: KannalaBrandt(torch.zeros(5)), ValueError, "coefficients: want 4 of them"),
@@ -513,7 +513,7 @@ def test_mistakes_are_named(make: Any, error: type[Exception], message: str) -> 
 def test_lens_from_outside() -> None:
     """A lens that the package does not know: what `Lens` asks for is enough."""
 
-    class Stereographic:
+    class Stereographic(Lens):
         """`rho = 2 f tan(theta / 2)`, with one scale `f`."""
 
         def __init__(self, scale: Tensor):
@@ -555,3 +555,11 @@ def test_lens_from_outside() -> None:
     direction = cone(2.5, 50)
     back = torch.func.vmap(lambda one: one.unproject(one.project_direction(direction)[0])[0])(lens)
     torch.testing.assert_close(back, direction.expand(2, -1, -1))
+    xy = lens[1].project_direction(direction)[0]
+    front = direction[:, 2] > 0
+    undistorted, valid = lens[1].undistort(xy)
+    assert torch.equal(valid, front)
+    torch.testing.assert_close(undistorted[front], direction[front, :2] / direction[front, 2:])
+    again, valid = lens[1].distort(undistorted)
+    assert valid.all()
+    torch.testing.assert_close(again[front], xy[front])

@@ -16,7 +16,7 @@ def calibration() -> dp.Calibration:
 
 
 def test_the_unseen_corner_is_tens_of_times_less_certain(calibration: dp.Calibration) -> None:
-    accuracy = dp.AccuracyMap.over_image(calibration, step=16)
+    accuracy = dp.AccuracyMap.over_image(calibration, step=16, view=0)
     H, W = accuracy.valid.shape
     middle, corner = accuracy.deviation[H // 2, W // 2], accuracy.deviation[0, 0]
     assert accuracy.valid.all()
@@ -30,7 +30,7 @@ def test_the_unseen_corner_is_tens_of_times_less_certain(calibration: dp.Calibra
 
 
 def test_the_grid_reaches_the_edges(calibration: dp.Calibration) -> None:
-    accuracy = dp.AccuracyMap.over_image(calibration, step=50)
+    accuracy = dp.AccuracyMap.over_image(calibration, step=50, view=0)
     assert accuracy.pixels[0, 0].tolist() == [0, 0]
     assert accuracy.pixels[-1, -1].tolist() == [639, 479]
     assert accuracy.pixels.shape == (11, 14, 2)
@@ -68,37 +68,37 @@ def test_the_plane_is_the_image_seen_from_the_other_side(calibration: dp.Calibra
     off = (accuracy.points * torch.tensor([0.05, -0.1, 1.0], dtype=D)).sum(-1) - 3.0
     assert off[accuracy.valid].abs().max() < 1e-9
     view = calibration.views.names.index("left03.jpg")
-    measured = dp.measure(accuracy.pixels[2, 3][None], calibration, table, view=view)
+    measured = dp.measure(accuracy.pixels[2, 3][None], calibration, table, view=view, pixel_sigma="detector")
     worst = torch.linalg.eigvalsh(measured.covariance[0])[-1].sqrt()
     torch.testing.assert_close(accuracy.deviation[2, 3], worst)
 
 
 def test_horizon_and_image_end_the_map(calibration: dp.Calibration) -> None:
     upright = dp.Plane([0.0, 1.0, 0.02], 300.0)
-    accuracy = dp.AccuracyMap.over_image(calibration, upright, step=40)
+    accuracy = dp.AccuracyMap.over_image(calibration, upright, step=40, view=0)
     assert accuracy.valid.any()
     assert not accuracy.valid.all()
     assert torch.equal(accuracy.deviation.isnan(), ~accuracy.valid)
-    far = dp.AccuracyMap.over_plane(calibration, (-5000, -5000, 5000, 5000), shape=(9, 9))
+    far = dp.AccuracyMap.over_plane(calibration, (-5000, -5000, 5000, 5000), shape=(9, 9), view=0)
     assert not far.valid[0, 0]
     assert torch.equal(far.resolution.isnan(), ~far.valid)
 
 
 def test_picture(calibration: dp.Calibration) -> None:
-    image = figures.png(figures.accuracy(dp.AccuracyMap.over_image(calibration, step=32)))
+    image = figures.png(figures.accuracy(dp.AccuracyMap.over_image(calibration, step=32, view=0)))
     assert image[:8] == b"\x89PNG\r\n\x1a\n"
 
 
 @pytest.mark.plain
 def test_bad_input_is_refused_by_name(calibration: dp.Calibration) -> None:
     with pytest.raises(ValueError, match="step: want a positive distance"):
-        dp.AccuracyMap.over_image(calibration, step=0)
+        dp.AccuracyMap.over_image(calibration, step=0, view=0)
     with pytest.raises(ValueError, match="extent: want"):
-        dp.AccuracyMap.over_plane(calibration, (0, 0, 0, 1))
+        dp.AccuracyMap.over_plane(calibration, (0, 0, 0, 1), view=0)
     with pytest.raises(ValueError, match="plane: want one that is a height"):
-        dp.AccuracyMap.over_plane(calibration, (0, 0, 1, 1), dp.Plane([1.0, 0, 0], 0.0))
+        dp.AccuracyMap.over_plane(calibration, (0, 0, 1, 1), dp.Plane([1.0, 0, 0], 0.0), view=0)
     with pytest.raises(ValueError, match=r"plane: want one plane, got batch shape \(2,\)"):
-        dp.AccuracyMap.over_image(calibration, dp.Plane.z(torch.zeros(2, dtype=D)))
+        dp.AccuracyMap.over_image(calibration, dp.Plane.z(torch.zeros(2, dtype=D)), view=0)
     both = dp.calibrate(dp.Views(torch.stack([calibration.views.pixels] * 2), size=(640, 480)), BOARD)
     with pytest.raises(ValueError, match="calibration: want one camera of known size"):
         dp.AccuracyMap.over_image(both)

@@ -53,7 +53,7 @@ def test_deviations_grow_with_what_the_lens_may_do(lens: str) -> None:
     for seed in range(3):
         truth, calibration = centred(lens, seed)
         points, known = dp.back_project(places, truth[0], Z)
-        measured = dp.measure(places, calibration, Z)
+        measured = dp.measure(places, calibration, Z, view=0, pixel_sigma="detector")
         assert measured.extrapolated is not None
         assert measured.extrapolated[:5].all()
         known = known & measured.valid & measured.extrapolated
@@ -65,7 +65,7 @@ def test_deviations_grow_with_what_the_lens_may_do(lens: str) -> None:
         unknown, finite = unknown + int((lost & known).sum()), finite + int((~lost & known).sum())
         assert low.nan_to_num(0.0).tolist() == [0, 0]
         assert (high.isinf() | high.isnan()).all()
-        inside = dp.measure(calibration.views.pixels[3], calibration, Z, view=3)
+        inside = dp.measure(calibration.views.pixels[3], calibration, Z, view=3, pixel_sigma="detector")
         assert inside.extrapolated is not None
         assert not inside.extrapolated.any()
         assert inside.deviations.isfinite().all()
@@ -84,10 +84,10 @@ def test_where_the_lens_is_known_nothing_changes() -> None:
     """The larger deviations are those to first order where errors move points in proportion, and begin smoothly."""
     calibration = independent(dp.calibrate(dp.example_views("left"), BOARD, "brown4"))
     places = torch.rand(100, 2, generator=torch.Generator().manual_seed(5), dtype=D) * torch.tensor([640.0, 480])
-    measured = dp.measure(places, calibration, Z, pixel_sigma=0.0)
+    measured = dp.measure(places, calibration, Z, pixel_sigma=0.0, view=0)
     assert measured.extrapolated is not None
     inside = replace(calibration, lens_region=torch.full((64,), 1e9, dtype=D))
-    first = dp.measure(places, inside, Z, pixel_sigma=0.0)
+    first = dp.measure(places, inside, Z, pixel_sigma=0.0, view=0)
     ratio = measured.deviations[:, :2] / first.deviations[:, :2]
     assert (ratio[~measured.extrapolated] == 1).all()
     assert ((ratio >= 1) & (ratio < 1.02)).all()
@@ -96,12 +96,16 @@ def test_where_the_lens_is_known_nothing_changes() -> None:
 
 def test_it_is_said_and_drawn() -> None:
     _, calibration = centred("brown5", 0)
-    text = dp.measure(torch.tensor([[340.0, 380], [520, 390]], dtype=D), calibration, Z).summary()
+    text = dp.measure(
+        torch.tensor([[340.0, 380], [520, 390]], dtype=D), calibration, Z, view=0, pixel_sigma="detector"
+    ).summary()
     assert "extrapolated" in text.splitlines()[0]
     assert "Extrapolated: outside of the region that the calibration's corners covered" in text
-    middle = dp.measure(torch.tensor([[510.0, 380], [520, 390]], dtype=D), calibration, Z).summary()
+    middle = dp.measure(
+        torch.tensor([[510.0, 380], [520, 390]], dtype=D), calibration, Z, view=0, pixel_sigma="detector"
+    ).summary()
     assert "xtrapolated" not in middle
-    accuracy = dp.AccuracyMap.over_image(dp.calibrate(dp.example_views("left"), BOARD), step=32)
+    accuracy = dp.AccuracyMap.over_image(dp.calibrate(dp.example_views("left"), BOARD), step=32, view=0)
     assert torch.equal(accuracy.extrapolated, accuracy.valid & ~accuracy.covered)
     assert accuracy.extrapolated[0, 0]
     assert 0.3 < float(accuracy.extrapolated.double().mean()) < 0.6
@@ -116,11 +120,14 @@ def test_the_region_is_that_of_the_lens_not_of_the_pose() -> None:
     calibration = dp.calibrate(views[:8], BOARD)
     located = dp.locate(views[8:9], BOARD, calibration)
     everywhere = torch.rand(200, 2, generator=torch.Generator().manual_seed(3), dtype=D) * torch.tensor([640.0, 480])
-    measured, whole = dp.measure(everywhere, located, Z), dp.measure(everywhere, calibration, Z)
+    measured, whole = (
+        dp.measure(everywhere, located, Z, pixel_sigma="detector"),
+        dp.measure(everywhere, calibration, Z, view=0, pixel_sigma="detector"),
+    )
     assert torch.equal(measured.extrapolated, whole.extrapolated)
     assert 0 < int(measured.extrapolated.sum()) < 200
     camera = dp.locate(views[8:9], BOARD, calibration.camera)
-    assert dp.measure(everywhere, camera, Z).extrapolated is None
+    assert dp.measure(everywhere, camera, Z, pixel_sigma="detector").extrapolated is None
     assert dp.measure(everywhere, calibration.cameras[0], Z, pixel_sigma=0.2).extrapolated is None
     assert dp.AccuracyMap.over_image(camera, step=100).covered.all()
 

@@ -186,7 +186,7 @@ def test_bounds_are_the_extremes_over_all_errors_of_that_size() -> None:
     plane = dp.Plane([0.0, 1.0, 0.02], 300.0)
     spread = torch.diag(torch.tensor([1e-6, 1e-6, 1e-6, 1.0], dtype=D))
     pixels = torch.tensor([[320.0, 160.0], [330, 170]], dtype=D)
-    measured = dp.measure(pixels, setup, plane, pixel_sigma=0.5, plane_covariance=spread)
+    measured = dp.measure(pixels, setup, plane, view=0, pixel_sigma=0.5, plane_covariance=spread)
     low, high = measured.lengths().interval()
     noise = measured._noise
     errors = torch.randn(20000, noise.sigma.shape[-1] + 4, generator=torch.Generator().manual_seed(3), dtype=D)
@@ -228,7 +228,7 @@ def test_estimated_from_few_corners(corners: int) -> None:
     noise = 0.3 * torch.randn(1500, 3, 2, generator=torch.Generator().manual_seed(2), dtype=D)
     pixels = posed.project(places)[0] + noise
     truth = places.diff(dim=0).norm(dim=-1)
-    found = dp.measure(pixels, located, Z)
+    found = dp.measure(pixels, located, Z, pixel_sigma="detector")
     assert torch.equal(found.degrees_of_freedom, located.degrees_of_freedom)
     assert found.lengths().degrees_of_freedom.median() == pytest.approx(2 * corners - 6, rel=0.01)
     assert 93 < covered(found.lengths().interval(), truth) < 97

@@ -107,7 +107,7 @@ def test_points_on_the_curve_are_those_of_moved_cameras() -> None:
 
 
 def test_joint_covariance_is_symmetric_and_positive(calibration: dp.Calibration) -> None:
-    measured = dp.measure(calibration.views.pixels[0], calibration, Z, pixel_sigma=0.2)
+    measured = dp.measure(calibration.views.pixels[0], calibration, Z, pixel_sigma=0.2, view=0)
     joint = measured.joint()
     assert joint.shape == (162, 162)
     torch.testing.assert_close(joint, joint.mT, rtol=1e-10, atol=1e-14)
@@ -118,7 +118,7 @@ def test_joint_covariance_is_symmetric_and_positive(calibration: dp.Calibration)
 
 
 def test_quantities_carry_the_joint_covariance(calibration: dp.Calibration) -> None:
-    measured = dp.measure(calibration.views.pixels[0, [0, 8, 53, 45]], calibration, Z)
+    measured = dp.measure(calibration.views.pixels[0, [0, 8, 53, 45]], calibration, Z, view=0)
     joint = measured.joint()
 
     def want(function: object, which: list[int]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -155,33 +155,36 @@ def test_correlations_make_short_lengths_sure(calibration: dp.Calibration) -> No
     start = calibration.views.pixels[0, 20]
     offsets = torch.tensor([0.0, 1e-3, 1e-2, 0.1, 1.0, 10.0], dtype=D)
     pixels = start + torch.stack([offsets, 0 * offsets], dim=-1)
-    exact = dp.measure(pixels, calibration, Z, pixel_sigma=0.0)
+    exact = dp.measure(pixels, calibration, Z, pixel_sigma=0.0, view=0)
     lengths = exact.lengths([[0, i] for i in range(6)])
     ratio = lengths.deviation[1:] / lengths.value[1:]
     assert lengths.deviation[0] == 0
     assert (lengths.deviation[1:] < 0.02 * lengths.value[1:]).all()
     torch.testing.assert_close(ratio[0], ratio[1], rtol=0.01, atol=0)  # in proportion to the length
-    noisy = dp.measure(pixels, calibration, Z).lengths([[0, 1], [0, 5]])
+    noisy = dp.measure(pixels, calibration, Z, view=0, pixel_sigma="detector").lengths([[0, 1], [0, 5]])
     assert noisy.significant.tolist() == [False, True]
-    assert "less than three deviations from 0" in dp.measure(pixels[:2], calibration, Z).summary()
+    assert (
+        "less than three deviations from 0"
+        in dp.measure(pixels[:2], calibration, Z, view=0, pixel_sigma="detector").summary()
+    )
 
 
 def test_points_counted_from_the_end_are_the_same_points(calibration: dp.Calibration) -> None:
-    measured = dp.measure(calibration.views.pixels[0, :3], calibration, Z)
+    measured = dp.measure(calibration.views.pixels[0, :3], calibration, Z, view=0)
 
     def total(points: torch.Tensor) -> torch.Tensor:
         return (points[0] + points[1])[0]
 
     same, ends = measured.quantity(total, [[2, 2]]), measured.quantity(total, [[2, -1]])
     assert torch.equal(same.deviation, ends.deviation)
-    with pytest.raises(IndexError, match="which: want numbers of the 3 points"):
+    with pytest.raises(IndexError, match="pairs: want numbers of the 3 points"):
         measured.lengths([[0, 3]])
     with pytest.raises(ValueError, match="pairs: want point numbers"):
         measured.lengths([[0, 1, 2]])
     with pytest.raises(ValueError, match="pixel_sigma: want finite standard deviations"):
-        dp.measure(calibration.views.pixels[0, :3], calibration, Z, pixel_sigma=-1.0)
+        dp.measure(calibration.views.pixels[0, :3], calibration, Z, pixel_sigma=-1.0, view=0)
     with pytest.raises(ValueError, match="pixel_sigma: want a number or a shape"):
-        dp.measure(calibration.views.pixels[0, :3], calibration, Z, pixel_sigma=torch.ones(2))
+        dp.measure(calibration.views.pixels[0, :3], calibration, Z, pixel_sigma=torch.ones(2), view=0)
 
 
 def test_a_view_by_number_or_name_and_a_camera_alone(calibration: dp.Calibration) -> None:
@@ -215,14 +218,14 @@ def test_a_located_photograph_knows_the_intrinsics_uncertainty() -> None:
     far = torch.tensor([[20.0, 20.0], [620.0, 460.0]], dtype=D)
     sure, unsure = (dp.measure(far, c, Z, view=1, pixel_sigma=0.2).lengths().deviation for c in (held, known))
     assert unsure > 1.1 * sure
-    assert "noise of the pixels and the pose" in dp.measure(far, held, Z, view=1).summary()
-    assert "noise" not in dp.measure(far, known, Z, view=1).summary()
+    assert "noise of the pixels and the pose" in dp.measure(far, held, Z, view=1, pixel_sigma="detector").summary()
+    assert "noise" not in dp.measure(far, known, Z, view=1, pixel_sigma="detector").summary()
 
 
 def test_points_that_are_not_there(calibration: dp.Calibration) -> None:
     away = dp.Plane([0.0, 1.0, 0.05], -400.0)
     pixels = torch.tensor([[320.0, 10.0], [320.0, 470.0], [1e6, 0.0], [torch.nan, 0.0]], dtype=D)
-    measured = dp.measure(pixels, calibration, away)
+    measured = dp.measure(pixels, calibration, away, view=0, pixel_sigma="detector")
     lengths = measured.lengths()
     assert measured.points.isfinite().all()
     assert torch.equal(measured.covariance.isnan().all(-1).all(-1), ~measured.valid)
@@ -249,7 +252,7 @@ def test_what_is_not_determined_is_infinite() -> None:
     finite = torch.where(full.isinf(), 0.0, full)
     scale = finite.diagonal().clamp(min=1e-30).rsqrt()
     assert torch.linalg.eigvalsh(finite * scale * scale[:, None])[0] > -1e-6
-    measured = dp.measure(views.pixels[0, [0, 5]], found, Z)
+    measured = dp.measure(views.pixels[0, [0, 5]], found, Z, view=0)
     joint = measured.joint()
     assert not joint.isnan().any()
     assert joint.diagonal().isinf()[[0, 1, 3, 4]].all()
@@ -264,16 +267,16 @@ def test_batched_and_differentiable() -> None:
     truth = camera.at(posed.R.reshape(2, 8, 3, 3), posed.t.reshape(2, 8, 3))
     views = synthetic.corner_views(truth, BOARD)
     both = dp.calibrate(views, BOARD)
-    measured = dp.measure(views.pixels[:, 1], both, Z, view=1)
+    measured = dp.measure(views.pixels[:, 1], both, Z, view=1, pixel_sigma="detector")
     assert measured.points.shape == (2, 54, 3)
     assert measured.joint().shape == (2, 162, 162)
     for i in range(2):
         alone = dp.calibrate(dp.Views(views.pixels[i], size=views.size), BOARD)
-        single = dp.measure(views.pixels[i, 1], alone, Z, view=1)
+        single = dp.measure(views.pixels[i, 1], alone, Z, view=1, pixel_sigma="detector")
         torch.testing.assert_close(measured.lengths().deviation[i], single.lengths().deviation, rtol=1e-5, atol=0)
 
     def deviation(pixels: torch.Tensor) -> torch.Tensor:
-        found = dp.measure(pixels, both, Z, view=1)
+        found = dp.measure(pixels, both, Z, view=1, pixel_sigma="detector")
         return found.lengths().deviation.sum() + found.points.sum()
 
     assert torch.autograd.gradcheck(deviation, (views.pixels[:, 1, ::27].clone().requires_grad_(),), fast_mode=True)
@@ -301,7 +304,7 @@ def test_bad_input_is_refused_by_name(calibration: dp.Calibration) -> None:
     pixels = calibration.views.pixels[0, :2]
     with pytest.raises(ValueError, match="view: want one of left01.jpg, .* got 'left99.jpg'"):
         dp.measure(pixels, calibration, Z, view="left99.jpg")
-    with pytest.raises(ValueError, match="view: want a number below 13, got 13"):
+    with pytest.raises(ValueError, match="view: want a number from -13 to 12, of the views, got 13"):
         dp.measure(pixels, calibration, Z, view=13)
     with pytest.raises(ValueError, match="pixel_sigma: want the noise of the pixels"):
         dp.measure(pixels, calibration.cameras[0], Z)
@@ -309,35 +312,38 @@ def test_bad_input_is_refused_by_name(calibration: dp.Calibration) -> None:
     with pytest.raises(ValueError, match="view: want one whose pose is known, got 6"):
         dp.measure(pixels, missing, Z, view=6)
     with pytest.raises(ValueError, match="level: want a probability between 0 and 1"):
-        dp.measure(pixels, calibration, Z).lengths().interval(1.0)
+        dp.measure(pixels, calibration, Z, view=0).lengths().interval(1.0)
     with pytest.raises(ValueError, match="points: want at least 3, got 2"):
-        dp.measure(pixels, calibration, Z).angles()
+        dp.measure(pixels, calibration, Z, view=0).angles()
 
 
 def test_deviations_have_finite_gradients(calibration: dp.Calibration) -> None:
     """Also on a plane where one coordinate is exact."""
     pixels = calibration.views.pixels[0, [0, 8, 53]].clone().requires_grad_()
-    total = dp.measure(pixels, calibration, Z).deviations.sum()
+    total = dp.measure(pixels, calibration, Z, view=0, pixel_sigma="detector").deviations.sum()
     (gradient,) = torch.autograd.grad(total, pixels)
     assert gradient.isfinite().all()
     step = torch.zeros_like(pixels)
     step[1, 0] = 1e-3
     with torch.no_grad():
-        up, down = (dp.measure(pixels + sign * step, calibration, Z).deviations.sum() for sign in (1, -1))
+        up, down = (
+            dp.measure(pixels + sign * step, calibration, Z, view=0, pixel_sigma="detector").deviations.sum()
+            for sign in (1, -1)
+        )
     assert float(gradient[1, 0]) == pytest.approx(float(up - down) / 2e-3, rel=1e-4)
 
 
 @pytest.mark.parametrize("matrix", [-1e-2 * torch.eye(4), torch.ones(4, 4).tril(), math.nan * torch.eye(4)])
 def test_a_plane_covariance_that_is_none_is_refused(calibration: dp.Calibration, matrix: torch.Tensor) -> None:
     with pytest.raises(ValueError, match="plane_covariance: want a symmetric matrix without negative eigenvalues"):
-        dp.measure(calibration.views.pixels[0], calibration, Z, plane_covariance=matrix.to(D))
+        dp.measure(calibration.views.pixels[0], calibration, Z, plane_covariance=matrix.to(D), view=0)
 
 
 def test_noise_that_is_none_is_refused_and_no_pixels_give_no_points(calibration: dp.Calibration) -> None:
     for sigma in (math.nan, math.inf, -1.0):
         with pytest.raises(ValueError, match="pixel_sigma: want finite standard deviations of at least 0"):
-            dp.measure(calibration.views.pixels[0], calibration, Z, pixel_sigma=sigma)
-    nothing = dp.measure(calibration.views.pixels[0, :0], calibration, Z)
+            dp.measure(calibration.views.pixels[0], calibration, Z, pixel_sigma=sigma, view=0)
+    nothing = dp.measure(calibration.views.pixels[0, :0], calibration, Z, view=0)
     assert nothing.points.shape == nothing.deviations.shape == (0, 3)
 
 

@@ -53,7 +53,7 @@ def test_error_bars_in_test_views_hold_what_the_fit_leaves_open(views: dp.Views)
     held = dp.locate(views[8:], outcome.board, outcome.fit.camera)
     assert torch.equal(outcome.test.cameras.t, held.cameras.t)
     corners = views.pixels[8, [0, 53]]
-    full, noise_alone = (dp.measure(corners, found, dp.Plane.z(0.0)) for found in (outcome.test, held))
+    full, noise_alone = (dp.measure(corners, found, dp.Plane.z(0.0), view=0) for found in (outcome.test, held))
     assert full.includes_intrinsics
     assert (full.lengths().deviation > noise_alone.lengths().deviation).all()
 

@@ -105,7 +105,7 @@ def test_errors() -> None:
     camera = dp.Camera(setup.fit.K[0])
     with pytest.raises(ValueError, match="camera: want a size"):
         synthetic.photograph(camera, setup.board)
-    with pytest.raises(ValueError, match="vignetting from 0 to 1"):
+    with pytest.raises(ValueError, match="vignetting: want a number from 0 to 1, got 2.0"):
         synthetic.photograph(setup.fit[0], setup.board, vignetting=2.0)
     with pytest.raises(ValueError, match="texels: want at least 1"):
         synthetic.board_texture(setup.board, 0)

@@ -1,0 +1,177 @@
+"""The verdict on a calibration that converged: good or weak, why, and what to photograph next, in plain words.
+
+It looks at what a careful person would: how many views differ, how far the board was tilted, how much of the image its
+corners covered, how surely the focal lengths are known, whether the corners scatter as a detector's do, and whether the
+residuals leave something over. The limits are rules of thumb; error bars hold what each of them costs.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from diffproj.calibration.region import in_region
+from diffproj.geometry.camera import Camera
+from diffproj.geometry.grid import pixel_grid
+
+FEW_VIEWS, ENOUGH_VIEWS = 5, 10
+"""Views that differ below which a calibration is weak, and as many as are asked for then."""
+LOW_TILT = 20.0
+"""Largest tilt of the board against the image, in degrees, below which focal lengths lean on little."""
+ONE_AXIS = 0.05
+"""Spread of the boards' normals about their second axis below which the board was tilted about one only."""
+SMALL_COVER = 0.4
+"""Part of the image inside the corners' region below which most of the lens is guessed."""
+BARE = 0.25
+"""The same of each ninth of the image, below which it is named."""
+UNSURE = 0.01
+"""Deviation of a focal length or the principal point, relative to the focal length, from which on it is unsure."""
+COARSE_PX = 0.5
+"""Scatter of a corner's coordinate above that of a detector in sharp photographs, 0.05 to 0.3 px."""
+ODD = 3.0
+"""Times the median RMS of all views from which on a view is named."""
+OTHER_LENS = "another lens"
+"""What a remark says of residuals that another lens would explain."""
+ACROSS, DOWN = ("left", "", "right"), ("top", "", "bottom")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a verdict goes by, of one camera.
+
+    Attributes:
+        cameras: at the poses of the V views.
+        used: which views have corners that were used `(V,)`.
+        different: how many views differ, those alike counting as one.
+        region: of the corners, as `covered_region` gives it `(64,)`.
+        unsure: the largest deviation of a focal length or the principal point, relative to the focal length; `None`
+            where it is not known.
+        sigma: of a corner's coordinate in px.
+        view_rms: `(V,)` in px.
+        names: of the views.
+        remarks: what the residuals leave over, in words; empty where nothing.
+    """
+
+    cameras: Camera
+    used: Bool[Tensor, " v"]
+    different: float
+    region: Float[Tensor, " directions"] | None
+    unsure: float | None
+    sigma: float
+    view_rms: Float[Tensor, " v"]
+    names: tuple[str, ...]
+    remarks: str
+
+    @property
+    def other_lens(self) -> bool:
+        """Whether the residuals are those of another lens."""
+        return OTHER_LENS in self.remarks
+
+
+def verdict(seen: Evidence) -> str:
+    """Good or weak, why, and what to photograph next, in two or three sentences."""
+    normals = seen.cameras.R[seen.used][..., 2].detach()
+    tilt = float(torch.rad2deg(normals[:, 2].abs().clamp(max=1).acos()).amax())
+    covered = _covered(seen)
+    faults, remedies = _faults(seen, tilt, covered), []
+    one_axis = tilt >= LOW_TILT and seen.different >= 2 and _second_spread(normals) < ONE_AXIS
+    if seen.other_lens:
+        remedies.append("no photograph yet, but the lens model that the remark on the residuals names")
+    if seen.different < FEW_VIEWS:
+        more = ENOUGH_VIEWS - round(seen.different)
+        remedies.append(f"{more} more photographs, the board at other places, distances and tilts")
+    if tilt < LOW_TILT or (seen.unsure is not None and seen.unsure > UNSURE and not seen.other_lens):
+        remedies.append("the board tilted by 20 to 50 degrees, about both axes")
+    elif one_axis:
+        remedies.append("the board tilted about its other axis too")
+    bare = [] if covered is None else _bare(covered)
+    if bare:
+        remedies.append(f"the board in the {_listed(bare)} of the image, up to the edge")
+    if seen.sigma > COARSE_PX and not seen.other_lens:
+        remedies.append("sharper photographs: more light, a camera at rest, a flat print")
+    odd = _odd(seen)
+    if odd:
+        remedies.append(f"another look at {_listed(odd)}, whose corners fit far worse than the others'")
+    text = f"Weak: {'; '.join(faults)}" if faults else f"Good: {_praise(seen, tilt, covered)}"
+    if remedies:
+        text += f". {'Next' if faults else 'Better still'}: {'; '.join(remedies)}"
+    return text + "."
+
+
+def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
+    """What makes it weak."""
+    faults = []
+    count = int(seen.used.sum())
+    if seen.different < FEW_VIEWS:
+        alike = f" of {count}" if round(seen.different) < count else ""
+        number = f"only {round(seen.different)}{alike}"
+        faults.append(f"{number} view{'s differ' if round(seen.different) > 1 else ' tells it'}")
+    if tilt < LOW_TILT:
+        faults.append(f"the board was tilted by {tilt:.0f} degrees at most")
+    if seen.unsure is not None and seen.unsure > UNSURE:
+        known = f"only to {100 * seen.unsure:.1g} %" if math.isfinite(seen.unsure) else "not at all"
+        faults.append(f"focal lengths and principal point are known {known} of the focal length")
+    if covered is not None and float(covered.nanmean()) < SMALL_COVER:
+        faults.append(
+            f"its corners cover {100 * float(covered.nanmean()):.0f} % of the image, the lens is a guess beyond"
+        )
+    if seen.sigma > COARSE_PX and not seen.other_lens:
+        faults.append(
+            f"the corners scatter by {seen.sigma:.2g} px in each coordinate, in sharp photographs by 0.05 to 0.3"
+        )
+    if seen.other_lens:
+        faults.append("this lens model does not fit the lens")
+    return faults
+
+
+def _praise(seen: Evidence, tilt: float, covered: Tensor | None) -> str:
+    where = "" if covered is None else f", cover {100 * float(covered.nanmean()):.0f} % of the image"
+    text = f"{round(seen.different)} views differ{where} and are tilted by up to {tilt:.0f} degrees"
+    if seen.unsure:
+        text += f"; focal lengths and principal point are known to {100 * seen.unsure:.1g} % of the focal length"
+    return f"{text}; corners scatter by {seen.sigma:.2g} px in each coordinate"
+
+
+def _covered(seen: Evidence) -> Tensor | None:
+    """Which of 36 x 48 places of the image the corners surround, 1 or 0; NaN where the lens sees nothing."""
+    size = seen.cameras.size
+    if size is None or seen.region is None:
+        return None
+    grid = pixel_grid(36, 48, seen.region).to(seen.region).flatten(0, 1) + 0.5
+    pixels = grid / grid.new_tensor([48.0, 36.0]) * grid.new_tensor(size) - 0.5
+    _, has_ray = seen.cameras[0].detach().directions(pixels)
+    inside = in_region(pixels, seen.region).to(pixels)
+    return torch.where(has_ray, inside, torch.nan).reshape(36, 48)
+
+
+def _bare(covered: Tensor) -> list[str]:
+    """The ninths of the image that hardly a corner reached, in words."""
+    parts = covered.unflatten(0, (3, 12)).unflatten(-1, (3, 16)).movedim(2, 1).flatten(2).nanmean(-1)
+    return [
+        " ".join(filter(None, (down, across))) or "middle"
+        for row, down in zip(parts.tolist(), DOWN, strict=True)
+        for share, across in zip(row, ACROSS, strict=True)
+        if share < BARE
+    ]
+
+
+def _odd(seen: Evidence) -> list[str]:
+    """Views whose corners fit far worse than the others'."""
+    usual = float(seen.view_rms.nanmedian())
+    return [name for name, rms in zip(seen.names, seen.view_rms.tolist(), strict=True) if rms > ODD * usual > 0]
+
+
+def _second_spread(normals: Tensor) -> float:
+    """Root mean square of the boards' normals along the axis of the image about which they differ least."""
+    xy = (normals * normals[:, 2:].sign())[:, :2]
+    xy = xy - xy.mean(0)
+    return float(torch.linalg.eigvalsh(xy.mT @ xy / len(xy))[0].clamp(min=0).sqrt())
+
+
+def _listed(names: list[str]) -> str:
+    """`a`, `a and b`, `a, b and c`; of many the first four."""
+    names = names if len(names) <= 4 else [*names[:4], f"{len(names) - 4} more"]
+    *most, last = names
+    return f"{', '.join(most)} and {last}" if most else last

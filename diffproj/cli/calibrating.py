@@ -1,0 +1,118 @@
+"""`diffproj calibrate`: from photographs of a chessboard to a camera file."""
+
+import argparse
+import textwrap
+from dataclasses import replace
+
+from rich.markup import escape
+from rich.table import Table
+
+from diffproj.calibration.calibrate import calibrate
+from diffproj.calibration.result import Calibration
+from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
+from diffproj.cli.inputs import check_writable, writing
+from diffproj.cli.photographs import find_corners, photographs
+from diffproj.cli.terminal import RESULTS, aligned, in_options, progress_bars, result, rounded
+from diffproj.files.save import save_camera
+from diffproj.targets.chessboard import Chessboard
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command."""
+    check_writable("--output", options.output)
+    check_drawing(options.draw)
+    columns, rows = options.board
+    board = Chessboard(columns, rows, options.square.value)
+    sources = photographs(options.photographs)
+    check_no_photograph(options.draw, sources)
+    with progress_bars() as bars:
+        views = find_corners(sources, board, bars, orientation=options.orientation)
+        task = bars.add_task("Solving", total=None)
+        calibration = calibrate(
+            views,
+            board,
+            options.distortion,
+            bow=options.bow,
+            skew=options.skew,
+            reject_outliers=options.reject_outliers,
+            progress=lambda done, total: bars.update(task, completed=done, total=total),
+        )
+    calibration = replace(calibration, unit=options.square.unit)
+    if calibration.comparison is not None:
+        result(f"Lenses compared\n{calibration.comparison.summary()}\n")
+    RESULTS.print(_views_table(calibration))
+    result("")
+    RESULTS.print(_parameters_table(calibration))
+    _say_how_it_ended(calibration, options.reject_outliers)
+    if options.draw is not None:
+        from diffproj import figures  # here, for it loads matplotlib
+
+        write_drawing(options.draw, figures.corners(calibration))
+    with writing("--output", options.output):
+        save_camera(options.output, calibration)
+    more = "" if options.output.suffix.lower() == ".json" else "; a .json file would hold the whole calibration"
+    result(f"\nWritten to {options.output}{more}")
+    if options.draw is not None:
+        result(f"Drawn to {options.draw}")
+    return 0
+
+
+def _views_table(calibration: Calibration) -> Table:
+    rejected = calibration.rejected
+    table = Table(title="Views", title_justify="left")
+    table.add_column("view", overflow="fold")
+    table.add_column("corners", justify="right", no_wrap=True)
+    table.add_column("RMS in px", justify="right", no_wrap=True)
+    if bool(rejected.any()):
+        table.add_column("rejected: number (u, v)", no_wrap=True)
+    seen, used = calibration.views.visible.sum(-1).tolist(), calibration.used.sum(-1).tolist()
+    for view, name in enumerate(calibration.views.names):
+        row = [escape(name), f"{used[view]} of {seen[view]}"]
+        row.append(f"{float(calibration.view_rms[view]):.4f}" if used[view] else "left out")
+        if bool(rejected.any()):
+            numbers = rejected[view].nonzero().flatten().tolist()
+            places = calibration.views.pixels[view, numbers].tolist()
+            texts = [f"{number} ({u:.0f}, {v:.0f})" for number, (u, v) in zip(numbers, places, strict=True)]
+            row.append("\n".join("  ".join(texts[i : i + 2]) for i in range(0, len(texts), 2)))
+        table.add_row(*row)
+    return table
+
+
+def _parameters_table(calibration: Calibration) -> Table:
+    values = calibration.shared.tolist()
+    known = calibration.covariance.deviations
+    pairs = [rounded(value, float(deviation)) for value, deviation in zip(values, known.values(), strict=True)]
+    table = Table(title="Camera", title_justify="left")
+    table.add_column("parameter")
+    table.add_column("value", no_wrap=True)
+    table.add_column("standard deviation", no_wrap=True)
+    for name, *pair in zip(known, *(aligned(column) for column in zip(*pairs, strict=True)), strict=True):
+        table.add_row(_title(name, calibration.unit), *pair)
+    return table
+
+
+def _title(name: str, unit: str | None) -> str:
+    """What a parameter is, with its unit."""
+    if name.startswith("bow"):
+        return f"board's bow along {name[-1]}, {unit or 'unit of --square'}"
+    if name == "skew":
+        return "skew, px"
+    titles = {"f": "focal length {}, px", "c": "principal point {}, px"}
+    return titles.get(name[0], "lens {}").format(name)
+
+
+def _say_how_it_ended(calibration: Calibration, reject_outliers: bool) -> None:
+    corners, views = int(calibration.used.sum()), int(calibration.used.any(-1).sum())
+    result(f"\nRMS reprojection error {float(calibration.rms):.4f} px over {corners} corners in {views} views")
+    if reject_outliers:
+        count = int(calibration.rejected.sum())
+        result(f"{count or 'no'} corner{'s' * (count > 1)} rejected as outlier{'s' * (count > 1)}".capitalize())
+    how, *remarks = calibration.message.split("; ")
+    result(f"Solver {how}")
+    for remark in remarks:
+        result(textwrap.fill(_with_unit(in_options(remark[0].upper() + remark[1:]), calibration.unit), 79))
+
+
+def _with_unit(text: str, unit: str | None) -> str:
+    """A remark with the world's unit by its name."""
+    return text if unit is None else text.replace("world units", unit)

@@ -1,0 +1,94 @@
+"""`diffproj measure`: points, lengths and an area on a plane, with error bars, from pixels of a photograph."""
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
+from diffproj.cli.inputs import DETECTOR, HAND
+from diffproj.cli.measure_csv import as_csv
+from diffproj.cli.measure_document import PixelNoise, document
+from diffproj.cli.measure_plane import plane_at_height
+from diffproj.cli.measure_tables import say, shown
+from diffproj.cli.points_file import Pixel, read_points
+from diffproj.cli.scene import Scene, new_photograph, stored_view
+from diffproj.cli.terminal import result
+from diffproj.geometry.plane import Plane
+from diffproj.measurement.measure import measure
+from diffproj.targets.images import grey, listed
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command."""
+    check_drawing(options.draw)
+    if options.photograph is not None:
+        check_no_photograph(options.draw, [options.photograph])
+    given = _given_pixels(options)
+    scene = stored_view(options) if options.view is not None else new_photograph(options)
+    noise = _noise(options, scene)
+    if options.plane is None:
+        plane = plane_at_height(scene, options.height)
+    else:
+        plane = Plane(torch.tensor(options.plane[:3], dtype=torch.float64, device="cpu"), options.plane[3])
+    pixels = torch.tensor([[pixel.u, pixel.v] for pixel in given], dtype=torch.float64, device="cpu")
+    sigma = DETECTOR if noise.source == DETECTOR else noise.sigma
+    measured = measure(pixels, scene.calibration, plane, scene.view, sigma)
+    found = document(scene, plane, noise, given, measured)
+    found["warnings"] = options.warned
+    if options.draw is not None:
+        _draw(options.draw, scene, found)
+    if options.json:
+        result(json.dumps(found, indent=1, allow_nan=False))
+    elif options.csv:
+        result(as_csv(found).rstrip())
+    else:
+        say(found, scene)
+        if options.draw is not None:
+            result(f"\nDrawn to {options.draw}")
+    return 0
+
+
+def _given_pixels(options: argparse.Namespace) -> list[Pixel]:
+    """The pixels to measure, named by their numbers where they have no names."""
+    if options.points_file is not None:
+        return read_points(options.points_file)
+    return [Pixel(str(number), u, v) for number, (u, v) in enumerate(options.points, start=1)]
+
+
+def _noise(options: argparse.Namespace, scene: Scene) -> PixelNoise:
+    """The noise of the pixels: that of the option, or of points picked by hand."""
+    if options.pixel_sigma is None:
+        return PixelNoise(HAND, "hand")
+    if options.pixel_sigma != DETECTOR:
+        return PixelNoise(options.pixel_sigma, "option")
+    known = scene.calibration.pixel_sigma
+    if known is None or not math.isfinite(known):
+        raise ValueError(f"--pixel-sigma: want a number of px, for {options.camera} does not tell the detector's noise")
+    return PixelNoise(float(known), DETECTOR)
+
+
+def _draw(path: Path, scene: Scene, found: dict[str, Any]) -> None:
+    """Draw what was measured into the photograph."""
+    from diffproj import figures  # here, for it loads matplotlib
+
+    figure = figures.measured(
+        scene.calibration,
+        scene.view,
+        [row["pixel"] for row in found["points"]],
+        [row["name"] if row["valid"] else f"{row['name']} (not on the plane)" for row in found["points"]],
+        [_length_in_words(length, scene.square.unit) for length in found["lengths"]],
+        photograph=None if scene.photograph is None else grey(listed(scene.photograph)[0], options.orientation),
+        title=f"{found['view']}: {found['plane_in_words']}",
+    )
+    write_drawing(path, figure)
+
+
+def _length_in_words(length: dict[str, Any], unit: str | None) -> str:
+    """`199.9 ± 0.2 mm`; empty where the length is not known."""
+    value, deviation, _ = shown(length)
+    known = f" ± {deviation}" if length["deviation"] is not None else ""
+    return "" if length["value"] is None else f"{value}{known}" + (f" {unit}" if unit else "")

@@ -1,0 +1,137 @@
+"""Kalibr's `camchain.yaml`, and the `sensor.yaml` of EuRoC, which has one camera in the same terms.
+
+`pinhole` with `radtan` (k1 k2 p1 p2) or `equidistant` (Kannala-Brandt); integer pixel centres; `resolution` is width,
+height. `T_cam_imu` takes IMU to camera, so the world is the IMU; without it, `T_cn_cnm1` takes the camera before to
+this one, and the world is the first camera. `T_imu_cam`, `T_BS` and `body_T_cam0` run the other way.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from diffproj.calibration.result import Calibration
+from diffproj.files.document import Document
+from diffproj.files.found import Found
+from diffproj.files.lenses import coefficients, first_brown, is_fisheye, kind_of, lens_of
+from diffproj.files.numbers import camera_of, focal_lengths, image_size, inverse, matrix, rigid, vector
+from diffproj.files.writing import cameras_of, number_text, numbers_text
+from diffproj.geometry.camera import Camera
+
+Pose = tuple[np.ndarray, np.ndarray]
+INTO_CAMERA = ("T_cam_imu",)
+FROM_CAMERA = ("T_imu_cam", "T_BS")
+
+
+def recognises(document: Document) -> bool:
+    """Whether `cam0` or the file itself has `intrinsics` with a model of camera or lens."""
+    return bool(_cameras(document.mapping))
+
+
+def read(document: Document) -> Found:
+    """The cameras, each at its pose.
+
+    Raises:
+        ValueError: a camera that is neither `pinhole` nor ours, or poses of only some.
+    """
+    cameras = _cameras(document.mapping)
+    poses = _poses(cameras)
+    return Found({name: _camera(name, fields, poses.get(name)) for name, fields in cameras.items()})
+
+
+def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
+    """Cameras with their poses, the world in the place of the IMU.
+
+    Raises:
+        ValueError: a lens that Kalibr does not have, skew, or no size.
+    """
+    lines = []
+    for i, camera in enumerate(cameras_of(item, "Kalibr")):
+        if camera.size is None:
+            raise ValueError("size: want the size of the image, which Kalibr needs; Camera(..., size=(width, height))")
+        model = "equidistant" if is_fisheye(camera) else "none" if camera.distortion is None else "radtan"
+        lens = coefficients(camera) if model != "radtan" else first_brown(camera, 4, "Kalibr's radtan")
+        (f_x, _, c_x), (_, f_y, c_y), _ = camera.K.tolist()
+        rows = np.vstack([np.column_stack([camera.R.numpy(), camera.t.numpy()]), [0, 0, 0, 1]]).tolist()
+        lines += [f"cam{i}:", "  T_cam_imu:", *(f"  - {numbers_text(row)}" for row in rows)]
+        lines += ["  cam_overlaps: []", "  camera_model: pinhole", f"  distortion_coeffs: {numbers_text(lens)}"]
+        lines += [f"  distortion_model: {model}", f"  intrinsics: {numbers_text([f_x, f_y, c_x, c_y])}"]
+        lines += [f"  resolution: [{camera.size[0]}, {camera.size[1]}]", f"  rostopic: /cam{i}/image_raw"]
+        lines += [f"  timeshift_cam_imu: {number_text(0.0)}"]
+    return {path: "\n".join(lines) + "\n"}
+
+
+def _cameras(tree: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    def fits(fields: Any) -> bool:
+        return (
+            isinstance(fields, dict)
+            and isinstance(fields.get("intrinsics"), list)
+            and ("camera_model" in fields or "distortion_model" in fields)
+        )
+
+    if fits(tree):
+        return {"cam0": tree}
+    return {name: fields for name, fields in tree.items() if fits(fields)}
+
+
+def _camera(name: str, fields: dict[str, Any], pose: Pose | None) -> Camera:
+    model = fields.get("camera_model", "pinhole")
+    if model != "pinhole":
+        raise ValueError(
+            f"{name}, camera_model: want pinhole, got {model!r}, whose equations no lens of this package has; "
+            "calibrate with pinhole-radtan or pinhole-equi"
+        )
+    if "distortion_model" not in fields:
+        raise ValueError(f"{name}: want a distortion_model, got none")
+    kind = kind_of(f"{name}, distortion_model", fields["distortion_model"])
+    key = "distortion_coeffs" if "distortion_coeffs" in fields else "distortion_coefficients"
+    if key not in fields and kind != "none":
+        raise ValueError(f"{name}: want distortion_coeffs, got none")
+    lens = matrix(f"{name}, {key}", fields.get(key, [])).ravel().tolist()
+    if kind is None or (kind == "brown" and len(lens) not in (4, 5)) or (kind == "fisheye" and len(lens) != 4):
+        raise ValueError(f"{name}, {key}: want 4 coefficients of {fields['distortion_model']}, got {len(lens)}")
+    f_x, f_y, c_x, c_y = vector(f"{name}, intrinsics", fields["intrinsics"], (4,))
+    width, height = None, None
+    if fields.get("resolution") is not None:
+        width, height = vector(f"{name}, resolution", fields["resolution"], (2,))
+    size = image_size(width, height, f"{name}, resolution")
+    return camera_of(focal_lengths(f_x, f_y, c_x, c_y), lens_of(kind, lens), size, pose)
+
+
+def _poses(cameras: dict[str, dict[str, Any]]) -> dict[str, Pose]:
+    """The poses by name; empty where the file has none."""
+    poses: dict[str, Pose] = {}
+    before: Pose | None = None
+    for i, (name, fields) in enumerate(cameras.items()):
+        own = _own_pose(name, fields)
+        if own is None and fields.get("T_cn_cnm1") is not None:
+            if i == 0:
+                raise ValueError(f"{name}, T_cn_cnm1: want a camera before the first one, got none")
+            R, t = rigid(f"{name}, T_cn_cnm1", fields["T_cn_cnm1"])
+            R_before, t_before = (np.eye(3), np.zeros(3)) if before is None else before
+            if before is None and i > 1:
+                raise ValueError(f"{name}, T_cn_cnm1: want a pose of the camera before, got none")
+            if before is None:
+                poses[next(iter(cameras))] = np.eye(3), np.zeros(3)
+            own = R @ R_before, R @ t_before + t
+        if own is not None:
+            poses[name] = own
+        before = own
+    if poses and len(poses) < len(cameras):
+        bare = ", ".join(name for name in cameras if name not in poses)
+        raise ValueError(f"{bare}: want T_cam_imu or T_cn_cnm1 as the other cameras have, got neither")
+    return poses
+
+
+def _own_pose(name: str, fields: dict[str, Any]) -> Pose | None:
+    for key, value in fields.items():
+        if value is None or key == "T_cn_cnm1" or not (key.startswith("T_") or "_T_" in key):
+            continue
+        if key in INTO_CAMERA:
+            return rigid(f"{name}, {key}", value)
+        if key in FROM_CAMERA or key.startswith("body_T_cam"):
+            return inverse(rigid(f"{name}, {key}", value))
+        raise ValueError(
+            f"{name}, {key}: want T_cam_imu or T_imu_cam as the pose, got a transformation of another name"
+        )
+    return None

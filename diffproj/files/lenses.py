@@ -1,0 +1,133 @@
+"""Lenses by the names that files give them; what is no lens of this package is refused by name.
+
+Equal to Brown-Conrady or to Kannala-Brandt are only those named here: under other names stand other equations.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+from diffproj.files.numbers import as_tensor, number
+from diffproj.geometry.camera import Camera
+from diffproj.lens.brown_conrady import BrownConrady
+from diffproj.lens.kannala_brandt import KannalaBrandt
+
+Kind = Literal["none", "brown", "fisheye"]
+
+_BROWN = (
+    *("plumb_bob", "radtan", "radial_tangential", "brown", "brown_conrady", "rational_polynomial", "rational"),
+    *("brown4", "brown5", "brown8", "brown12", "brown14", "opencv", "opencv4", "opencv5", "opencv8", "full_opencv"),
+)
+_FISHEYE = (
+    "equidistant",
+    "fisheye",
+    "kannala_brandt",
+    "kannala_brandt4",
+    "kannala_brandt8",
+    "kb4",
+    "kannalabrandt8",
+    "equi",
+    "opencv_fisheye",
+)
+KINDS_BY_NAME: dict[str, Kind] = {
+    **dict.fromkeys(("none", "simple_pinhole"), "none"),
+    **dict.fromkeys(_BROWN, "brown"),
+    **dict.fromkeys(_FISHEYE, "fisheye"),
+}
+"""What a lens of a file is here; the names in lower case, with `_` between words."""
+
+PERSPECTIVE = ("pinhole", "perspective", "standard", "frame", "normal", "monocular", "mono")
+"""Names of cameras that tell nothing of the lens but that it is no fisheye."""
+
+COUNTS = BrownConrady.counts
+
+
+def kind_of(name: str, value: object) -> Kind | None:
+    """Which lens a file's model is; `None` where it says no more than that the camera is perspective.
+
+    Args:
+        name: of the key, for the message.
+        value: what the file says.
+
+    Raises:
+        ValueError: a model that is none of this package's.
+    """
+    if isinstance(value, bool) or (isinstance(value, int) and value in (0, 1)):  # fisheye_model: 0
+        return "fisheye" if value else "brown"
+    model = str(value).strip().lower().replace("-", "_").replace(" ", "_")
+    if model in PERSPECTIVE:
+        return None
+    if model not in KINDS_BY_NAME:
+        raise ValueError(
+            f"{name}: want a model equal to OpenCV's perspective or fisheye one, got {value!r}, which is neither; "
+            "calibrate again with one of them"
+        )
+    return KINDS_BY_NAME[model]
+
+
+def brown(coefficients: Sequence[float]) -> BrownConrady:
+    """A Brown-Conrady lens of 4, 5, 8, 12 or 14 coefficients in OpenCV's order."""
+    return BrownConrady(as_tensor(coefficients))
+
+
+def fisheye(coefficients: Sequence[float]) -> KannalaBrandt:
+    """A Kannala-Brandt lens of k1 to k4."""
+    return KannalaBrandt(as_tensor(coefficients))
+
+
+def lens_of(kind: Kind, coefficients: Sequence[float]) -> BrownConrady | KannalaBrandt | None:
+    """The lens of that kind; of no coefficients, a pinhole.
+
+    Raises:
+        ValueError: the kind has another number of coefficients.
+    """
+    if kind == "fisheye":
+        if len(coefficients) != 4:
+            raise ValueError(f"distortion: want the 4 coefficients of a fisheye lens, got {len(coefficients)}")
+        return fisheye(coefficients)
+    if not coefficients:
+        return None
+    if kind == "none" and any(coefficients):
+        raise ValueError(f"distortion: want no coefficients as the model says, got {list(coefficients)}")
+    if len(coefficients) not in COUNTS:
+        raise ValueError(f"distortion: want {', '.join(map(str, COUNTS))} coefficients, got {len(coefficients)}")
+    return brown(coefficients)
+
+
+def unused(name: str, value: object, why: str) -> None:
+    """Check that a coefficient which the lenses of this package lack is 0.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if value is not None and number(name, value) != 0:
+        raise ValueError(f"{name}: want 0, got {value}: {why}")
+
+
+def coefficients(camera: Camera) -> list[float]:
+    """The coefficients of one camera's lens; empty of a pinhole.
+
+    Raises:
+        ValueError: a lens of another package.
+    """
+    lens = camera.distortion
+    if lens is not None and type(lens) not in (BrownConrady, KannalaBrandt):
+        raise ValueError(f"distortion: want a BrownConrady or KannalaBrandt lens, got {type(lens).__name__}")
+    return [] if lens is None else lens.coefficients.tolist()  # type: ignore[attr-defined]
+
+
+def is_fisheye(camera: Camera) -> bool:
+    """Whether the lens is Kannala-Brandt."""
+    return isinstance(camera.distortion, KannalaBrandt)
+
+
+def first_brown(camera: Camera, count: int, what: str) -> list[float]:
+    """The first coefficients of a perspective lens, filled up with 0, where the others are 0.
+
+    Raises:
+        ValueError: one of the others is not 0, so that `what` cannot hold the lens.
+    """
+    found = coefficients(camera)
+    if is_fisheye(camera) or any(found[count:]):
+        kind = "a fisheye lens" if is_fisheye(camera) else f"coefficients beyond the first {count}"
+        raise ValueError(f"distortion: want a lens that {what} holds, got {kind}")
+    return [*found, *[0.0] * (count - len(found))][:count]

@@ -1,0 +1,129 @@
+"""MATLAB's camera parameters: `save` and `jsonencode` of `toStruct(cameraParams)`; Bouguet's toolbox, `.mat` and `.m`.
+
+`IntrinsicMatrix` is transposed, `K` is not; both are one-based: 1 is taken off the principal point. `RadialDistortion`
+is k1 k2 and perhaps k3, `TangentialDistortion` p1 p2, `ImageSize` height, width. Bouguet's `fc cc kc alpha_c nx ny` are
+zero-based, with OpenCV's coefficients; `om` and `T` place the right camera beside the left one.
+"""
+
+import re
+from typing import Any
+
+import cv2
+import numpy as np
+
+from diffproj.files import mat5
+from diffproj.files.document import Document
+from diffproj.files.found import Found
+from diffproj.files.lenses import brown
+from diffproj.files.numbers import camera_of, focal_lengths, image_size, intrinsics, matrix, vector
+from diffproj.geometry.camera import Camera
+
+HDF5 = b"\x89HDF"
+TO_STRUCT = "s = toStruct(cameraParams); save('camera.mat', '-struct', 's', '-v7')"
+
+
+def recognises(document: Document) -> bool:
+    """Whether it is a `.mat` file, or has MATLAB's or Bouguet's names."""
+    if document.data.startswith((b"MATLAB", HDF5)):
+        return True
+    tree = document.mapping
+    return _is_struct(tree) or any(_is_struct(value) for value in tree.values()) or _is_bouguet_text(document)
+
+
+def read(document: Document) -> Found:
+    """The camera, or Bouguet's stereo pair.
+
+    Raises:
+        ValueError: it holds MATLAB's objects, or something is missing or not understood.
+    """
+    if document.data.startswith(HDF5) or (b"MAT-file" in document.data[:30] and b"7.3" in document.data[:30]):
+        raise ValueError(f"want a .mat file of version 7, got one of 7.3 (HDF5); in MATLAB: {TO_STRUCT}")
+    if document.data.startswith(b"MATLAB"):
+        fields = mat5.variables(document.data)
+    elif _is_bouguet_text(document):
+        fields = _assignments(document.text or "")
+    else:
+        fields = document.mapping
+    if "fc" in fields or "fc_left" in fields:
+        return _bouguet(fields)
+    structs = {name: value for name, value in {"": fields, **fields}.items() if _is_struct(value)}
+    if not structs:
+        if any(isinstance(value, mat5.Unreadable) for value in fields.values()):
+            raise ValueError(f"want numbers, got an object, which only MATLAB opens; there: {TO_STRUCT}")
+        raise ValueError(f"want K or IntrinsicMatrix, or Bouguet's fc and cc, got {', '.join(fields) or 'nothing'}")
+    return Found({name or "camera": _camera(value) for name, value in structs.items()})
+
+
+def _is_struct(fields: Any) -> bool:
+    return isinstance(fields, dict) and "RadialDistortion" in fields
+
+
+def _is_bouguet_text(document: Document) -> bool:
+    return re.search(r"^\s*fc(_left)?\s*=\s*\[", document.text or "", re.MULTILINE) is not None
+
+
+def _camera(fields: dict[str, Any]) -> Camera:
+    if "IntrinsicMatrix" not in fields and "K" not in fields and "FocalLength" in fields:
+        (f_x, f_y), (c_x, c_y) = (vector(key, fields[key], (2,)) for key in ("FocalLength", "PrincipalPoint"))
+        K = focal_lengths(f_x, f_y, c_x, c_y, _scalar("Skew", fields.get("Skew", 0.0)))
+    elif "K" in fields:
+        K = intrinsics("K", fields["K"], skew=True).copy()
+    elif "IntrinsicMatrix" in fields:
+        K = intrinsics("IntrinsicMatrix", matrix("IntrinsicMatrix", fields["IntrinsicMatrix"]).T, skew=True).copy()
+    else:
+        raise ValueError("want K, IntrinsicMatrix or FocalLength beside RadialDistortion, got none")
+    K[:2, 2] -= 1
+    radial = vector("RadialDistortion", fields["RadialDistortion"], (2, 3))
+    if "TangentialDistortion" not in fields:
+        raise ValueError("want TangentialDistortion beside RadialDistortion, got none")
+    tangential = vector("TangentialDistortion", fields["TangentialDistortion"], (2,))
+    size = None
+    if "ImageSize" in fields and np.size(matrix("ImageSize", fields["ImageSize"])):
+        height, width = vector("ImageSize", fields["ImageSize"], (2,))
+        size = image_size(width, height)
+    return camera_of(K, brown([*radial[:2], *tangential, *radial[2:]]), size)
+
+
+def _bouguet(fields: dict[str, Any]) -> Found:
+    sides = ("_left", "_right") if "fc_left" in fields else ("",)
+    cameras = {side.strip("_") or "camera": _bouguet_camera(fields, side, None) for side in sides}
+    if len(sides) == 2:
+        if "om" not in fields or "T" not in fields:
+            raise ValueError("want om and T from the left camera to the right one, got none")
+        om, t = (np.array(vector(key, fields[key], (3,))) for key in ("om", "T"))
+        cameras["right"] = _bouguet_camera(fields, "_right", (cv2.Rodrigues(om)[0], t))
+    return Found(cameras)
+
+
+def _bouguet_camera(fields: dict[str, Any], side: str, pose: Any) -> Camera:
+    for key in ("fc", "cc", "kc"):
+        if key + side not in fields:
+            raise ValueError(f"want {key + side}, got none")
+    (f_x, f_y), (c_x, c_y) = (vector(key, fields[key + side], (2,)) for key in ("fc", "cc"))
+    skew = _scalar("alpha_c", fields.get("alpha_c" + side, 0.0)) * f_x
+    width, height = (None if key not in fields else _scalar(key, fields[key]) for key in ("nx", "ny"))
+    size = image_size(width, height)
+    return camera_of(
+        focal_lengths(f_x, f_y, c_x, c_y, skew), brown(vector("kc", fields["kc" + side], (4, 5))), size, pose
+    )
+
+
+def _scalar(name: str, value: Any) -> float:
+    array = matrix(name, value if isinstance(value, list | np.ndarray) else [value])
+    if array.size != 1:
+        raise ValueError(f"{name}: want one number, got {array.size}")
+    return float(array.ravel()[0])
+
+
+def _assignments(text: str) -> dict[str, Any]:
+    """The numbers of lines such as `fc = [ 657.3 ; 657.7 ];`, without those that are computed."""
+    fields: dict[str, Any] = {}
+    for name, inside, alone in re.findall(r"^\s*(\w+)\s*=\s*(?:\[([^\]]*)\]|([-+.\deE]+))\s*;", text, re.MULTILINE):
+        try:
+            numbers = [float(word) for word in re.split(r"[\s;,]+", (inside or alone).strip()) if word]
+        except ValueError:
+            continue
+        if name in fields:
+            raise ValueError(f"{name}: want the variable once, got it twice")
+        fields[name] = numbers
+    return fields

@@ -1,0 +1,279 @@
+"""Cameras by the names that K, lens and size have in files: those of OpenCV's programs, and those of the wild.
+
+Several cameras of one file have a label in front of or behind the name: `M1 D1 M2 D2`, `left_K`, `cam1_intrinsics`.
+A key that looks as if it held a lens and is not understood is an error: a lens is never dropped.
+"""
+
+import re
+from typing import Any
+
+import numpy as np
+
+from diffproj.files.found import Found
+from diffproj.files.lenses import Kind, brown, kind_of, lens_of
+from diffproj.files.numbers import camera_of, described, image_size, intrinsics, matrix, rigid, shape_of, square
+from diffproj.geometry.camera import Camera
+from diffproj.lens.brown_conrady import BrownConrady
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+MATRICES = _words(
+    "cameramatrix cameramat cammatrix cammat cammtx mtx matrix k kmatrix cm m intrinsic intrinsics intrinsicmatrix "
+    "intrinsicsmatrix intrinsicparameters cameraintrinsic cameraintrinsics cameraintrinsicmatrix"
+)
+"""Names of K in lower case, without what stands between words."""
+
+LENSES = _words(
+    "distortioncoefficients distortioncoefficient distortioncoefficents distortioncoeffs distortioncoeff distcoeffs "
+    "distcoeff distcoefs distcoef dist d distortion distortions distorsion distortionvector distortionparameters "
+    "distortioncoeficients distcoefficients kc"
+)
+SIZES = _words("cameraresolution imagesize imgsize resolution size framesize imageresolution")
+SIDES = (("imagewidth", "imageheight"), ("imgwidth", "imgheight"), ("width", "height"))
+MODELS = _words(
+    "distortionmodel cameramodel modeltype lensmodel fisheyemodel fisheye isfisheye distortiontype cameratype"
+)
+OMNIDIRECTIONAL = _words("xi mirrorparameters alpha gamma1 gamma2")
+COEFFICIENTS = _words("k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4 taux tauy r1 r2 t1 t2")
+
+_LABEL = re.compile(
+    r"(?:(?P<front>left|right|cam\d*|camera\d+|proj|projector|rgb|colou?r|depth|ir|l|r)_)?"
+    r"(?P<core>.+?)"
+    r"(?:_?(?P<back>\d+|left|right)|_(?P<side>l|r))?"
+)
+
+
+def read(mapping: dict[str, Any], four_is_brown: bool = True) -> Found:
+    """The cameras of a mapping.
+
+    Args:
+        mapping: of a file; values as in `numbers.matrix`.
+        four_is_brown: whether 4 coefficients under the name of OpenCV's own programs are Brown-Conrady where nothing
+            names the model: these programs write it where it is another.
+
+    Raises:
+        ValueError: there is none, or something about it is not understood.
+    """
+    matrices: dict[str, tuple[str, Any]] = {}
+    lenses: dict[str, tuple[str, Any]] = {}
+    sizes: dict[str, tuple[int, int]] = {}
+    for key, value in mapping.items():
+        label, core = _parted(key)
+        if _is_matrix(label, core, value):
+            _once(matrices, label, key, value)
+        elif core in LENSES:
+            _once(lenses, label, key, value)
+        elif core in SIZES and (size := _size(key, value)) is not None:
+            sizes[label] = size
+        else:
+            check_no_lens_key(key, value)
+            check_no_lens(value, [])
+    if not lenses:
+        for key, value in mapping.items():
+            _check_no_vector(key, value)
+    if not matrices:
+        raise ValueError(_nothing(mapping))
+    size, kind = _sides(mapping), _kind(mapping)
+    found = {}
+    for label, (name, value) in sorted(matrices.items()):
+        K = intrinsics(name, value)
+        lens = _lens(lenses, label, len(matrices), kind, four_is_brown)
+        found[label or "camera"] = camera_of(K, lens, _plausible(sizes.get(label, sizes.get("", size)), K))
+    strays = [name for label, (name, _) in lenses.items() if label not in matrices]
+    if strays:
+        raise ValueError(
+            f"{strays[0]}: want a camera matrix to this lens, got {', '.join(n for n, _ in matrices.values())}"
+        )
+    return Found(_posed(found, mapping))
+
+
+def holds_matrix(mapping: dict[str, Any]) -> bool:
+    """Whether K stands in a mapping under one of the names."""
+    return any(_is_matrix(*_parted(key), value) for key, value in mapping.items())
+
+
+def _is_matrix(label: str, core: str, value: Any) -> bool:
+    """Whether a key and what it holds may be K; lists of mappings are cameras of other programs."""
+    if core not in MATRICES or (core == "m" and not label):
+        return False
+    return isinstance(value, dict | np.ndarray) or (
+        isinstance(value, list) and not any(isinstance(x, dict) for x in value)
+    )
+
+
+def check_no_lens(tree: Any, read_elsewhere: list[Any]) -> None:
+    """Refuse a tree in which a lens stands that nobody reads.
+
+    Args:
+        tree: what to look through.
+        read_elsewhere: the mappings in it that are read.
+
+    Raises:
+        ValueError: it holds a key that looks like a lens.
+    """
+    if isinstance(tree, dict) and not any(tree is known for known in read_elsewhere):
+        for key, value in tree.items():
+            if _parted(key)[1] in LENSES and isinstance(value, list | dict | str):
+                raise ValueError(f"{key}: want the lens in the same mapping as its camera matrix, got it elsewhere")
+            check_no_lens_key(key, value)
+    for item in tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ():
+        if isinstance(item, dict | list) and not any(item is known for known in read_elsewhere):
+            check_no_lens(item, read_elsewhere)
+
+
+def _parted(key: str) -> tuple[str, str]:
+    """The label of a key, and its name in lower case without what stands between words."""
+    words = re.sub(r"(?<=[a-z])([LR])$", r"_\1", key.strip())  # cameraMatrixL
+    words = re.sub(r"[\s.\-]+", "_", words).lower()
+    parts = _LABEL.fullmatch(words)
+    core = words.replace("_", "")
+    if parts is None or core in MATRICES | LENSES | SIZES:
+        return "", core
+    label = parts["front"] or parts["back"] or parts["side"] or ""
+    return label, parts["core"].replace("_", "")
+
+
+def _once(known: dict[str, tuple[str, Any]], label: str, key: str, value: Any) -> None:
+    if label in known:
+        raise ValueError(f"{key}: want one of the kind, got {known[label][0]} too; leave one out")
+    known[label] = key, value
+
+
+def check_no_lens_key(key: str, value: Any) -> None:
+    """Refuse a key that looks as if it held something of the lens."""
+    plain = re.sub(r"[^a-z0-9]", "", key.lower())
+    if plain in MODELS or re.search("std|dev|err|undistort|distance(?!coef)|sigma|covariance", plain):
+        return
+    if plain in OMNIDIRECTIONAL:
+        raise ValueError(
+            f"{key}: want a perspective or fisheye lens of OpenCV, got the parameters of an omnidirectional model; "
+            "calibrate again with one of them"
+        )
+    looks = re.search("dist|coef|radial|tangential|lens", plain) or plain == "kc"
+    if (looks and isinstance(value, list | dict | np.ndarray | float)) or (
+        plain in COEFFICIENTS and not hasattr(value, "__len__")
+    ):
+        raise ValueError(
+            f"{key}: want a name that is known to hold the lens, such as distortion_coefficients, got "
+            f"{described(value)} under this one; rename it, or build dp.Camera.from_opencv(K, dist)"
+        )
+
+
+def _check_no_vector(key: str, value: Any) -> None:
+    """Refuse a vector of as many numbers as a lens has, under a name that nobody knows, where no lens was found."""
+    plain = re.sub(r"[^a-z0-9]", "", key.lower())
+    harmless = re.search("std|dev|err|roi|quat|rot|orient|vec|rms|time", plain) or _parted(key)[1] in MATRICES | SIZES
+    if harmless or not isinstance(value, list | dict | np.ndarray):
+        return
+    try:
+        found = matrix(key, value)
+    except ValueError:
+        return
+    if found.size in BrownConrady.counts and found.size == max(found.shape):
+        raise ValueError(
+            f"{key}: want the lens under a name that is known, such as distortion_coefficients, got {found.size} "
+            "numbers under this one, as a lens has; rename it, or take it out of the file where it is none"
+        )
+
+
+def _kind(mapping: dict[str, Any]) -> Kind | None:
+    """The lens that the file names; `None` where it names none."""
+    kinds: dict[Kind, str] = {}
+    for key, value in mapping.items():
+        if re.sub(r"[^a-z0-9]", "", key.lower()) in MODELS and value is not None and value != "":
+            kind = kind_of(key, value)
+            if kind is not None:
+                kinds[kind] = key
+    if len(kinds) > 1:
+        raise ValueError(f"{' and '.join(kinds.values())}: want one lens model, got {' and '.join(kinds)}")
+    return next(iter(kinds), None)
+
+
+def _lens(lenses: dict[str, tuple[str, Any]], label: str, count: int, kind: Kind | None, four_is_brown: bool) -> Any:
+    if label not in lenses:
+        if lenses and count > 1:
+            raise ValueError(f"camera {label}: want its distortion, as another camera of the file has, got none")
+        if kind == "fisheye":
+            raise ValueError("distortion: want the coefficients of the fisheye lens that the file names, got none")
+        return None
+    name, value = lenses[label]
+    found = matrix(name, value)
+    if found.size and found.size != max(found.shape):
+        raise ValueError(f"{name}: want one row or column of coefficients, got {shape_of(found)}")
+    numbers = found.ravel().tolist()
+    if len(numbers) == 4 and kind is None:
+        own = four_is_brown and _parted(name)[1] == "distortioncoefficients"
+        if not own and any(numbers):
+            raise ValueError(
+                f"{name}: want 5 coefficients, or the name of the model beside 4: they may be k1 k2 p1 p2 or a "
+                "fisheye's k1 to k4; add fisheye_model: 0 or 1, or build dp.Camera.from_opencv(K, dist, fisheye=...)"
+            )
+        return brown(numbers)
+    return lens_of(kind or "brown", numbers)
+
+
+def _size(key: str, value: Any) -> tuple[int, int] | None:
+    """A size given as width and height in one, by their names or in this order."""
+    if isinstance(value, dict) and "rows" not in value:
+        return image_size(value.get("width"), value.get("height"), key)
+    if isinstance(value, str) and re.search(r"\d", value):
+        raise ValueError(f"{key}: want width and height as numbers, got {described(value)}")
+    if not isinstance(value, list | dict | np.ndarray):
+        return None
+    sides = matrix(key, value).ravel().tolist()
+    if len(sides) != 2:
+        raise ValueError(f"{key}: want width and height, got {len(sides)} numbers")
+    return image_size(sides[0], sides[1], key)
+
+
+def _sides(mapping: dict[str, Any]) -> tuple[int, int] | None:
+    plain = {re.sub(r"[^a-z0-9]", "", key.lower()): value for key, value in mapping.items()}
+    for width, height in SIDES:
+        if (width in plain and height in plain) or (width.startswith("im") and (width in plain or height in plain)):
+            return image_size(plain.get(width), plain.get(height), width.removesuffix("width") or "size")
+    return None
+
+
+def _plausible(size: tuple[int, int] | None, K: np.ndarray) -> tuple[int, int] | None:
+    """The size, unless it is (height, width), or that of something else, as the principal point tells."""
+    x, y = float(K[0, 2]), float(K[1, 2])
+    if size is not None and not (-size[0] < x < 2 * size[0] and -size[1] < y < 2 * size[1]):
+        raise ValueError(
+            f"size: want that of the image, got {size}, far from which the principal point is: ({x:g}, {y:g})"
+        )
+    if size is not None and not (x < size[0] and y < size[1]) and 0 <= x < size[1] and 0 <= y < size[0]:
+        raise ValueError(
+            f"size: want width and height, got {size}, which looks like height and width: c is ({x:g}, {y:g})"
+        )
+    return size
+
+
+def _posed(cameras: dict[str, Camera], mapping: dict[str, Any]) -> dict[str, Camera]:
+    """The second camera of a stereo pair at its place beside the first, one camera at the pose beside its K."""
+    names = list(cameras)
+    if len(names) == 2 and ("R" in mapping or "T" in mapping):
+        if not ("R" in mapping and "T" in mapping):
+            raise ValueError("want R and T from the first camera to the second, got only one of them")
+        R, t = square("R", mapping["R"], 3, 3), matrix("T", mapping["T"]).ravel()
+        if t.size != 3:
+            raise ValueError(f"T: want 3 numbers, got {t.size}")
+        R, t = rigid("R", np.column_stack([R, t]))
+        second = cameras[names[1]]
+        return {
+            names[0]: cameras[names[0]],
+            names[1]: camera_of(second.K.numpy(), second.distortion, second.size, (R, t)),
+        }
+    if len(names) == 1 and "R" in mapping and "t" in mapping:
+        pose = rigid("R", np.column_stack([square("R", mapping["R"], 3, 3), square("t", mapping["t"], 3, 1)]))
+        only = cameras[names[0]]
+        return {names[0]: camera_of(only.K.numpy(), only.distortion, only.size, pose)}
+    return cameras
+
+
+def _nothing(mapping: dict[str, Any]) -> str:
+    keys = [str(key) for key in mapping if not str(key).startswith("<")]
+    listed = ", ".join(keys[:6]) + " and more" * (len(keys) > 6)
+    return f"want the key camera_matrix, or another name of K that is known, got {listed or 'no keys at all'}"

@@ -1,0 +1,133 @@
+"""Settings of ORB-SLAM, stella and VINS, and other files with `fx fy cx cy` and `k1 k2 p1 p2 [k3]` one by one.
+
+ORB-SLAM writes them flat (`Camera.fx`, `Camera1.fx`), stella in a mapping `Camera`, VINS in `projection_parameters` and
+`distortion_parameters`. Integer pixel centres. A fisheye only where the file says so: `KannalaBrandt8`, `fisheye`,
+VINS's `KANNALA_BRANDT` with k2 to k5. `Stereo.T_c1_c2` and `Tlr` take the second camera to the first, the world; poses
+in a body are not taken.
+"""
+
+import re
+from typing import Any
+
+from diffproj.files.document import Document
+from diffproj.files.found import Found
+from diffproj.files.lenses import brown, fisheye, kind_of
+from diffproj.files.named import check_no_lens, check_no_lens_key, holds_matrix
+from diffproj.files.numbers import camera_of, focal_lengths, image_size, inverse, number, rigid
+from diffproj.geometry.camera import Camera
+from diffproj.lens.protocol import Lens
+
+FOCAL = ("fx", "fy", "cx", "cy")
+VINS_FISHEYE: dict[str, str] = {
+    "mu": "fx",
+    "mv": "fy",
+    "u0": "cx",
+    "v0": "cy",
+    "k2": "k1",
+    "k3": "k2",
+    "k4": "k3",
+    "k5": "k4",
+}
+ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+SIZES = (("width", "height"), ("image_width", "image_height"), ("cols", "rows"))
+TYPES = ("type", "model", "model_type", "camera_model")
+PERSPECTIVE = ("pinhole", "perspective", "rectified")
+SECOND_TO_FIRST = ("Stereo.T_c1_c2", "Tlr")
+
+
+def recognises(document: Document) -> bool:
+    """Whether it has focal lengths and principal point one by one."""
+    return bool(_cameras(document.mapping)) and not holds_matrix(document.mapping)
+
+
+def read(document: Document) -> Found:
+    """The cameras, the second of a stereo pair beside the first.
+
+    Raises:
+        ValueError: something is missing or not understood.
+    """
+    tree = document.mapping
+    fields = _cameras(tree)
+    common = fields.pop("Camera", {}) if len(fields) > 1 else {}
+    cameras = {name: _camera(common | own, None) for name, own in fields.items()}
+    poses = [key for key in SECOND_TO_FIRST if key in tree]
+    if len(cameras) == 2 and poses:
+        second = list(cameras)[1]
+        cameras[second] = _camera(common | fields[second], inverse(rigid(poses[0], tree[poses[0]])))
+    return Found(cameras)
+
+
+def _cameras(tree: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The fields of each camera; those that hold for all by the name `Camera`."""
+    flat: dict[str, dict[str, Any]] = {}
+    for key, value in tree.items():
+        prefix, dot, name = key.partition(".")
+        if dot and re.fullmatch(r"Camera\d?", prefix):
+            flat.setdefault(prefix, {})[name] = value
+    if any(_is_whole(fields) for fields in flat.values()):
+        return {name: fields for name, fields in flat.items() if name == "Camera" or _is_whole(fields)}
+    if isinstance(tree.get("Camera"), dict) and _is_whole(tree["Camera"]):
+        return {"camera": tree["Camera"]}
+    if isinstance(tree.get("projection_parameters"), dict) and "model_type" in tree:
+        return {"camera": tree}
+    return {"camera": tree} if _is_whole(tree) else {}
+
+
+def _is_whole(fields: dict[str, Any]) -> bool:
+    return all(key in fields for key in FOCAL)
+
+
+def _vins(tree: dict[str, Any]) -> dict[str, Any]:
+    """The fields of VINS's sections under the names of the others."""
+    fields: dict[str, Any] = tree["projection_parameters"]
+    lens = tree.get("distortion_parameters", {})
+    if tree["model_type"] == "KANNALA_BRANDT":
+        fields = {VINS_FISHEYE.get(key, key): value for key, value in fields.items()}
+    elif tree["model_type"] != "PINHOLE" or not isinstance(lens, dict):
+        raise ValueError(f"model_type: want PINHOLE or KANNALA_BRANDT, got {tree['model_type']!r} of other equations")
+    sides = {key: tree[key] for key in ("image_width", "image_height") if key in tree}
+    return {"model_type": tree["model_type"]} | fields | lens | sides
+
+
+def _camera(fields: dict[str, Any], pose: Any) -> Camera:
+    if "projection_parameters" in fields:
+        fields = _vins(fields)
+    f_x, f_y, c_x, c_y = (_got(fields, key) for key in FOCAL)
+    K = focal_lengths(f_x, f_y, c_x, c_y)
+    size = None
+    for width, height in SIZES:
+        if width in fields or height in fields:
+            size = image_size(fields.get(width), fields.get(height), f"{width}, {height}")
+    return camera_of(K, _lens(fields), size, pose)
+
+
+def _lens(fields: dict[str, Any]) -> Lens | None:
+    kinds = {kind_of(key, fields[key]) for key in TYPES if key in fields and not _is_perspective(fields[key])}
+    given = {key: number(key, fields[key]) for key in ORDER if key in fields}
+    for key, value in fields.items():
+        if key not in (*ORDER, *TYPES):
+            check_no_lens_key(key, value)
+            check_no_lens(value, [])
+    if "fisheye" in kinds:
+        if set(given) != {"k1", "k2", "k3", "k4"}:
+            raise ValueError(f"want k1 to k4 of the fisheye lens that the file names, got {', '.join(given) or 'none'}")
+        return fisheye([given[key] for key in ("k1", "k2", "k3", "k4")])
+    types = [key for key in TYPES if key in fields and str(fields[key]).lower() != "rectified"]
+    if not given and types:
+        raise ValueError(f"want k1 k2 p1 p2 beside {types[0]}, got none")
+    if not given:
+        return None
+    for count in (4, 5, 8):
+        if set(given) == set(ORDER[:count]):
+            return brown([given[key] for key in ORDER[:count]])
+    raise ValueError(f"want k1 k2 p1 p2, then k3, then k4 to k6, got {', '.join(given)}")
+
+
+def _is_perspective(value: object) -> bool:
+    return isinstance(value, str) and value.lower() in PERSPECTIVE
+
+
+def _got(fields: dict[str, Any], key: str) -> Any:
+    if key not in fields:
+        raise ValueError(f"want {key}, got none")
+    return fields[key]

@@ -1,0 +1,106 @@
+"""What whoever measures has to say, for nothing else tells it: which view the pixels are in, and how good they are."""
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from diffproj._core.warn import warn_caller
+from diffproj.calibration import ambiguity, mismatch
+from diffproj.calibration.mismatch import CameraMismatchWarning
+from diffproj.calibration.parametrisation import POSE
+from diffproj.calibration.result import Calibration
+
+PixelSigma = float | Tensor | Literal["detector"] | None
+"""A number of pixels, one for each pixel, `"detector"` for that of the calibration's corners; `None` was not said."""
+
+HAND_PX = 0.5
+"""Standard deviation of a coordinate that a hand picked on a screen."""
+SHOWN = 3
+"""Names of views in a message."""
+
+
+class PixelNoiseWarning(UserWarning):
+    """Pixels were measured without a word on how good they are, and count as found by the corner detector."""
+
+
+def chosen_view(calibration: Calibration, view: int | str | None) -> int | str:
+    """The view that was asked for; the only one where nothing was said.
+
+    Raises:
+        ValueError: nothing was said, and there are several.
+    """
+    if view is not None:
+        return view
+    names = calibration.views.names
+    if len(names) == 1:
+        return 0
+    listed = ", ".join(map(repr, names[:SHOWN])) + (", ..." if len(names) > SHOWN else "")
+    raise ValueError(
+        f"view: want one of the calibration's {len(names)} views, in whose photograph the pixels are, by number or "
+        f"name (0 to {len(names) - 1}; {listed}), got none; in a new photograph, measure with what dp.locate finds"
+    )
+
+
+def detector_noise(calibration: Calibration, view: int) -> Tensor | None:
+    """The standard deviation of a corner's coordinate in a view `(*B,)`; `None` where it is not known.
+
+    That of all corners; where the calibration does not fit the view, that view's own if it is larger.
+    """
+    level = calibration.pixel_sigma
+    doubtful = calibration.mismatch.doubtful[..., view]
+    if level is None or not bool(doubtful.any()):
+        return level
+    count = calibration.used[..., view, :].sum(-1)
+    own = calibration.view_rms[..., view] * (count / (2 * count - POSE).clamp(min=1)).sqrt()
+    return torch.where(doubtful, own.maximum(level), level)
+
+
+def pixel_noise(
+    pixels: Tensor, pixel_sigma: PixelSigma, calibration: Calibration | None, view: int
+) -> tuple[float | Tensor, bool]:
+    """The standard deviation of the pixels' coordinates, and whether the calibration's residuals told it.
+
+    Where nothing was said, a warning says what was taken, unless the pixels are corners that the view was given with.
+
+    Raises:
+        ValueError: the calibration does not know the noise, or it is a word that means nothing.
+    """
+    if isinstance(pixel_sigma, str) and pixel_sigma != "detector":
+        raise ValueError(f"pixel_sigma: want px, or 'detector' for the noise of the corners, got {pixel_sigma!r}")
+    if not isinstance(pixel_sigma, str | None):
+        return pixel_sigma, False
+    level = None if calibration is None else detector_noise(calibration, view)
+    if calibration is None or level is None:
+        source = "a camera alone" if calibration is None else "this calibration"
+        raise ValueError(
+            f"pixel_sigma: want the noise of the pixels in px, for {source} does not know it: {HAND_PX:g} for points "
+            "that a hand picked"
+        )
+    if pixel_sigma is None and not _are_corners(pixels, calibration.views.pixels[..., view, :, :]):
+        warn_caller(
+            f"measure: pixel_sigma was left out, so the pixels count as found by the corner detector, to "
+            f"{float(level.detach().amax()):.2g} px in each coordinate; say pixel_sigma='detector' if they are, or how "
+            f"good they are: {HAND_PX:g} for points that a hand picked",
+            PixelNoiseWarning,
+        )
+    return level.unsqueeze(-1), True
+
+
+def doubts(calibration: Calibration, view: int) -> str:
+    """What makes the pose of a view doubtful, in words; with a warning where it does not fit the calibration."""
+    only, name = slice(view, view + 1), calibration.views.names[view : view + 1]
+    found = mismatch.Mismatch(*(part[..., only] for part in calibration.mismatch))
+    misfit = mismatch.described(found, name)
+    if misfit:
+        warn_caller(f"measure: {misfit}", CameraMismatchWarning)
+    two = ambiguity.described(calibration.ambiguous[..., only], name) if calibration.has_alternatives else ""
+    return "; ".join(filter(None, [misfit, two]))
+
+
+def _are_corners(pixels: Tensor, corners: Tensor) -> bool:
+    """Whether all pixels `(*B, N, 2)` are among the corners `(*B, M, 2)` of the view."""
+    if pixels.shape[-2] > corners.shape[-2] or pixels.ndim > corners.ndim:
+        return False
+    same = (pixels.detach().unsqueeze(-2) == corners.detach().to(pixels).unsqueeze(-3)).all(-1)
+    return bool(same.any(-1).all())

@@ -1,0 +1,110 @@
+"""What objects show of themselves: one line, and a table where a notebook asks for HTML."""
+
+import json
+from html.parser import HTMLParser
+from typing import Any
+
+import pytest
+import torch
+
+import diffproj as dp
+from diffproj._core.shown import number, rounded
+
+D = torch.float64
+
+
+class Tree(HTMLParser):
+    """Checks that tags are closed in order, and gathers the text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.opened: list[str] = []
+        self.rows = 0
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        self.opened.append(tag)
+        self.rows += tag == "tr"
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.opened.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def shown() -> dict[str, Any]:
+    views, board, plane = dp.example_views("left"), dp.Chessboard(), dp.Plane.z(0.0)
+    calibration = dp.calibrate(views, board)
+    measured = dp.measure(views.pixels[0, :4], calibration, plane, view=0)
+    both = dp.calibrate(dp.Views(torch.stack([views.pixels, dp.example_views("right").pixels]), size=(640, 480)), board)
+    return {
+        "Calibration": calibration,
+        "many": both,
+        "Camera": calibration.camera,
+        "cameras": calibration.cameras,
+        "Views": dp.Views(views.pixels, names=[f"<b>{i}</b>" for i in range(13)]),
+        "Plane": plane,
+        "Covariance": calibration.covariance,
+        "Measurement": measured,
+        "Quantity": measured.lengths(),
+        "PlaneMap": dp.PlaneMap(calibration.cameras[0], plane),
+        "CrossValidation": dp.cross_validate(views, board, folds=2),
+        "Experiment": dp.run_experiment(views[:8], views[8:], board),
+        "AccuracyMap": dp.AccuracyMap.over_image(calibration, view=0, step=80),
+    }
+
+
+def test_one_short_line(shown: dict[str, Any]) -> None:
+    for name, item in shown.items():
+        text = repr(item)
+        assert text.startswith(type(item).__name__ + "("), name
+        assert "\n" not in text
+        assert len(text) < 160, text
+    assert repr(shown["Calibration"]) == (
+        "Calibration(13 views of 54 corners, f 533.0, 533.1 px, BrownConrady, RMS 0.1765 px, converged)"
+    )
+    assert "f 533.0, 533.1 px, c 342.3, 234.1 px" in repr(shown["Camera"])
+    assert "no pose" in repr(shown["Camera"])
+    assert repr(shown["cameras"]).startswith("Camera(13 cameras, f 533.0, 533.1 px")
+    assert repr(shown["Quantity"]).startswith("Quantity(25.16 ± 0.16, 24.90 ± 0.15")
+    assert repr(dp.Camera(torch.eye(3)).to("meta")).startswith("Camera(f ?, ? px")
+
+
+def test_tables_for_notebooks(shown: dict[str, Any]) -> None:
+    for name, item in shown.items():
+        tree, text = Tree(), item._repr_html_()
+        tree.feed(text)
+        assert not tree.opened, name
+        assert type(item).__name__ in text
+    assert "&lt;b&gt;0&lt;/b&gt;" in shown["Views"]._repr_html_()
+    assert "Good: 13 views differ" in shown["Calibration"]._repr_html_()
+    tree = Tree()
+    tree.feed(dp.Views(torch.rand(50, 4, 2))._repr_html_())
+    assert tree.rows == 21
+    assert "and 30 more" in dp.Views(torch.rand(50, 4, 2))._repr_html_()
+
+
+def test_plain_numbers(shown: dict[str, Any]) -> None:
+    """What `json` writes and reads back; of tables, columns of one length."""
+    for name in ("Calibration", "many", "Measurement", "Quantity", "CrossValidation", "Experiment"):
+        found = shown[name].to_dict()
+        assert json.loads(json.dumps(found)) == found
+        if name != "Calibration":
+            assert len({len(column) for column in found.values()}) == 1, name
+    assert shown["Calibration"].to_dict()["status"] == "CONVERGED"
+    assert shown["many"].to_dict()["status"] == ["CONVERGED", "CONVERGED"]
+    floor = dp.Plane([0.0, 1.0, 0.0], 1.5)
+    camera = dp.Camera(torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=D))
+    pixels = torch.tensor([[320.0, 300], [320, 240], [320, 100]], dtype=D)
+    assert dp.measure(pixels, camera, floor, pixel_sigma=0.5).to_dict()["reason"] == ["VALID", "PARALLEL", "BEHIND"]
+    two = dp.measure(pixels.expand(2, 3, 2), camera, floor, pixel_sigma=0.5)
+    assert two.to_dict()["camera"] == [0, 0, 0, 1, 1, 1]
+    assert two._repr_html_()
+
+
+def test_numbers_for_people() -> None:
+    assert rounded(123.456, 0.0234) == ("123.456", "0.023")
+    assert rounded(123.456, 234.0) == ("120", "230")
+    assert rounded(123.456, 0.0) == ("123.456", "")
+    assert rounded(123.456, float("inf")) == ("123.456", "inf")
+    assert number(torch.tensor([1.0, 1.0])) == "1.0"
+    assert number(torch.tensor([1.0, 2.0])) == "1.0 to 2.0"
+    assert number(torch.zeros(0)) == "?"

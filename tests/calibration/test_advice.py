@@ -1,0 +1,77 @@
+"""The verdict on a calibration, in words that a newcomer understands."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import diffproj as dp
+
+D = torch.float64
+BOARD = dp.Chessboard()
+LEFT = dp.example_views("left")
+
+
+@pytest.fixture(scope="module")
+def calibration() -> dp.Calibration:
+    return dp.calibrate(LEFT, BOARD)
+
+
+def test_good_views(calibration: dp.Calibration) -> None:
+    assert calibration.verdict.startswith(
+        "Good: 13 views differ, cover 56 % of the image and are tilted by up to 41 deg"
+    )
+    assert "Better still: the board in the top left and bottom left of the image" in calibration.verdict
+    assert calibration.summary().splitlines()[-1] == calibration.verdict
+    assert "top right" in dp.calibrate(dp.example_views("right"), BOARD).verdict
+
+
+def test_few_views_and_copies() -> None:
+    few = dp.calibrate(LEFT[[0, 4]], BOARD).verdict
+    assert few.startswith("Weak: only 2 views differ")
+    assert "Next: 8 more photographs" in few
+    copies = dp.calibrate(dp.Views(LEFT.pixels[[0, 0, 0, 0, 3, 4]], size=LEFT.size), BOARD).verdict
+    assert copies.startswith("Weak: only 3 of 6 views differ")
+
+
+def test_a_board_that_was_hardly_tilted() -> None:
+    setup = dp.paper_setup()
+    angles = torch.tensor([[8.0, 0, 3], [-8, 4, 5], [0, 9, 20], [5, -9, 90], [-6, -6, 45], [9, 3, 10]], dtype=D)
+    R = setup.fit.R[0] @ dp.rotation_from_euler(*torch.deg2rad(angles).unbind(-1))
+    middle = setup.board.points.mean(0)
+    t = torch.tensor([0.0, 0, 420], dtype=D) - R @ middle
+    pixels, _ = setup.fit[0].at(R, t).project(setup.board.points)
+    views = dp.Views(pixels + 0.1 * torch.randn(pixels.shape, dtype=D), size=(640, 480))
+    found = dp.calibrate(views, setup.board, "none", throw=False)
+    assert "the board was tilted by" in found.verdict
+    assert "the board tilted by 20 to 50 degrees, about both axes" in found.verdict
+
+
+def test_noise_and_a_wrong_lens() -> None:
+    noisy = dp.Views(LEFT.pixels + torch.randn(13, 54, 2), size=LEFT.size)
+    assert "corners scatter by 1 px" in dp.calibrate(noisy, BOARD).verdict
+    assert "sharper photographs" in dp.calibrate(noisy, BOARD).verdict
+    bare = dp.calibrate(LEFT, BOARD, "none").verdict
+    assert "this lens model does not fit the lens. Next: no photograph yet, but the lens model" in bare
+
+
+def test_a_view_that_fits_badly(calibration: dp.Calibration) -> None:
+    pixels = LEFT.pixels.clone()
+    pixels[6] += torch.randn(54, 2)
+    assert (
+        "another look at left07.jpg" in dp.calibrate(dp.Views(pixels, names=LEFT.names, size=LEFT.size), BOARD).verdict
+    )
+    assert "another look" not in calibration.verdict
+
+
+def test_what_is_no_calibration(calibration: dp.Calibration) -> None:
+    assert dp.calibrate(LEFT[0], BOARD, throw=False).verdict.startswith("Not usable: one view does not tell")
+    assert dp.locate(LEFT[:2], BOARD, calibration.camera).verdict.startswith("Poses only, the camera was given")
+    both = dp.calibrate(dp.Views(torch.stack([LEFT.pixels, dp.example_views("right").pixels]), size=LEFT.size), BOARD)
+    with pytest.raises(ValueError, match="verdict: want one camera"):
+        _ = both.verdict
+
+
+def test_a_file_keeps_it(calibration: dp.Calibration, tmp_path: Path) -> None:
+    dp.save_camera(tmp_path / "camera.json", calibration)
+    assert dp.load_calibration(tmp_path / "camera.json").verdict == calibration.verdict

@@ -1,0 +1,123 @@
+"""`diffproj convert` and `diffproj info`."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import diffproj as dp
+from diffproj.cli import main
+from tests.files.samples import KALIBR, OPENCV_YAML, ROS, SAMPLES, K, npz
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name, data in SAMPLES.items():
+        (tmp_path / name).write_bytes(data)
+    return tmp_path
+
+
+def test_a_camera_goes_from_one_program_to_another(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for out, options in {
+        "a.json": [],
+        "a.yaml": [],
+        "a.npz": [],
+        "new/images.txt": [],
+        "ost2.yaml": ["--to", "ros"],
+        "chain.yaml": ["--to", "kalibr"],
+        "t.json": ["--to", "nerfstudio"],
+    }.items():
+        lens = "cameras.txt" if out != "ost2.yaml" else "opencv.yml"
+        (folder / "new").mkdir(exist_ok=True)
+        one = ["--camera", "1"] if lens == "cameras.txt" else []
+        assert main(["convert", str(folder / lens), str(folder / out), *one, *options]) == 0
+        found = dp.load_camera(folder / out)
+        want = dp.load_camera(folder / lens, camera="1" if one else None)
+        assert torch.allclose(found.K, want.K, atol=1e-12, rtol=0)
+        assert found.size == want.size
+    assert f"{folder}/a.json: one camera of 640 x 480 px, BrownConrady" in capsys.readouterr().out
+
+
+def test_a_whole_calibration_stays_whole(folder: Path) -> None:
+    calibration = dp.calibrate(dp.example_views("left")[:4], dp.Chessboard())
+    dp.save_camera(folder / "c.json", calibration)
+    assert main(["convert", str(folder / "c.json"), str(folder / "d.json")]) == 0
+    assert dp.load_calibration(folder / "d.json").summary() == calibration.summary()
+    assert main(["convert", str(folder / "c.json"), str(folder / "c.yml")]) == 0
+    assert "avg_reprojection_error" in (folder / "c.yml").read_text()
+
+
+def test_what_does_not_fit_is_told_in_options(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    chain, out = str(folder / "camchain.yaml"), str(folder / "out.yaml")
+    for options, said in (
+        ([], "write .json, or choose one by --camera"),
+        (["--camera", "cam1"], "or give --without-pose"),
+        (["--camera", "cam7"], "--camera: want one of cam0, cam1, got 'cam7'"),
+        (["--camera", "1", "--without-pose", "--size", "640x480"], "--size: want 752x480"),
+    ):
+        assert main(["convert", chain, out, *options]) == 1
+        line = capsys.readouterr().err
+        assert said in line
+        assert line.count("\n") == 1
+        assert not Path(out).exists()
+    assert main(["convert", chain, out, "--camera", "1", "--without-pose"]) == 0
+    assert dp.load_camera(out).size == (752, 480)
+    assert main(["convert", str(folder / "calibration.npz"), out, "--to", "ros"]) == 1
+    assert "give --size WxH" in capsys.readouterr().err
+    assert main(["convert", str(folder / "calibration.npz"), out, "--to", "ros", "--size", "640x480"]) == 0
+    with pytest.raises(SystemExit, match="2"):
+        main(["convert", chain, out, "--size", "640"])
+    assert main(["convert", str(folder / "nowhere.yaml"), out]) == 1
+    assert "nowhere.yaml: No such file" in capsys.readouterr().err
+
+
+def test_info_tells_what_is_in_a_file(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(folder / "ost.yaml")]) == 0
+    out, err = capsys.readouterr()
+    for part in ("ost.yaml: ros", "640 x 480 px", "brown5: k1 0.031195", "degrees", "reaches all corners", "rectified"):
+        assert part in out
+    assert err == ""
+    assert main(["info", str(folder / "camchain.yaml"), "--camera", "cam1"]) == 0
+    out, _ = capsys.readouterr()
+    assert "in the world" in out
+    assert "cam0" not in out
+    for name in SAMPLES:
+        assert main(["info", str(folder / name)]) == 0
+        assert name in capsys.readouterr().out
+
+
+def test_info_doubts_what_looks_wrong(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for text, said in (
+        (
+            KALIBR.replace("[752, 480]", "[480, 752]"),
+            "the principal point (367.2, 248.4) is far from the middle of 480 x 752 px",
+        ),
+        (
+            OPENCV_YAML.replace("6.8415526980092864e+02, 0., 6.41", "3.8415526980092864e+02, 0., 6.41"),
+            "was the image stretched?",
+        ),
+        (OPENCV_YAML.replace("-3.1574774054416294e-01", "-1.6"), "the lens folds at"),
+        (
+            ROS.replace("470.198924", "70000.0").replace("475.088069", "70000.0"),
+            "field of view of 0.5 degrees is unusual",
+        ),
+    ):
+        (folder / "doubtful.yaml").write_text(text)
+        assert main(["info", str(folder / "doubtful.yaml")]) == 0
+        assert said in capsys.readouterr().err
+
+
+def test_info_of_a_calibration_and_of_damage(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dp.save_camera(folder / "c.json", dp.calibrate(dp.example_views("left")[:4], dp.Chessboard()))
+    assert main(["info", str(folder / "c.json")]) == 0
+    assert "a calibration of 4 views, RMS" in capsys.readouterr().out
+    (folder / "d.npz").write_bytes(npz(mtx=K, dist=K))
+    assert main(["info", str(folder / "d.npz")]) == 1
+    assert "d.npz: dist: want one row or column of coefficients, got 3 x 3" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["convert", "info"])
+def test_help_fits_a_terminal(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main([command, "--help"])
+    assert all(len(line) <= 80 for line in capsys.readouterr().out.splitlines())

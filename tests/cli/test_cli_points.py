@@ -1,0 +1,77 @@
+"""Files of points, and sides of squares with their units: what is read, and what it means."""
+
+from pathlib import Path
+
+import pytest
+
+from diffproj.cli.points_file import Pixel, read_points
+from diffproj.cli.units import Length, agreed, square_side
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a,1.5,2\nb,-3,4\n",
+        "name,u,v\na,1.5,2\nb,-3,4",
+        "# picked on Monday\nName, U in px, V in px\n\n  a , 1.5 , 2 \n# and\nb,-3,4\n",
+        "a;1,5;2\nb;-3;4,0\n",
+        "a\t1.5\t2\r\nb\t-3\t4\r\n",
+        "\ufeffname;u;v\r\na;1,5;2\r\nb;-3;4\r\n",
+        '"a","1.5","2"\n"b","-3","4"\n',
+    ],
+)
+def test_points_files(text: str, tmp_path: Path) -> None:
+    file = tmp_path / "points.csv"
+    file.write_bytes(text.encode())
+    assert read_points(file) == [Pixel("a", 1.5, 2.0), Pixel("b", -3.0, 4.0)]
+
+
+def test_points_without_names_have_numbers(tmp_path: Path) -> None:
+    file = tmp_path / "points.csv"
+    file.write_text("u,v\n1,2\n3,4\nend,5,6\n")
+    assert read_points(file) == [Pixel("1", 1, 2), Pixel("2", 3, 4), Pixel("end", 5, 6)]
+
+
+@pytest.mark.parametrize(
+    ("text", "square"),
+    [
+        ("25", Length(25.0)),
+        ("25mm", Length(25.0, "mm")),
+        ("2.5cm", Length(2.5, "cm")),
+        (" 2.5 CM ", Length(2.5, "cm")),
+        ("1in", Length(1.0, "in")),
+        ("3e-2m", Length(0.03, "m")),
+        ("40μm", Length(40.0, "µm")),  # the Greek letter and the sign of micro
+        ("1e-12", Length(1e-12)),
+        ("1e9", Length(1e9)),
+    ],
+)
+def test_sides_of_squares(text: str, square: Length) -> None:
+    assert square_side(text) == square
+
+
+MM, CM, INCH, BARE = Length(25.0, "mm"), Length(2.5, "cm"), Length(1.0, "in"), Length(25.0)
+
+
+@pytest.mark.parametrize(
+    ("square", "calibrated", "unit", "warning"),
+    [
+        (MM, MM, "mm", None),
+        (BARE, MM, "mm", None),
+        (MM, BARE, "mm", None),
+        (BARE, BARE, None, None),
+        (Length(25.4, "mm"), Length(1.0, "in"), "mm", "the same side, but results are in mm"),
+        (CM, MM, "cm", "--square: 2.5 cm here, and 25 mm in camera.json: the same side, but results are in cm"),
+        (INCH, MM, "in", "--square: 1 in here, and 25 mm in camera.json: right only where it is another board"),
+        (Length(30.0, "mm"), MM, "mm", "right only where it is another board"),
+        (Length(1.0), MM, None, "right only where it is another board, measured in the unit that you have in mind"),
+        (Length(30.0), BARE, None, "right only where it is another board"),
+        (MM, Length(25.0, "furlong"), "mm", "right only where it is another board"),
+    ],
+)
+def test_another_side_than_the_calibrations(
+    square: Length, calibrated: Length, unit: str | None, warning: str | None
+) -> None:
+    found, said = agreed(square, calibrated, "camera.json")
+    assert found == Length(square.value, unit)
+    assert said is None if warning is None else warning in (said or "")

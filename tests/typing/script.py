@@ -1,0 +1,73 @@
+# pyright: strict
+"""What a user writes, for type checkers in their strict mode: `test_typing.py` runs them, nobody runs this."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+import diffproj as dp
+
+
+def calibrated(photographs: Sequence[str]) -> dp.Calibration:
+    board = dp.Chessboard(columns=9, rows=6, square=25.0)
+    views = dp.detect(photographs, board)
+    calibration = dp.calibrate(views, board, "auto", reject_outliers=True)
+    if calibration.comparison is not None:
+        print(calibration.comparison.summary())
+    print(calibration.verdict, calibration.status, calibration.covariance.deviations["f_x"].item())
+    numbers: dict[str, object] = calibration.to_dict()
+    print(numbers)
+    return calibration
+
+
+def measured(photograph: str, calibration: dp.Calibration, clicks: Tensor) -> float:
+    board = dp.Chessboard()
+    located = dp.locate(dp.detect(photograph, board), board, calibration)
+    found = dp.measure(clicks, located, dp.Plane.z(-12.0), pixel_sigma=0.5)
+    low, high = found.lengths().interval(0.95)
+    print(found.summary(), found.doubts, low, high, found.to_dict()["reason"])
+    print(dp.Reason(int(dp.explain(clicks, located.cameras[0], dp.Plane.z(-12.0))[0])).name)
+    return float(found.lengths().value[0])
+
+
+def straightened(camera: dp.Camera, pixels: Tensor) -> Tensor:
+    lens = camera.distortion
+    xy = (pixels - camera.K[:2, 2]) / camera.K.diagonal()[:2]
+    if lens is None:
+        return xy
+    undistorted, valid = lens.undistort(xy)
+    again, _ = lens.distort(undistorted)
+    print(int(valid.sum()), float((again - xy).abs().amax()))
+    return undistorted
+
+
+class Network(nn.Module):
+    def __init__(self, camera: dp.Camera) -> None:
+        super().__init__()
+        self.heads = nn.Linear(8, 2)
+        self.projector = dp.PlaneProjector(camera, dp.Plane.z(0.0), learn=("focal", "pose"))
+
+    def forward(self, features: Tensor) -> Tensor:
+        points, valid = self.projector(self.heads(features))
+        return torch.where(valid.unsqueeze(-1), points, 0.0)
+
+
+def trained(camera: dp.Camera, calibration: dp.Calibration, features: Tensor, target: Tensor) -> Tensor:
+    network, loss, prior = Network(camera), dp.PlaneLoss(dp.Huber(5.0)), dp.CalibrationPrior(calibration)
+    points = network.forward(features)
+    learnable = dp.LearnableCamera(camera)
+    moved: dp.Camera = learnable()
+    plane: dp.Plane = dp.LearnablePlane(dp.Plane.z(0.0))()
+    print(moved.size, plane.offset)
+    total = loss(points, target) + prior(learnable())
+    (slope,) = torch.autograd.grad(total, [network.heads.weight])
+    return slope
+
+
+def mapped(camera: dp.Camera, calibration: dp.Calibration, image: Tensor) -> Tensor:
+    to_plane = dp.PlaneMap(camera, dp.Plane.z(0.0))
+    points, valid = to_plane(torch.rand(10, 2, dtype=torch.float64))
+    accuracy = dp.AccuracyMap.over_image(calibration, view="left01.jpg", step=16)
+    print(points[valid].shape, accuracy.extrapolated.sum(), accuracy.deviation.amax())
+    return dp.rectify(image, camera, dp.Plane.z(0.0), (0.0, 0.0, 200.0, 125.0), 0.5)[0]
