@@ -104,7 +104,7 @@ def test_calibrate_names_rejected_corners(
     assert "No corner rejected as outlier" in out
     corner = 11
     shift = torch.zeros(5, 40, 2, dtype=torch.float64)
-    shift[2, corner, 0] = 4.0
+    shift[2, corner, 0] = 1.0
     found = calibrating.find_corners
 
     def spoilt(*arguments: Any, **options: Any) -> dp.Views:
