@@ -315,7 +315,7 @@ def _draw_axes(axes: Axes, calibration: Calibration, view: int) -> None:
     points = calibration.points.cpu()
     origin = points[0]
     length = float((points.amax(0) - points.amin(0)).max()) / 4
-    tips = origin + length * torch.eye(3, dtype=points.dtype)
+    tips = origin + length * torch.eye(3, dtype=points.dtype, device="cpu")
     places, valid = calibration.cameras[view].project(torch.cat([origin[None], tips]).to(calibration.points))
     (u, v), *ends = places.detach().cpu().tolist()
     for (name, colour), (x, y), seen in zip(AXES.items(), ends, valid[1:].tolist(), strict=True):

@@ -111,6 +111,7 @@ def _say_how_it_ended(calibration: Calibration, reject_outliers: bool) -> None:
     result(f"Solver {how}")
     for remark in remarks:
         result(textwrap.fill(_with_unit(in_options(remark[0].upper() + remark[1:]), calibration.unit), 79))
+    result("\n" + textwrap.fill(_with_unit(in_options(calibration.verdict), calibration.unit), 79))
 
 
 def _with_unit(text: str, unit: str | None) -> str:

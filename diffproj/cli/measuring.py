@@ -18,6 +18,7 @@ from diffproj.cli.points_file import Pixel, read_points
 from diffproj.cli.scene import Scene, new_photograph, stored_view
 from diffproj.cli.terminal import result
 from diffproj.geometry.plane import Plane
+from diffproj.measurement.choices import detector_noise
 from diffproj.measurement.measure import measure
 from diffproj.targets.images import Orientation, grey, listed
 
@@ -65,7 +66,7 @@ def _noise(options: argparse.Namespace, scene: Scene) -> PixelNoise:
         return PixelNoise(HAND, "hand")
     if options.pixel_sigma != DETECTOR:
         return PixelNoise(options.pixel_sigma, "option")
-    known = scene.calibration.pixel_sigma
+    known = detector_noise(scene.calibration, scene.view)
     if known is None or not math.isfinite(known):
         raise ValueError(f"--pixel-sigma: want a number of px, for {options.camera} does not tell the detector's noise")
     return PixelNoise(float(known), DETECTOR)

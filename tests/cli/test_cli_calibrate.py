@@ -59,6 +59,7 @@ def test_calibrate_writes_the_whole_calibration(
     assert f"RMS reprojection error {calibration.rms:.4f} px over 200 corners in 5 views" in out
     assert f"Solver {calibration.message}" in out
     assert f"Written to {file}\n" in out
+    assert " ".join(calibration.verdict.split()) in " ".join(out.split())
     assert "rejected" not in out
     assert all(len(line) <= 80 for line in out.splitlines() if str(file) not in line)
 

@@ -22,6 +22,7 @@ from diffproj.cli.inputs import HAND
 from diffproj.cli.measure_document import REASONS, between, crosses, listed
 from diffproj.cli.measure_plane import equation
 from diffproj.cli.measure_tables import coordinate, shown
+from diffproj.measurement.choices import HAND_PX
 
 D = torch.float64
 BOARD = ("--board", "8x5", "--square", "25")
@@ -298,7 +299,6 @@ def test_corners_that_no_pose_explains(capsys: pytest.CaptureFixture[str], monke
         (["--view", "1.png", "--points", "1,2", "--plane", "-1,0,5"], "got '-1,0,5'"),
         (["--view", "1.png", "--points", "1,2", "--pixel-sigma", "0"], "want a positive number of pixels"),
         (["--view", "1.png", "--points", "1,2", "--pixel-sigma", "-1"], "want a positive number of pixels"),
-        (["--view", "1.png", "--points", "1,2", "--camera", "camera.txt"], "want a file ending in .json"),
     ],
 )
 def test_options_are_checked_first(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -484,3 +484,24 @@ def test_warnings_are_in_the_document(capsys: pytest.CaptureFixture[str], monkey
     _, out, err = run(capsys, "photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS, "--json")
     assert json.loads(out)["warnings"] == ["the photograph is odd: look again"]
     assert err == "diffproj: the photograph is odd: look again\n"
+
+
+def test_the_photograph_of_another_camera_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a camera whose focal length is 10 % longer, on the screen and in the document, once."""
+    calibration = dp.load_calibration("camera.json")
+    K = calibration.camera.K.clone()
+    K[:2, :2] *= 1.1
+    seen = dp.paper_setup().test[3]
+    other = dp.Camera(K, seen.R, seen.t, size=(640, 480))
+    image = synthetic.photograph(other, dp.Chessboard(8, 5, 25.0, axes="paper")).numpy()
+    cv2.imwrite(str(tmp_path / "other.png"), image)
+    options = (str(tmp_path / "other.png"), "--camera", "camera.json", *BOARD, "--points", *CORNERS, "--json")
+    _, out, err = run(capsys, *options)
+    (warned,) = json.loads(out)["warnings"]
+    assert "other.png" in warned
+    assert "another camera, zoom or focus" in warned
+    assert err == f"diffproj: {warned}\n"
+
+
+def test_a_hand_picks_as_the_library_says() -> None:
+    assert HAND == HAND_PX
