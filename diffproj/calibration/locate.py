@@ -18,6 +18,7 @@ from diffproj.calibration.result import Calibration
 from diffproj.calibration.solver import Solution, Status, select
 from diffproj.calibration.task import Task
 from diffproj.geometry.camera import Camera, as_camera
+from diffproj.targets.chessboard import Chessboard, origin_doubt
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
@@ -36,6 +37,8 @@ def locate(
     A plane seen from afar has two poses that explain it almost equally well; both are refined and the better kept. The
     other is in `alternatives`, and the covariance holds the doubt; where it may well be the right one, the view is
     `ambiguous`, and an `AmbiguousPoseWarning` names it.
+    A chessboard that looks the same when turned (`Chessboard.turns`) leaves open which corner is the origin: a warning
+    says so.
     With a calibration in the place of a camera a `CameraMismatchWarning` names the views whose corners are not where it
     sees them, as photographs of another camera, zoom or focus: see `mismatch`.
     The board is taken to be flat, also where a calibration found a bow.
@@ -66,6 +69,8 @@ def locate(
         0.18
     """
     found = located(views, target, camera, **options)
+    if isinstance(target, Chessboard) and target.turns > 1:
+        warn_caller(f"locate: {origin_doubt(target)}")
     if bool(found.ambiguous.any()):
         warnings.warn(f"locate: {found.ambiguity}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
     if text := described(found.mismatch, views.names):

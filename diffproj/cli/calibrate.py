@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import get_args
 
 from diffproj.cli.drawing import drawing
-from diffproj.cli.inputs import board_size, camera_file, some_path
+from diffproj.cli.inputs import add_orientation, board_size, camera_file, some_path
 from diffproj.cli.units import square_side
 from diffproj.lens.names import LensModel
 
@@ -86,6 +86,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         action="store_true",
         help="leave out corners that lie more than 5 standard deviations off, and name them",
     )
+    add_orientation(lens)
     file = command.add_argument_group("the files")
     file.add_argument(
         "-o",

@@ -26,7 +26,7 @@ def run(options: argparse.Namespace) -> int:
     sources = photographs(options.photographs)
     check_no_photograph(options.draw, sources)
     with progress_bars() as bars:
-        views = find_corners(sources, board, bars)
+        views = find_corners(sources, board, bars, orientation=options.orientation)
         task = bars.add_task("Solving", total=None)
         calibration = calibrate(
             views,

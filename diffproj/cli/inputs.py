@@ -41,6 +41,17 @@ def some_path(text: str) -> Path:
     return Path(text)
 
 
+def add_orientation(group: argparse._ArgumentGroup | argparse.ArgumentParser) -> None:
+    """Give a command the option that says how the pixels of photographs are counted."""
+    group.add_argument(
+        "--orientation",
+        choices=("sensor", "upright"),
+        default="sensor",
+        help="how pixels are counted: as the sensor recorded them, or with the photograph turned upright as its EXIF "
+        "data ask, which is what most programs show (default: sensor)",
+    )
+
+
 def camera_file(text: str) -> Path:
     """Read the name of a camera file."""
     if Path(text).suffix.lower() not in CAMERA_SUFFIXES:

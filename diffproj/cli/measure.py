@@ -4,7 +4,7 @@ import argparse
 import functools
 
 from diffproj.cli.drawing import drawing
-from diffproj.cli.inputs import DETECTOR, HAND, LARGEST_NUMBER, board_size, numbers, some_path
+from diffproj.cli.inputs import DETECTOR, HAND, LARGEST_NUMBER, add_orientation, board_size, numbers, some_path
 from diffproj.cli.units import Length, height, square_side
 
 DESCRIPTION = """\
@@ -126,6 +126,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         help=f"standard deviation of u and of v of each point, in px; or '{DETECTOR}', the noise of the board's "
         f"corners, for pixels that a program found as well as these (default: {HAND}, for points picked by hand)",
     )
+    add_orientation(more)
     output = more.add_mutually_exclusive_group()
     output.add_argument("--json", action="store_true", help="print one JSON document, with null for what is not known")
     output.add_argument("--csv", action="store_true", help="print one table for spreadsheets")

@@ -20,7 +20,7 @@ from diffproj.cli.terminal import result
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.choices import detector_noise
 from diffproj.measurement.measure import measure
-from diffproj.targets.images import grey, listed
+from diffproj.targets.images import Orientation, grey, listed
 
 
 def run(options: argparse.Namespace) -> int:
@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> int:
     found = document(scene, plane, noise, given, measured)
     found["warnings"] = options.warned
     if options.draw is not None:
-        _draw(options.draw, scene, found)
+        _draw(options.draw, scene, found, options.orientation)
     if options.json:
         result(json.dumps(found, indent=1, allow_nan=False))
     elif options.csv:
@@ -72,7 +72,7 @@ def _noise(options: argparse.Namespace, scene: Scene) -> PixelNoise:
     return PixelNoise(float(known), DETECTOR)
 
 
-def _draw(path: Path, scene: Scene, found: dict[str, Any]) -> None:
+def _draw(path: Path, scene: Scene, found: dict[str, Any], orientation: Orientation) -> None:
     """Draw what was measured into the photograph."""
     from diffproj import figures  # here, for it loads matplotlib
 
@@ -82,7 +82,7 @@ def _draw(path: Path, scene: Scene, found: dict[str, Any]) -> None:
         [row["pixel"] for row in found["points"]],
         [row["name"] if row["valid"] else f"{row['name']} (not on the plane)" for row in found["points"]],
         [_length_in_words(length, scene.square.unit) for length in found["lengths"]],
-        photograph=None if scene.photograph is None else grey(listed(scene.photograph)[0]),
+        photograph=None if scene.photograph is None else grey(listed(scene.photograph)[0], orientation),
         title=f"{found['view']}: {found['plane_in_words']}",
     )
     write_drawing(path, figure)

@@ -1,7 +1,9 @@
 """Which files are photographs: broken and hidden ones in folders are left out, copies count once, and all is told."""
 
 import hashlib
+import os
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +43,19 @@ def photographs(paths: Iterable[Path]) -> list[Source]:
     return list(_without_copies(list(found.values())))
 
 
-def find_corners(sources: list[Any], board: Chessboard, bars: Progress, title: str = "Finding corners") -> Views:
-    """The board's corners in photographs, under a progress bar."""
+def find_corners(
+    sources: list[Any], board: Chessboard, bars: Progress, title: str = "Finding corners", orientation: str = "sensor"
+) -> Views:
+    """The board's corners in photographs, on all cores, under a progress bar."""
     task = bars.add_task(title, total=None)
-    return detect(sources, board, lambda done, total: bars.update(task, completed=done, total=total))
+    with ThreadPoolExecutor(max(1, min(len(sources), os.cpu_count() or 1))) as cores:
+        return detect(
+            sources,
+            board,
+            lambda done, total: bars.update(task, completed=done, total=total),
+            orientation=orientation,
+            executor=cores,
+        )
 
 
 def _named(path: Path) -> list[Path]:

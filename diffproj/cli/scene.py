@@ -101,7 +101,7 @@ def new_photograph(options: argparse.Namespace) -> Scene:
     columns, rows = options.board
     board = Chessboard(columns, rows, square.value)
     with progress_bars() as bars:
-        views = find_corners(sources, board, bars)
+        views = find_corners(sources, board, bars, orientation=options.orientation)
     if camera.size is not None and camera.size != views.size:
         (w, h), (width, height) = views.size or (0, 0), camera.size
         raise ValueError(

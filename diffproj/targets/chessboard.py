@@ -72,6 +72,20 @@ class Chessboard:
         return self.columns, self.rows
 
     @property
+    def turns(self) -> int:
+        """The number of turns in its plane after which the board looks the same: 1, 2 or 4.
+
+        1 where columns + rows is odd: only such a board shows which corner is the first.
+
+        Example:
+            >>> Chessboard(9, 6).turns, Chessboard(8, 6).turns, Chessboard(7, 7).turns, Chessboard(6, 6).turns
+            (1, 2, 2, 4)
+        """
+        if (self.columns + self.rows) % 2:
+            return 1
+        return 4 if self.columns == self.rows and self.columns % 2 == 0 else 2
+
+    @property
     def points(self) -> Float[Tensor, "n 3"]:
         """The inner corners in the world, row by row, in the unit of `square`: a new float64 tensor on each access."""
         row, column = torch.meshgrid(
@@ -101,6 +115,21 @@ class Chessboard:
         """World points in this board's frame from rows and columns in units of squares."""
         along = (column, row) if self.axes == "opencv" else (row, column)
         return torch.stack([*along, torch.zeros_like(row)], dim=-1) * self.square
+
+
+def origin_doubt(board: Chessboard) -> str:
+    """What to know about a board that looks the same when turned: which corner is the first is not seen.
+
+    Example:
+        >>> origin_doubt(Chessboard(8, 6))[:74]
+        'a board with 8 x 6 inner corners looks the same when turned by 180 degrees'
+    """
+    return (
+        f"a board with {board.columns} x {board.rows} inner corners looks the same when turned by "
+        f"{360 // board.turns} degrees: the first corner, and with it the origin of the world, is one nearest to the "
+        "photograph's top left, and may be another in the next photograph; keep the board as it is, or use one whose "
+        "columns + rows is odd, such as 9 x 6"
+    )
 
 
 def as_board(board: Chessboard) -> Chessboard:

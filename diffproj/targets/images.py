@@ -4,18 +4,24 @@ import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Shaped, UInt8
 from torch import Tensor
 
+from diffproj.targets import videos
+from diffproj.targets.videos import Frame
+
 Source = str | os.PathLike[str] | np.ndarray | Tensor
 """A photograph, or several: a file, folder or pattern; an array or tensor."""
 
 SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".jp2", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
 """Suffixes of the files in a folder that count as photographs."""
+
+Orientation = Literal["sensor", "upright"]
+"""How a photograph's pixels are counted: as the sensor recorded them, or turned as its EXIF data ask."""
 
 LAYOUTS = "an array (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA, or a tensor (1 | 3 | 4, H, W) RGB"
 
@@ -26,20 +32,22 @@ class Photograph(NamedTuple):
     Attributes:
         name: the name of its view: the file's name, or `image 3` for the third of several arrays.
         label: its name in messages: the file with its folder, or the same as `name`.
-        source: the file or the pixels.
+        source: the file, the pixels, or a frame of a video.
     """
 
     name: str
     label: str
-    source: Path | np.ndarray | Tensor
+    source: Path | np.ndarray | Tensor | Frame
 
 
-def listed(photographs: Source | Iterable[Source]) -> list[Photograph]:
+def listed(photographs: Source | Iterable[Source], frames: int | None = None) -> list[Photograph]:
     """List the input photographs one by one.
 
     Args:
         photographs: a file, a folder (its photographs in natural order: `view2` before `view10`; hidden files are
             none), a pattern such as `photos/left*.jpg`, an array, a tensor, or a list of files, arrays and tensors.
+
+        frames: of a video, each so-manieth frame; by default sharp ones from all its parts.
 
     Raises:
         TypeError: an entry is none of these.
@@ -49,17 +57,20 @@ def listed(photographs: Source | Iterable[Source]) -> list[Photograph]:
     entries = _entries(photographs)
     if not entries:
         raise ValueError(f"photographs: want at least one, got none in {photographs!r}")
-    return [_named(number, entry) for number, entry in enumerate(entries, start=1)]
+    return [photograph for n, entry in enumerate(entries, start=1) for photograph in _named(n, entry, frames)]
 
 
-def _named(number: int, entry: Any) -> Photograph:
+def _named(number: int, entry: Any, frames: int | None) -> list[Photograph]:
     if isinstance(entry, np.ndarray | Tensor):
-        return Photograph(f"image {number}", f"image {number}", entry)
+        return [Photograph(f"image {number}", f"image {number}", entry)]
     if isinstance(entry, str | os.PathLike):
         path = Path(entry)
         if not path.is_file():
             raise FileNotFoundError(f"photographs: no such file: {path}")
-        return Photograph(path.name, str(path), path)
+        if path.suffix.lower() in videos.SUFFIXES:
+            taken = videos.frames_of(path, frames)
+            return [Photograph(f"{path.name} frame {f.number}", f"{path} frame {f.number}", f) for f in taken]
+        return [Photograph(path.name, str(path), path)]
     raise TypeError(f"photographs: want file names, arrays or tensors, got {type(entry).__name__}")
 
 
@@ -97,11 +108,11 @@ def _natural(path: Path) -> list[Any]:
     return [int(part) if place % 2 else part for place, part in enumerate(parts)]
 
 
-def grey(photograph: Photograph) -> Shaped[np.ndarray, "h w"]:
+def grey(photograph: Photograph, orientation: Orientation = "sensor") -> Shaped[np.ndarray, "h w"]:
     """Convert a photograph to grey, `(H, W)`, from 0 to 255: uint8 for 8-bit input, float32 otherwise.
 
-    Files are read as `cv2.imread` reads them, which applies the EXIF orientation. The contrast of 16-bit images is
-    stretched from their 0.1st to their 99.9th percentile, since cameras of 10, 12 or 14 bits use a part of the range.
+    Files are read as the sensor recorded them, or upright. The contrast of 16-bit images is stretched from their 0.1st
+    to their 99.9th percentile, since cameras of 10, 12 or 14 bits use a part of the range.
 
     Raises:
         ValueError: the file is no image, the shape is none of the layouts, or floats are not in 0..1.
@@ -110,7 +121,9 @@ def grey(photograph: Photograph) -> Shaped[np.ndarray, "h w"]:
     """
     label, source = photograph.label, photograph.source
     if isinstance(source, Path):
-        return _scaled(label, _read(source))
+        return _scaled(label, _read(source, orientation))
+    if isinstance(source, Frame):
+        return source.image
     image = _channels_last(label, source) if isinstance(source, Tensor) else source
     if image.size == 0 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (1,), (3,), (4,)):
         raise ValueError(f"{label}: want {LAYOUTS}, got shape {tuple(source.shape)}")
@@ -125,10 +138,13 @@ def as_8_bit(image: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     return image if image.dtype == np.uint8 else np.rint(image).astype(np.uint8)
 
 
-def _read(path: Path) -> np.ndarray:
+def _read(path: Path, orientation: Orientation) -> np.ndarray:
     # cv2.imread does not distinguish a missing file from a broken one, and fails on some file names.
     data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if data.size else None
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+    if orientation == "sensor":
+        flags |= cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(data, flags) if data.size else None
     if image is None:
         raise ValueError(f"{path}: want an image, got {data.size} bytes that OpenCV cannot read as one")
     return image

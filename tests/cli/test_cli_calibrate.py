@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 
 import diffproj as dp
 from diffproj import cli
@@ -94,7 +95,7 @@ def test_calibrate_fits_the_bow(photographs: Path, tmp_path: Path, capsys: pytes
 
 
 def test_calibrate_names_rejected_corners(
-    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, file = tmp_path / "photographs", tmp_path / "camera.json"
     shutil.copytree(photographs, folder)
@@ -103,11 +104,15 @@ def test_calibrate_names_rejected_corners(
     assert code == 0
     assert "No corner rejected as outlier" in out
     corner = 11
-    u, v = dp.load_calibration(file).views.pixels[2, corner].round().int().tolist()
-    spoilt = cv2.imread(str(folder / "3.png"))
-    assert spoilt is not None
-    spoilt[v - 3 : v + 4, u + 2 : u + 6] = 20
-    cv2.imwrite(str(folder / "3.png"), spoilt)
+    shift = torch.zeros(5, 40, 2, dtype=torch.float64)
+    shift[2, corner, 0] = 1.0
+    found = calibrating.find_corners
+
+    def spoilt(*arguments: Any, **options: Any) -> dp.Views:
+        views = found(*arguments, **options)
+        return dp.Views(views.pixels + shift, names=views.names, size=views.size)
+
+    monkeypatch.setattr(calibrating, "find_corners", spoilt)
     code, out, _ = calibrate(capsys, folder, *options)
     assert code == 0
     assert "1 corner rejected as outlier\n" in out

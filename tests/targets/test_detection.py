@@ -12,6 +12,7 @@ import torch
 from diffproj.targets import detection
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.detection import BoardNotFoundError, BoardNotFoundWarning, detect
+from diffproj.targets.search import Pattern
 
 BOARD = Chessboard(columns=9, rows=6)
 SIZE = (400, 300)
@@ -93,68 +94,6 @@ def test_corners_are_where_they_are(pose):
     assert error.max() < 0.2
 
 
-def test_the_window_follows_the_spacing():
-    """Within one strongly tilted view, each corner gets 0.30 of the distance to its own nearest neighbour."""
-    image, corners = photograph(quadrilateral=((150, 60), (250, 60), (380, 270), (20, 270)))
-    distance = detection.nearest_distance(corners)
-    assert distance[0] == pytest.approx(np.linalg.norm(corners[1] - corners[0]))
-    half_sides = []
-    original = cv2.cornerSubPix
-
-    def spy(image, start, window, *rest):
-        half_sides.append((window[0], len(start)))
-        return original(image, start, window, *rest)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cv2, "cornerSubPix", spy)
-        refined = detection.refine_corners(image, corners.astype(np.float32))
-    expected = np.floor(0.30 * distance).astype(int)
-    assert sorted(half_sides) == sorted(zip(*np.unique(expected, return_counts=True), strict=True))
-    assert len(half_sides) > 3
-    assert np.linalg.norm(refined - corners, axis=1).max() < 0.2
-
-
-def test_a_tiny_window_is_never_used():
-    corners = np.array([[10.0, 10], [14, 10], [10, 14], [14, 14]], dtype=np.float32)
-    with pytest.MonkeyPatch.context() as patch:
-        windows = []
-        patch.setattr(cv2, "cornerSubPix", lambda image, start, window, *rest: windows.append(window) or start)
-        detection.refine_corners(np.zeros((30, 30), dtype=np.uint8), corners)
-    assert windows == [(2, 2)]
-
-
-def test_large_photographs_are_searched_at_half_their_size(monkeypatch):
-    """Where the detector fails on a large photograph, a smaller copy gives the start, the full size the corners."""
-    image, corners = photograph(size=(401, 301))
-    original, widths = cv2.findChessboardCorners, []
-
-    def only_small(image, size):
-        widths.append(image.shape[1])
-        return original(image, size) if image.shape[1] < 300 else (False, None)
-
-    monkeypatch.setattr(cv2, "findChessboardCorners", only_small)
-    monkeypatch.setattr(detection, "LARGE", 350)
-    assert farthest(detect(image, BOARD), corners) < 0.2
-    assert widths == [401, 200]
-    monkeypatch.setattr(detection, "LARGE", 500)
-    with pytest.raises(BoardNotFoundError):
-        detect(image, BOARD)
-    monkeypatch.setattr(detection, "LARGE", 50)
-    with pytest.raises(BoardNotFoundError):
-        detect(np.zeros_like(image), BOARD)
-    assert widths[3:] == [401, 200, 100, 50]
-
-
-def test_corners_of_a_smaller_copy_are_carried_back_exactly(monkeypatch):
-    """Edges map to edges: with pixel centres at whole numbers, `c -> s c + (s - 1) / 2` along each side."""
-    _, small = photograph(size=(200, 150), quadrilateral=((35, 30), (165, 25), (170, 120), (30, 125)))
-    small = small.astype(np.float32)
-    monkeypatch.setattr(cv2, "findChessboardCorners", lambda image, size: (image.shape == (150, 200), small))
-    monkeypatch.setattr(detection, "LARGE", 350)
-    rough = detection._rough_corners(np.zeros((301, 401), dtype=np.uint8), BOARD)
-    assert np.abs(rough - ((small + 0.5) * (401 / 200, 301 / 150) - 0.5)).max() < 1e-4
-
-
 # ------------------------------------------------------------------------------------------------------- in order
 
 
@@ -202,23 +141,22 @@ REORDERED = {
 }
 
 
-@pytest.mark.parametrize("shape", [(-1, 2), (-1, 1, 2)], ids=["OpenCV 5", "OpenCV 4"])
 @pytest.mark.parametrize("order", REORDERED)
-def test_whatever_the_detector_returns(monkeypatch, order, shape):
+def test_whatever_the_search_returns(monkeypatch, order):
     image, corners = photograph()
-    reordered = REORDERED[order](corners.reshape(6, 9, 2)).reshape(shape).astype(np.float32)
-    monkeypatch.setattr(cv2, "findChessboardCorners", lambda image, size: (True, reordered))
+    reordered = REORDERED[order](corners.reshape(6, 9, 2))
+    monkeypatch.setattr(detection, "find_pattern", lambda image, board: Pattern(reordered))
     assert farthest(detect(image, BOARD), corners) < 0.2
 
 
 @pytest.mark.parametrize("order", REORDERED)
 @pytest.mark.parametrize("transposed", [False, True])
-def test_whatever_the_detector_returns_on_a_square_board(monkeypatch, order, transposed):
+def test_whatever_the_search_returns_on_a_square_board(monkeypatch, order, transposed):
     board = Chessboard(4, 4)
     image, corners = photograph(board)
     grid = REORDERED[order](corners.reshape(4, 4, 2))
-    reordered = (grid.swapaxes(0, 1) if transposed else grid).reshape(-1, 2).astype(np.float32)
-    monkeypatch.setattr(cv2, "findChessboardCorners", lambda image, size: (True, reordered))
+    reordered = np.ascontiguousarray(grid.swapaxes(0, 1) if transposed else grid)
+    monkeypatch.setattr(detection, "find_pattern", lambda image, board: Pattern(reordered))
     assert farthest(detect(image, board), corners) < 0.2
 
 
@@ -381,6 +319,75 @@ def test_a_name_outside_ascii(tmp_path):
     assert detect(str(bracketed), BOARD).names == ("a[1].png",)
 
 
+def test_hidden_files_and_folders_are_no_photographs(folder):
+    (folder / "._b1.PNG").write_bytes(b"what macOS keeps of b1.PNG")
+    (folder / "album.png").mkdir()
+    assert detect(folder, BOARD).names == ALL
+    assert detect(str(folder / "*b10.*"), BOARD).names == ("b10.png",)
+
+
+def with_orientation(jpeg, orientation):
+    """The bytes of a JPEG file with an EXIF segment that holds nothing but an orientation."""
+    tiff = b"MM\0*\0\0\0\x08" + b"\0\x01" + b"\x01\x12\0\x03\0\0\0\x01" + bytes([0, orientation, 0, 0]) + b"\0\0\0\0"
+    body = b"Exif\0\0" + tiff
+    return jpeg[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + jpeg[2:]
+
+
+def test_pixels_are_those_of_the_sensor_whichever_way_up_the_camera_was_held(tmp_path):
+    """One lens has one principal point: files that differ in their EXIF orientation alone give the same corners."""
+    image, corners = photograph()
+    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
+    for orientation in (1, 3, 6):
+        (tmp_path / f"{orientation}.jpg").write_bytes(with_orientation(jpeg, orientation))
+    views = detect(tmp_path, BOARD)
+    assert views.size == SIZE
+    for view in views:
+        assert farthest(view, corners) < 0.1
+    upright = detect(tmp_path / "3.jpg", BOARD, orientation="upright")
+    assert farthest(upright, turned(image, corners, 2)[1]) < 0.1
+    assert detect(tmp_path / "6.jpg", BOARD, orientation="upright").size == SIZE[::-1]
+    with pytest.raises(ValueError, match="orientation: want 'sensor' or 'upright', got 'exif'"):
+        detect(tmp_path, BOARD, orientation="exif")
+
+
+def test_sizes_that_differ_are_told_by_groups():
+    image, _ = photograph()
+    small = image[:, 1:]
+    message = (
+        r"one size, got 400 x 300 px in image 1, image 3, image 4 and 1 more and 399 x 300 px in image 2; .* those of "
+        "400 x 300 px"
+    )
+    with pytest.raises(ValueError, match=message):
+        detect([image, small, image, image, image], BOARD)
+
+
+def test_a_video_gives_sharp_frames_that_differ(tmp_path):
+    """A board that stands still, then jumps; every third frame is sharp, and some show no board."""
+    path = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, SIZE)
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no video")
+    image, corners = photograph()
+    for number in range(90):
+        shown = np.roll(image, 20 if number >= 45 else 0, axis=1)
+        shown = shown if number % 3 == 1 else cv2.GaussianBlur(shown, (0, 0), 3)
+        writer.write(cv2.cvtColor(np.full_like(image, 128) if number < 6 else shown, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    views = detect(path, BOARD)
+    assert len(views) == 2
+    assert all(int(name.removeprefix("walk.avi frame ")) % 3 == 1 for name in views.names)
+    assert np.linalg.norm(views.pixels[0].numpy() - corners, axis=1).max() < 0.2
+    assert np.linalg.norm(views.pixels[1].numpy() - corners - (20, 0), axis=1).max() < 0.2
+    with pytest.warns(BoardNotFoundWarning, match="frame 0: found no board"):
+        strided = detect(path, BOARD, frames=30)
+    assert strided.names == ("walk.avi frame 30", "walk.avi frame 60")
+    (tmp_path / "broken.mp4").write_bytes(b"text")
+    with pytest.raises(ValueError, match=r"broken\.mp4: want a video"):
+        detect(tmp_path / "broken.mp4", BOARD)
+    with pytest.raises(ValueError, match="frames: want a whole number from 1 on, got 0"):
+        detect(path, BOARD, frames=0)
+
+
 # ------------------------------------------------------------------------------------------- progress and misses
 
 
@@ -407,7 +414,9 @@ def test_a_photograph_without_a_board_is_skipped_and_named(tmp_path):
 def test_no_board_anywhere():
     """One error that says what to check, and no warnings before it."""
     image, _ = photograph()
-    with pytest.raises(BoardNotFoundError, match=r"10 x 7 .* image 1, image 2, image 3 and 1 more\. Check .* squares"):
+    with pytest.raises(
+        BoardNotFoundError, match=r"10 x 7 .* image 1, image 2, image 3 and 1 more\. .* Check .* squares"
+    ):
         detect([image] * 4, Chessboard(10, 7))
     assert issubclass(BoardNotFoundError, ValueError)
 
@@ -448,13 +457,6 @@ def test_an_empty_list(photographs):
         detect(photographs, BOARD)
 
 
-def test_hidden_files_and_folders_are_no_photographs(folder):
-    (folder / "._b1.PNG").write_bytes(b"what macOS keeps of b1.PNG")
-    (folder / "album.png").mkdir()
-    assert detect(folder, BOARD).names == ALL
-    assert detect(str(folder / "*b10.*"), BOARD).names == ("b10.png",)
-
-
 def test_an_empty_folder_and_an_empty_pattern(tmp_path):
     with pytest.raises(ValueError, match="photographs: want at least one, got none in"):
         detect(tmp_path, BOARD)
@@ -464,7 +466,7 @@ def test_an_empty_folder_and_an_empty_pattern(tmp_path):
 
 def test_bad_files_are_named_before_the_search(tmp_path, monkeypatch):
     """A missing or a broken file stops the run before the first photograph is searched."""
-    monkeypatch.setattr(cv2, "findChessboardCorners", lambda *_: pytest.fail("searched before all files were checked"))
+    monkeypatch.setattr(detection, "find_pattern", lambda *_: pytest.fail("searched before all files were checked"))
     image, _ = photograph()
     good, broken, empty = tmp_path / "good.png", tmp_path / "broken.png", tmp_path / "empty.png"
     assert cv2.imwrite(str(good), image)

@@ -1,0 +1,239 @@
+"""Corners of a board in a photograph to a hundredth of a pixel, and which of them can be trusted."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+
+from diffproj.targets.corner_fit import fit_corners
+
+WINDOW = 0.30
+"""Half the side of the window that brings a corner near its place, relative to the distance to its neighbour."""
+
+SMALLEST_WINDOW = 2
+"""Minimum half side in px: a smaller window contains too few gradients for a stable result."""
+
+MISFIT = 0.12
+"""Misfit from which a corner is doubted: half covered ones leave a third of the contrast."""
+
+FAINT = 0.15
+"""Least contrast, relative to the median of the view: glare drowns the rest."""
+
+VAGUE = 0.15
+"""Standard deviation in px from which a corner is doubted."""
+
+LOOSE, TIGHT, LEAST = 0.15, 0.015, 0.15
+"""Distances from where neighbours put a corner from which it is doubted: the first two relative to the spacing, for
+corners that look as good as the others and for those that look worse; the third in px, added to the second."""
+
+DEVIATIONS = 6.0
+"""The least such distance in terms of the view's median."""
+
+REACH, NARROW = 0.65, 0.4
+"""Radius of the pixels that are fitted, relative to the spacing: for all corners, and for those beside other edges."""
+
+FEWEST = 9
+"""Corners below which nothing is known about their neighbours."""
+
+_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
+
+
+class Corners(NamedTuple):
+    """Refined corners.
+
+    Attributes:
+        grid: `(rows, columns, 2)` px; NaN where not visible.
+        sigma: `(rows, columns)` px, standard deviation of a coordinate that the noise of the grey values implies.
+        visible: `(rows, columns)`, false where something hides the corner.
+        misfit: the median over the corners; above a third, it is no chessboard.
+    """
+
+    grid: Float[np.ndarray, "rows columns 2"]
+    sigma: Float[np.ndarray, "rows columns"]
+    visible: Bool[np.ndarray, "rows columns"]
+    misfit: float
+
+    def is_board(self) -> bool:
+        """Whether enough of it proves to be a board: half of all corners, and half of those along each side."""
+        sides = self.visible[0], self.visible[-1], self.visible[:, 0], self.visible[:, -1]
+        return self.misfit < 0.35 and min(float(part.mean()) for part in (self.visible, *sides)) >= 0.5
+
+
+def refine_grid(image: Shaped[np.ndarray, "h w"], rough: Float[np.ndarray, "rows columns 2"]) -> Corners:
+    """Refine a board's corners, seek doubtful ones again where their neighbours put them, and hide those in vain.
+
+    A corner is doubted where four alternating sectors do not explain the grey values around it, or where it lies off
+    the smooth surface through its neighbours, of third degree in row and column, which no lens and no tilt fools.
+
+    Args:
+        image: `(H, W)`, uint8 or float32.
+        rough: `(rows, columns, 2)` px, to within a third of a square; NaN where a corner was not found.
+    """
+    known = np.isfinite(rough[..., 0])
+    start = rough if known.all() else np.where(known[..., None], rough, predicted(rough, known).grid)
+    everywhere = np.ones_like(known)
+    fit = _fitted(image, start, everywhere, REACH)
+    good = _trusted(image, fit, known)
+    for reach in (REACH, NARROW):
+        if good.all() or good.sum() < FEWEST:
+            break
+        again = np.where(good[..., None], fit.grid, predicted(fit.grid, good).grid)
+        tried = _fitted(image, again, ~good, reach)
+        fit = _Fit(
+            np.where(good[..., None], fit.grid, tried.grid),
+            *(np.where(good, old, new) for old, new in zip(fit[1:], tried[1:], strict=True)),
+        )
+        good = _trusted(image, fit, everywhere)
+    return Corners(np.where(good[..., None], fit.grid, np.nan), fit.sigma, good, float(np.median(fit.misfit)))
+
+
+class _Fit(NamedTuple):
+    """`Fitted` by row and column."""
+
+    grid: Float[np.ndarray, "rows columns 2"]
+    misfit: Float[np.ndarray, "rows columns"]
+    contrast: Float[np.ndarray, "rows columns"]
+    sigma: Float[np.ndarray, "rows columns"]
+
+
+class Prediction(NamedTuple):
+    """Where neighbours put corners.
+
+    Attributes:
+        grid: `(rows, columns, 2)` px.
+        spread: `(rows, columns)`, standard deviation of corner minus prediction for neighbours with deviation 1.
+    """
+
+    grid: Float[np.ndarray, "rows columns 2"]
+    spread: Float[np.ndarray, "rows columns"]
+
+
+def predicted(
+    grid: Float[np.ndarray, "rows columns 2"],
+    use: Float[np.ndarray, "rows columns"] | Bool[np.ndarray, "rows columns"],
+) -> Prediction:
+    """Where each corner's neighbours put it: a surface of third degree through those at most two lines away.
+
+    Near the board's sides, the neighbours are the corners of the nearest five lines. The corner itself does not count.
+
+    Args:
+        grid: corners; what is not used does not matter.
+        use: weights of the corners from 0 to 1.
+    """
+    rows, columns = grid.shape[:2]
+    weight = use.astype(float)
+    values = np.where(weight[..., None] > 0, grid, 0.0)
+    near_r, near_c = _nearest_lines(rows), _nearest_lines(columns)
+    r = np.broadcast_to(near_r[:, None, :, None], (rows, columns, near_r.shape[1], near_c.shape[1]))
+    c = np.broadcast_to(near_c[None, :, None, :], r.shape)
+    r, c = (part.reshape(rows * columns, -1) for part in (r, c))
+    here_r, here_c = (axis.reshape(-1, 1) for axis in np.indices((rows, columns)))
+    dr, dc = (r - here_r) / 2.0, (c - here_c) / 2.0
+    w = weight[r, c] * ((dr != 0) | (dc != 0)) + 0.0
+    powers = [dr**i * dc**j for i in range(4) for j in range(4 - i)]
+    # What few neighbours leave open is held near zero: terms of higher degree more.
+    degree = np.array([i + j for i in range(4) for j in range(4 - i)])
+    basis = np.stack(powers, axis=-1)
+    ridge = np.diag(np.array([1e-9, 1e-9, 1e-4, 1e-3])[degree])
+    weighted = basis * w[..., None]
+    inverse = np.linalg.inv(np.swapaxes(weighted, 1, 2) @ basis + ridge)
+    hat = (inverse[:, :1] @ np.swapaxes(weighted, 1, 2))[:, 0]  # the value at the corner itself
+    where = (hat[..., None] * values[r, c]).sum(axis=1)
+    # A ridge draws the value to zero where neighbours are few; hat sums to 1 otherwise.
+    where = where / np.where(np.abs(hat.sum(axis=1)) > 0.5, hat.sum(axis=1), 1.0)[:, None]
+    spread = np.sqrt(1 + (hat**2).sum(axis=1))
+    return Prediction(where.reshape(rows, columns, 2), spread.reshape(rows, columns))
+
+
+def _nearest_lines(count: int) -> np.ndarray:
+    """The numbers of the nearest five lines for each line, `(count, 5)`, or all where there are fewer."""
+    width = min(5, count)
+    first = (np.arange(count) - width // 2).clip(0, count - width)
+    return first[:, None] + np.arange(width)
+
+
+def _trusted(
+    image: Shaped[np.ndarray, "h w"],
+    fit: _Fit,
+    known: Bool[np.ndarray, "rows columns"],
+) -> Bool[np.ndarray, "rows columns"]:
+    """Which corners look like corners and lie where the others put them.
+
+    One that looks as good as its fellows is held to its neighbours loosely, so that no lens fools the test: only
+    another crossing looks as good. One that looks worse may be drawn aside by an edge nearby, and is held tightly.
+    """
+    grid, misfit, contrast, sigma = fit
+    usual = float(np.median(misfit[known]))
+    # Dark and light change places from one corner to the next.
+    contrast = contrast * (1 - 2 * (np.indices(contrast.shape).sum(axis=0) % 2))
+    contrast /= float(np.median(contrast[known])) or 1.0
+    use = known & (misfit < max(MISFIT, 2.5 * usual)) & (contrast > FAINT)
+    use &= sigma < np.maximum(VAGUE, 6 * float(np.median(sigma[known])))
+    use &= ((grid >= 1) & (grid <= np.array(image.shape[::-1]) - 2)).all(axis=-1)
+    if use.sum() < FEWEST:
+        return use
+    spacing = spacing_of(np.where(np.isfinite(grid), grid, 0.0))
+    weight, off, limit = use.astype(float), np.zeros(use.shape), np.ones(use.shape)
+    for _ in range(4):
+        surface = predicted(grid, weight)
+        off = np.linalg.norm(np.where(use[..., None], grid - surface.grid, 0.0), axis=-1) / surface.spread
+        scale = DEVIATIONS * float(np.median(off[use]))
+        limit = np.maximum(scale, np.where(misfit < 1.5 * usual + 0.03, LOOSE * spacing, TIGHT * spacing + LEAST))
+        if (off[use] < 0.5 * limit[use]).all():
+            break
+        weight = use / (1 + (off / (0.5 * limit)) ** 4)
+    return use & (off < limit)
+
+
+def _fitted(
+    image: Shaped[np.ndarray, "h w"],
+    start: Float[np.ndarray, "rows columns 2"],
+    which: Bool[np.ndarray, "rows columns"],
+    reach: float,
+) -> _Fit:
+    """Some corners, from where they are to a pixel or two; the others stay."""
+    spacing = spacing_of(start)[which]
+    near = _brought_near(image, start[which], spacing)
+    angles = np.stack([np.arctan2(slope[..., 1], slope[..., 0])[which] for slope in _slopes(start)], axis=-1)
+    found = fit_corners(image, near, angles, spacing, reach)
+    fit = _Fit(start.copy(), *(np.zeros(which.shape) for _ in range(3)))
+    for whole, part in zip(fit, found, strict=True):
+        whole[which] = part
+    return fit
+
+
+def _slopes(grid: Float[np.ndarray, "rows columns 2"]) -> tuple[np.ndarray, np.ndarray]:
+    """The steps along each row and down each column at each corner, in px."""
+    return np.gradient(grid, axis=1), np.gradient(grid, axis=0)
+
+
+def _brought_near(
+    image: Shaped[np.ndarray, "h w"], corners: Float[np.ndarray, "n 2"], spacing: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 2"]:
+    """Corners to a fraction of a pixel by `cv2.cornerSubPix`, each in a window of its own size."""
+    half_sides = np.maximum(WINDOW * spacing, SMALLEST_WINDOW).astype(int)
+    corners = corners.astype(np.float32)
+    inside = ((corners >= 0) & (corners <= np.array(image.shape[::-1]) - 1)).all(axis=-1)
+    for half_side in np.unique(half_sides[inside]):
+        group = (half_sides == half_side) & inside
+        window = (int(half_side), int(half_side))
+        start = np.ascontiguousarray(corners[group]).reshape(-1, 1, 2)
+        corners[group] = cv2.cornerSubPix(image, start, window, (-1, -1), _STOP).reshape(-1, 2)
+    return corners.astype(np.float64)
+
+
+def spacing_of(grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns"]:
+    """The distance from each corner to the nearest of its neighbours along row and column, in px."""
+    rows, columns = grid.shape[:2]
+    down = np.linalg.norm(np.diff(grid, axis=0), axis=-1)
+    along = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
+    padded = [
+        np.pad(down, ((1, 0), (0, 0)), constant_values=np.inf),
+        np.pad(down, ((0, 1), (0, 0)), constant_values=np.inf),
+    ]
+    padded += [
+        np.pad(along, ((0, 0), (1, 0)), constant_values=np.inf),
+        np.pad(along, ((0, 0), (0, 1)), constant_values=np.inf),
+    ]
+    return np.min(padded, axis=0).reshape(rows, columns)

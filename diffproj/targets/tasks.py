@@ -1,0 +1,61 @@
+"""One piece of work for each photograph, here or on the workers of an executor, with results in order."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+AHEAD = 64
+"""Tasks handed out and not yet done: enough to keep a cluster busy, and few enough to stop soon after a failure."""
+
+
+def results_of(
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    executor: Executor | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> list[Result]:
+    """Do the work for each item; the results are in the items' order.
+
+    Args:
+        work: what to do; for processes and clusters, something that can be pickled, as the items and results.
+        items: what to do it for.
+        executor: any `concurrent.futures.Executor`; none does the work here, one item after the other.
+        progress: called here with `(done, total)` after each item.
+
+    Raises:
+        Exception: the first that the work raised; what has not begun by then is cancelled.
+
+    Example:
+        >>> from concurrent.futures import ThreadPoolExecutor
+        >>> with ThreadPoolExecutor(2) as pool:
+        ...     results_of(abs, [-3, 1, -2], pool)
+        [3, 1, 2]
+    """
+    total = len(items)
+    if executor is None:
+        results = []
+        for done, item in enumerate(items, start=1):
+            results.append(work(item))
+            if progress is not None:
+                progress(done, total)
+        return results
+    found: dict[int, Any] = {}
+    places: dict[Future[Any], int] = {}
+    waiting = list(reversed(range(total)))
+    try:
+        while waiting or places:
+            while waiting and len(places) < AHEAD:
+                place = waiting.pop()
+                places[executor.submit(work, items[place])] = place
+            done, _ = wait(places, return_when=FIRST_COMPLETED)
+            for future in sorted(done, key=places.__getitem__):
+                found[places.pop(future)] = future.result()
+                if progress is not None:
+                    progress(len(found), total)
+    finally:
+        for future in places:
+            future.cancel()
+    return [found[place] for place in range(total)]

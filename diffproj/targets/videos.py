@@ -1,0 +1,103 @@
+"""Photographs from videos: sharp frames, and of those in which a board hardly moved only one."""
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4"})
+"""Suffixes of files that count as videos."""
+
+MOST = 60
+"""Frames that are taken of a video by themselves."""
+
+MOVED = 0.02
+"""Mean motion of the corners, relative to the frame's diagonal, from which two frames count as two views."""
+
+
+class Frame(NamedTuple):
+    """One frame of a video, compressed without loss: many frames fit into memory, and travel to other machines.
+
+    Attributes:
+        video: the file.
+        number: of the frame, from 0.
+        png: the grey image.
+        sharpness: for which it was chosen, so that others may show the board at the same place; None for one of each
+            so-manieth frame.
+    """
+
+    video: Path
+    number: int
+    png: bytes
+    sharpness: float | None
+
+    @property
+    def image(self) -> UInt8[np.ndarray, "h w"]:
+        """The grey image `(H, W)`."""
+        return np.asarray(cv2.imdecode(np.frombuffer(self.png, dtype=np.uint8), cv2.IMREAD_GRAYSCALE))
+
+
+def frames_of(video: Path, every: int | None) -> list[Frame]:
+    """Frames of a video: each so-manieth, or the sharpest of each of at most 60 equal parts.
+
+    Raises:
+        ValueError: OpenCV reads no frame of it.
+    """
+    count = sum(1 for _ in _decoded(video))
+    if not count:
+        raise ValueError(f"{video}: want a video, got a file of which OpenCV reads no frame")
+    if every is not None:
+        return [_kept(video, n, image, None) for n, image in islice(enumerate(_decoded(video)), 0, None, every)]
+    length = -(-count // MOST)
+    frames: list[Frame] = []
+    best = -1.0
+    for number, image in enumerate(_decoded(video)):
+        if number % length == 0:
+            best = -1.0
+        sharpness = _sharpness(image)
+        if sharpness > best:
+            if best >= 0:
+                frames.pop()
+            best = sharpness
+            frames.append(_kept(video, number, image, sharpness))
+    return frames
+
+
+def distinct(
+    grids: list[Float[np.ndarray, "rows columns 2"]], sharpness: list[float], size: tuple[int, int]
+) -> list[bool]:
+    """Which views of a board to keep so that all differ: the sharpest of each place."""
+    least = MOVED * float(np.hypot(*size))
+    kept: list[int] = []
+    for k in sorted(range(len(grids)), key=lambda k: -sharpness[k]):
+        if all(np.nanmean(np.linalg.norm(grids[k] - grids[other], axis=-1)) >= least for other in kept):
+            kept.append(k)
+    return [k in kept for k in range(len(grids))]
+
+
+def _decoded(video: Path) -> Iterator[UInt8[np.ndarray, "_h _w"]]:
+    """All frames, grey, as they lie in the file."""
+    capture = cv2.VideoCapture(str(video))
+    try:
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        while True:
+            there, image = capture.read()
+            if not there:
+                return
+            yield image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    finally:
+        capture.release()
+
+
+def _sharpness(image: UInt8[np.ndarray, "h w"]) -> float:
+    """The variance of the second derivatives, at half the size, where the noise of the sensor counts less."""
+    small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(small, cv2.CV_32F).var())
+
+
+def _kept(video: Path, number: int, image: UInt8[np.ndarray, "h w"], sharpness: float | None) -> Frame:
+    return Frame(video, number, cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes(), sharpness)
