@@ -46,7 +46,7 @@ class Shared:
 
 def measured(shared: Shared) -> list[Any]:
     found = dp.measure(
-        shared.pixels, shared.calibration, shared.slanted, plane_covariance=1e-6 * torch.eye(4, dtype=D, device="cpu")
+        shared.pixels, shared.calibration, shared.slanted, view=0, plane_covariance=1e-6 * torch.eye(4, dtype=D, device="cpu")
     )
     middle = found.quantity(lambda p: p.mean(dim=0)[0], [[0, 1, 2]])
     numbers = [found.lengths(), found.angles(), found.area(), middle]
@@ -66,8 +66,8 @@ def measured(shared: Shared) -> list[Any]:
 
 def maps(shared: Shared) -> list[Any]:
     found = [
-        dp.AccuracyMap.over_image(shared.calibration, step=200),
-        dp.AccuracyMap.over_plane(shared.calibration, (0, 0, 200, 125), shape=(3, 4)),
+        dp.AccuracyMap.over_image(shared.calibration, view=0, step=200),
+        dp.AccuracyMap.over_plane(shared.calibration, (0, 0, 200, 125), view=0, shape=(3, 4)),
     ]
     return [(m.pixels, m.points, m.covered, m.resolution, m.deviation) for m in found]
 

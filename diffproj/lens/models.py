@@ -117,7 +117,7 @@ def register_lens(kind: type[T], tensors: Sequence[str], constants: Sequence[str
 
     Example:
         >>> import torch, diffproj as dp
-        >>> class Stretched:
+        >>> class Stretched(dp.Lens):
         ...     '''x is stretched by a factor, y is not.'''
         ...     def __init__(self, factor):
         ...         self.factor = factor  # (*B,)

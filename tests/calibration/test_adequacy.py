@@ -120,7 +120,8 @@ def test_corners_that_scatter() -> None:
 def test_what_is_said_is_in_message_and_summary() -> None:
     found = dp.calibrate(dp.example_views("left"), BOARD, "none")
     assert found.message == f"converged: no step lowers the error any more; {found.remarks[0]}"
-    assert found.summary().splitlines()[-1] == found.remarks[0]
+    assert found.remarks[0] in found.summary().splitlines()
+    assert found.summary().splitlines()[-1] == found.verdict
 
 
 def test_skew_is_advised_where_it_is_missing() -> None:

@@ -60,7 +60,7 @@ def test_scenes_near_the_origin_and_float64_do_not_warn() -> None:
         dp.back_project(PIXELS.float(), camera.to(S), GROUND)
         dp.back_project(PIXELS, camera, GROUND)
     dp.back_project(PIXELS, camera_at(1e7), GROUND)
-    on_plane = dp.Camera(camera_at(0.0).K, t=torch.zeros(3, dtype=D)).to(S)
+    on_plane = dp.Camera(camera_at(0.0).K, camera_at(0.0).R, torch.zeros(3, dtype=D)).to(S)
     assert not dp.back_project(PIXELS.float(), on_plane, GROUND)[1].any()
 
 

@@ -10,15 +10,16 @@ D = torch.float64
 COEFFICIENTS = [-0.2, 0.05, 0.001, -0.001, 0.002, 0.01, 0.01, 0.001, 0.001, 0.002, 0.001, 0.002, 0.02, -0.03]
 
 
-class Stereographic:
+class Stereographic(dp.Lens):
     """A lens of another package: only what `dp.Lens` asks for, and 20 lines of it."""
 
     def __init__(self, scale: Tensor) -> None:
-        self.scale, self.batch_shape, self.dtype, self.device = scale, scale.shape, scale.dtype, scale.device
+        self.scale = scale
 
-    @property
-    def domain(self) -> Tensor:
-        return torch.full_like(self.scale, 3.0)
+    batch_shape = property(lambda self: self.scale.shape)
+    dtype = property(lambda self: self.scale.dtype)
+    device = property(lambda self: self.scale.device)
+    domain = property(lambda self: torch.full_like(self.scale, 3.0))
 
     def project_direction(self, direction: Tensor) -> tuple[Tensor, Tensor]:
         length = direction.norm(dim=-1, keepdim=True)

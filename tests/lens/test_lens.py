@@ -348,7 +348,7 @@ def test_fisheye_domain() -> None:
 
 def test_fisheye_has_no_image_of_the_direction_straight_back() -> None:
     lens = KannalaBrandt(torch.zeros(4, dtype=torch.float64))
-    direction = tensor([[0, 0, -1.0], [0, 0, 0], [0, 0, 1], [1e-3, 0, -1], [1e200, 0, 1e200], [1e-200, 0, 0]])
+    direction = tensor([[0, 0, -1.0], [0, 0, 0], [0, 0, 1], [1e-3, 0, -1], [1e200, 0, 1e200], [1e-150, 0, 0]])
     xy_distorted, valid = lens.project_direction(direction)
     assert valid.tolist() == [False, False, True, True, True, True]
     torch.testing.assert_close(xy_distorted[4], tensor([math.pi / 4, 0]))

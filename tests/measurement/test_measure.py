@@ -354,7 +354,7 @@ def test_gradients_of_deviations_where_a_variance_is_zero() -> None:
     camera = calibration.cameras[0]
     camera = dp.Camera(K, camera.R, camera.t, camera.distortion)
     for source, sigma in ((calibration, None), (camera, 0.3), (camera, 0.0), (calibration, 0.0)):
-        measured = dp.measure(pixels, source, dp.Plane.z(0.0), pixel_sigma=sigma)
+        measured = dp.measure(pixels, source, dp.Plane.z(0.0), view=0, pixel_sigma=sigma)
         for found in (measured.deviations, measured.covariance, measured.lengths().deviation, measured.joint()):
             slopes = torch.autograd.grad(found.sum(), [pixels, K], allow_unused=True, retain_graph=True)
             assert all(slope is None or bool(slope.isfinite().all()) for slope in slopes)
@@ -364,8 +364,8 @@ def test_many_plane_covariances() -> None:
     calibration = dp.calibrate(dp.example_views("left")[:6], dp.Chessboard(), "brown4")
     pixels, plane = calibration.views.pixels[0, :3], dp.Plane([0.1, 0.2, 1.0], 3.0)
     covariances = torch.tensor([1e-6, 1e-4], dtype=torch.float64)[:, None, None] * torch.eye(4, dtype=torch.float64)
-    many = dp.measure(pixels, calibration, plane, plane_covariance=covariances)
+    many = dp.measure(pixels, calibration, plane, view=0, plane_covariance=covariances)
     for covariance, found in zip(covariances, many.deviations, strict=True):
-        one = dp.measure(pixels, calibration, plane, plane_covariance=covariance)
+        one = dp.measure(pixels, calibration, plane, view=0, plane_covariance=covariance)
         torch.testing.assert_close(found, one.deviations, rtol=1e-12, atol=0)
     assert many.lengths().interval()[0].shape == (2, 2)
