@@ -46,7 +46,11 @@ class Shared:
 
 def measured(shared: Shared) -> list[Any]:
     found = dp.measure(
-        shared.pixels, shared.calibration, shared.slanted, view=0, plane_covariance=1e-6 * torch.eye(4, dtype=D, device="cpu")
+        shared.pixels,
+        shared.calibration,
+        shared.slanted,
+        view=0,
+        plane_covariance=1e-6 * torch.eye(4, dtype=D, device="cpu"),
     )
     middle = found.quantity(lambda p: p.mean(dim=0)[0], [[0, 1, 2]])
     numbers = [found.lengths(), found.angles(), found.area(), middle]

@@ -128,7 +128,7 @@ def _say_view(name: str, camera: Camera) -> None:
 
 def _off_axis(camera: Camera, pixels: list[tuple[float, float]]) -> list[float]:
     """The angles between pixels and the optical axis in degrees; NaN where the lens does not reach them."""
-    directions, valid = camera.directions(torch.tensor(pixels, dtype=torch.float64))
+    directions, valid = camera.directions(torch.tensor(pixels, dtype=torch.float64, device="cpu"))
     across = directions[:, :2].norm(dim=-1)
     angle = torch.rad2deg(torch.atan2(across, directions[:, 2]))
     return torch.where(valid, angle, torch.nan).tolist()
@@ -136,7 +136,7 @@ def _off_axis(camera: Camera, pixels: list[tuple[float, float]]) -> list[float]:
 
 def _reach(camera: Camera, corner: tuple[float, float]) -> float:
     """How far towards a corner the lens reaches, from 0 at the principal point to 1."""
-    steps = torch.linspace(0, 1, STEPS + 1, dtype=torch.float64)[:, None]
+    steps = torch.linspace(0, 1, STEPS + 1, dtype=torch.float64, device="cpu")[:, None]
     middle = camera.K[:2, 2]
-    _, valid = camera.directions(middle + steps * (torch.tensor(corner, dtype=torch.float64) - middle))
+    _, valid = camera.directions(middle + steps * (torch.tensor(corner, dtype=torch.float64, device="cpu") - middle))
     return 1.0 if bool(valid.all()) else float(steps[int((~valid).nonzero()[0])])

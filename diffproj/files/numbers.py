@@ -225,7 +225,7 @@ def camera_of(
 
 def as_tensor(numbers: Any) -> Tensor:
     """A float64 tensor of its own."""
-    return torch.tensor(np.asarray(numbers, dtype=np.float64))
+    return torch.tensor(np.asarray(numbers, dtype=np.float64), device="cpu")
 
 
 def described(value: Any) -> str:

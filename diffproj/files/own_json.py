@@ -129,7 +129,7 @@ def _tensor(fields: dict[str, Any], name: str, dtype: torch.dtype) -> Tensor:
     array = np.array(fields[name])
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name}: want numbers, got something else")
-    return torch.tensor(array, dtype=dtype)
+    return torch.tensor(array, dtype=dtype, device="cpu")
 
 
 def _checked(document: Document) -> dict[str, Any]:

@@ -23,7 +23,7 @@ def cameras_of(item: Camera | Calibration, what: str) -> list[Camera]:
         raise ValueError(f"want at least one camera for {what}, got batch shape {tuple(camera.batch_shape)}")
     if not camera.batch_shape:
         return [camera]
-    rows = torch.arange(camera.batch_shape.numel()).reshape(camera.batch_shape)
+    rows = torch.arange(camera.batch_shape.numel(), device="cpu").reshape(camera.batch_shape)
     return [camera[tuple((rows == i).nonzero()[0].tolist())] for i in range(rows.numel())]
 
 
@@ -41,7 +41,7 @@ def one_camera(item: Camera | Calibration, what: str) -> Camera:
 
 def has_pose(camera: Camera) -> bool:
     """Whether the world frame is another than the camera's."""
-    turned = camera.R != torch.eye(3, dtype=camera.dtype)  # noqa: SIM300
+    turned = camera.R != torch.eye(3, dtype=camera.dtype, device=camera.device)  # noqa: SIM300
     return bool(turned.any() or (camera.t != 0).any())
 
 

@@ -251,9 +251,9 @@ class Measurement(Copied, Shown):
         beyond = self.extrapolated
         columns: dict[str, Tensor] = {}
         if batch:
-            cameras = torch.arange(batch.numel()).reshape(*batch, 1)
+            cameras = torch.arange(batch.numel(), device="cpu").reshape(*batch, 1)
             columns["camera"] = cameras.expand(self.valid.shape)
-        columns["point"] = torch.arange(self.valid.shape[-1]).expand(self.valid.shape)
+        columns["point"] = torch.arange(self.valid.shape[-1], device="cpu").expand(self.valid.shape)
         columns |= dict(zip("uv", sight.pixels.unbind(-1), strict=True)) | {"valid": self.valid}
         columns |= dict(zip("xyz", places.unbind(-1), strict=True))
         columns |= {f"{axis}_deviation": part for axis, part in zip("xyz", self.deviations.unbind(-1), strict=True)}

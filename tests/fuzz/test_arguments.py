@@ -61,7 +61,7 @@ WRONG: list[Case] = [
     (TypeError, "max_iterations: want .* got 3.5", lambda _: dp.calibrate(VIEWS, BOARD, max_iterations=3.5)),
     (ValueError, "tolerance: want .* got -1.0", lambda _: dp.calibrate(VIEWS, BOARD, tolerance=-1)),
     (TypeError, "seed: want a whole number", lambda _: dp.bootstrap(VIEWS, BOARD, seed="a")),
-    (TypeError, "pixel_sigma: want .* got 'x'", lambda k: dp.measure(PIXELS, k, PLANE, view=0, pixel_sigma="x")),
+    (ValueError, "pixel_sigma: want .* got 'x'", lambda k: dp.measure(PIXELS, k, PLANE, view=0, pixel_sigma="x")),
     (TypeError, "size: want .width, height. in whole px, got 5", lambda _: CAMERA.resized(5)),
     (TypeError, "size: want .width, height. in whole px, got 5", lambda _: dp.render(IMAGE, CAMERA, PLANE, (0, 0, 9, 9), size=5)),
     (ValueError, r"extent: want .* got \(0, 0, 9\)", lambda _: dp.rectify(IMAGE, CAMERA, PLANE, (0, 0, 9), 1)),
@@ -71,7 +71,7 @@ WRONG: list[Case] = [
     (ValueError, "resolution: want .* got nan", lambda _: dp.rectify(IMAGE, CAMERA, PLANE, (0, 0, 9, 9), np.nan)),
     (ValueError, "shape: want .rows, columns.* got 0", lambda k: dp.AccuracyMap.over_plane(k, (0, 0, 9, 9), shape=(0, 1))),
     (ValueError, "step: want .* got nan", lambda k: dp.AccuracyMap.over_image(k, step=np.nan)),
-    (ValueError, "level: want a probability", lambda k: dp.measure(PIXELS, k, PLANE, view=0).interval(1.5)),
+    (ValueError, "level: want a probability", lambda k: dp.measure(PIXELS, k, PLANE, view=0, pixel_sigma=0.5).interval(1.5)),
     (TypeError, "learn: want names of parts, got 3", lambda _: dp.PlaneProjector(CAMERA, PLANE, learn=3)),
     (ValueError, "scale: want .* got -2.0", lambda _: dp.LearnablePlane(PLANE, scale=-2.0)),
     # Views, points and functions of them.
@@ -81,15 +81,15 @@ WRONG: list[Case] = [
     (TypeError, "view: want a number .* got True", lambda k: dp.measure(PIXELS, k, PLANE, view=True)),
     (ValueError, "view: want a number .* got 13", lambda k: dp.CalibrationPrior(k, view=13)),
     (ValueError, "view: want a number .* got 13", lambda k: k.covariance.view(13)),
-    (ValueError, "corners: want the numbers .* of one polygon", lambda k: dp.measure(PIXELS, k, PLANE, view=0).area([[0, 1, 2]])),
-    (ValueError, "corners: want at least 3, got 2", lambda k: dp.measure(PIXELS, k, PLANE, view=0).area([0, 1])),
-    (IndexError, "pairs: want numbers of the 3 points", lambda k: dp.measure(PIXELS, k, PLANE, view=0).lengths([[0, 3]])),
+    (ValueError, "corners: want the numbers .* of one polygon", lambda k: dp.measure(PIXELS, k, PLANE, view=0, pixel_sigma=0.5).area([[0, 1, 2]])),
+    (ValueError, "corners: want at least 3, got 2", lambda k: dp.measure(PIXELS, k, PLANE, view=0, pixel_sigma=0.5).area([0, 1])),
+    (IndexError, "pairs: want numbers of the 3 points", lambda k: dp.measure(PIXELS, k, PLANE, view=0, pixel_sigma=0.5).lengths([[0, 3]])),
     (
         ValueError,
         "function: want one that gives a number, .* got Tensor of shape",
-        lambda k: dp.measure(PIXELS, k, PLANE, view=0).quantity(lambda p: p, [[0]]),
+        lambda k: dp.measure(PIXELS, k, PLANE, view=0, pixel_sigma=0.5).quantity(lambda p: p, [[0]]),
     ),
-    (TypeError, "function: want a function", lambda k: dp.measure(PIXELS, k, PLANE, view=0).quantity(3, [[0]])),
+    (TypeError, "function: want a function", lambda k: dp.measure(PIXELS, k, PLANE, view=0, pixel_sigma=0.5).quantity(3, [[0]])),
     # Arrays and tensors.
     (TypeError, "pixels: want torch.float64 as camera has.*pixels.to", lambda _: dp.back_project(PIXELS.float(), CAMERA, PLANE)),
     (TypeError, "pixels: want .* lists of numbers of equal lengths", lambda _: dp.back_project([[1, 2], [3]], CAMERA, PLANE)),
@@ -121,7 +121,7 @@ def test_an_argument_is_refused_by_name(
 
 
 def test_a_map_without_places_in_the_image_is_not_drawn(calibration: dp.Calibration) -> None:
-    nowhere = dp.AccuracyMap.over_plane(calibration, (1e5, 1e5, 2e5, 2e5), shape=(3, 4))
+    nowhere = dp.AccuracyMap.over_plane(calibration, (1e5, 1e5, 2e5, 2e5), view=0, shape=(3, 4))
     with pytest.raises(ValueError, match="found: want a map .* got 0 of 3 x 4 in the image"):
         dp.figures.accuracy(nowhere)
 
@@ -214,5 +214,7 @@ def test_planes_of_numbers_are_stacked_with_planes_of_tensors() -> None:
 def test_many_sets_of_pixels_are_measured_from_one_located_view(calibration: dp.Calibration) -> None:
     located = dp.locate(VIEWS[:1], BOARD, calibration)
     far = torch.tensor([[5.0, 5.0], [630, 470]], dtype=D)  # where the lens is extrapolated
-    one, two = (dp.measure(pixels, located, PLANE, view=0) for pixels in (far, torch.stack([far, far])))
+    one, two = (
+        dp.measure(pixels, located, PLANE, view=0, pixel_sigma=0.5) for pixels in (far, torch.stack([far, far]))
+    )
     torch.testing.assert_close(two.deviations, one.deviations.expand(2, 2, 3))

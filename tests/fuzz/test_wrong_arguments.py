@@ -79,7 +79,7 @@ def things() -> Things:
     located = dp.locate(views, board, calibration)
     plane = dp.Plane.z(0.0)
     measured = dp.measure(views.pixels[0, :5], calibration, plane, view=0)
-    accuracy = dp.AccuracyMap.over_image(calibration, step=40)
+    accuracy = dp.AccuracyMap.over_image(calibration, view=0, step=40)
     return Things(
         K,
         plain,
