@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from diffproj._core.arguments import instance, number
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.result import Calibration, as_calibration
 from diffproj.measurement.accuracy_map import AccuracyMap
 from diffproj.paper.experiment import Experiment
 
@@ -190,7 +190,7 @@ def corners(calibration: Calibration) -> Figure:
         >>> [axes.get_title() for axes in figure.axes]
         ['702 corners in 13 views', 'residuals, 109 times as long: RMS 0.18 px']
     """
-    size = calibration.views.size or calibration.camera.size
+    size = as_calibration(calibration).views.size or calibration.camera.size
     if calibration.views.batch_shape or size is None:
         raise ValueError("calibration: want one camera whose size is known, got many, or one without a size")
     figure = Figure(figsize=_beside(size, 2), layout="constrained")

@@ -346,6 +346,7 @@ def _measurement(t: Things) -> dict[str, Call]:
             dp.AccuracyMap.over_plane, {**wide, "extent": (0, 0, 30, 20), "shape": (2, 3)}, 4
         ),
         "figures.accuracy": Call(dp.figures.accuracy, {"found": t.accuracy, "unit": "mm"}, 0.1),
+        "figures.corners": Call(dp.figures.corners, {"calibration": k}, 0.1),
         "figures.fig7": Call(dp.figures.fig7, {"experiment": t.experiment, "magnification": 2.0}, 0.1),
     }
 
@@ -387,6 +388,7 @@ def _uses(t: Things) -> dict[str, Call]:
         "CalibrationPrior": Call(dp.CalibrationPrior, {"calibration": t.calibration, "view": 1}),
         "CalibrationPrior()": Call(prior, {"camera": t.calibration.cameras[0]}),
         "save_camera": Call(dp.save_camera, {"path": folder / "saved.json", "camera": c, "format": "json"}, 3),
+        "load": Call(dp.load, {"path": path}, 3),
         "load_camera": Call(dp.load_camera, {"path": path, "format": "json"}, 3),
         "load_calibration": Call(dp.load_calibration, {"path": path}, 3),
     }
@@ -445,6 +447,10 @@ NOT_CALLED = {
     "SoftL1.weight",
     "Cauchy.value",
     "Huber.weight",
+    "figures.content",  # for the command line, which looked at what is drawn
+    "figures.measured",
+    "Lens.distort",
+    "Lens.undistort",
     "Lens.project_direction",
     "Lens.unproject",
     "Lens.to",
