@@ -358,6 +358,7 @@ def in_threads(shared: Shared, alone: Alone, names: Sequence[str], rounds: int) 
         sys.setswitchinterval(before)
 
 
+@pytest.mark.slow
 def test_threads_that_share_all_objects(shared: Shared, alone: Alone) -> None:
     in_threads(shared, alone, QUICK, rounds=6)
 

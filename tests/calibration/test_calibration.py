@@ -129,6 +129,7 @@ def test_minimum_is_opencvs_on_simulated_corners(model: LensModel, count: int) -
     assert_same_minimum(views, model)
 
 
+@pytest.mark.slow
 def test_minimum_is_opencvs_for_eight_coefficients() -> None:
     # Along the valley k1 and k4 are known to 20, and a part of 10^11 of the cost is 1e-5 px in focal length.
     _, views = simulate(100, TRUE_LENSES["brown8"])

@@ -66,6 +66,7 @@ def problems(
     return dp.Views(pixels + noise, size=size), truth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_minimum_from_the_truth(family: str) -> None:
     views, truth = problems(5, 10, **FAMILIES[family])

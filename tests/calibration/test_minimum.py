@@ -226,6 +226,7 @@ def test_wrong_corners_turn_no_view(options: dict[str, Any], share: float) -> No
         assert int((~found.used.any(-1)).sum()) == 0
 
 
+@pytest.mark.slow
 def test_a_tilted_lens_leaves_its_side_valley() -> None:
     along = torch.arange(31, dtype=D) * 5 - 75
     x, y = torch.meshgrid(along, along, indexing="xy")
@@ -302,6 +303,7 @@ def test_locate_along_rays_far_off_the_axis(
 # ---------------------------------------------------------------------------------------------------------- verdicts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-8, 1.0, 1e8])
 @pytest.mark.parametrize("objective", ["image", "plane"])
 def test_the_verdict_does_not_depend_on_the_unit_of_weights(unit: float, objective: str) -> None:
@@ -315,6 +317,7 @@ def test_the_verdict_does_not_depend_on_the_unit_of_weights(unit: float, objecti
         dp.calibrate(dp.Views(mixed, names=views.names, size=views.size), BOARD, weights=weights)
 
 
+@pytest.mark.slow
 def test_a_robust_loss_does_not_hide_a_view_that_fits_nowhere() -> None:
     views = dp.example_views("left")
     mixed = views.pixels.clone()

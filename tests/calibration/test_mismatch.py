@@ -95,6 +95,7 @@ def test_another_zoom_or_focus_and_other_edits(calibration: dp.Calibration) -> N
     assert not located(changed(calibration), BOARD, calibration)[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corners", [4, 12, 54])
 def test_false_alarms_are_rare(corners: int) -> None:
     """Of 400 calibrations and a new view of each at most 1 %, also where its noise is 1.4 times as large: 2 %."""

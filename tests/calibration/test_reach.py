@@ -124,12 +124,14 @@ def test_the_summary_tells_what_of_the_image_is_out_of_reach() -> None:
         assert "fold" not in dp.calibrate(dp.example_views(side), BOARD).summary()
 
 
+@pytest.mark.slow
 def test_cross_validation_counts_what_a_lens_loses() -> None:
     outcome = dp.cross_validate(dp.example_views("right"), BOARD, "brown12")
     assert outcome.held_out_px.max() < 0.3
     assert not bool(outcome.lost.any())
 
 
+@pytest.mark.slow
 def test_a_fold_whose_lens_loses_corners_is_infinitely_bad() -> None:
     """The middle of the image tells five coefficients nothing about its corners."""
     strong = dp.Camera(K, distortion=lens_of(-0.3, 0.12, 0.0, 0.0, -0.02), size=SIZE)

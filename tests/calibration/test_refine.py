@@ -123,8 +123,8 @@ def test_plausible_intrinsics_are_not_warned_of(seen: tuple[dp.Camera, dp.Views]
     # One view of a board in a corner of the image, part of a photograph, and points of the normalised plane.
     camera = dp.Camera(K)
     corner = camera.at(torch.eye(3, dtype=D), torch.tensor([-300.0, -250, 700], dtype=D))
-    alone = synthetic.corner_views(corner.expand(1), dp.Chessboard(4, 4, 20.0))
-    dp.locate(alone, dp.Chessboard(4, 4, 20.0), camera)
+    alone = synthetic.corner_views(corner.expand(1), dp.Chessboard(5, 4, 20.0))
+    dp.locate(alone, dp.Chessboard(5, 4, 20.0), camera)
     part = dp.Views(views.pixels - 200)
     dp.locate(part, BOARD, dp.Camera(camera.cropped(200, 200, 440, 280).K, distortion=truth.distortion[0, 0]))
     xy = truth.directions(views.pixels)[0]

@@ -26,6 +26,7 @@ def lenses(count: int) -> list[torch.Tensor]:
     return list((0.05 * draws).unbind())
 
 
+@pytest.mark.slow
 def test_the_memory_of_compiled_lenses() -> None:
     coefficients = lenses(RECENT + 8)  # more than are remembered, so that entries come and go
     key = BrownConrady._key

@@ -66,6 +66,7 @@ def test_errors_are_what_equations_15_to_17_say(views: dp.Views) -> None:
     torch.testing.assert_close(torch.tensor(row.deviation).double(), error.std(dim=0), rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_trends_of_the_paper_on_photographs_with_known_truth() -> None:
     setup = dp.paper_setup()
     images = [

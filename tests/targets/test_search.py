@@ -54,6 +54,7 @@ def test_a_strongly_bent_board():
     assert np.linalg.norm(detect(image, board).pixels[0].numpy() - corners, axis=-1).max() < 0.1
 
 
+@pytest.mark.slow
 def test_a_small_board_in_a_large_photograph_and_a_large_one():
     board = Chessboard(9, 6, 1.0)
     small, corners = seen(board, scene(board, 9, tilt=(0.2, 0.1, 0.0)))
