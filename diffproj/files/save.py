@@ -39,6 +39,9 @@ def save_camera(path: PathLike, camera: Camera | PinholeCamera | Calibration, fo
         raise TypeError(f"camera: want dp.Camera or dp.Calibration, got {type(camera).__name__}")
     if isinstance(camera, PinholeCamera):
         camera = as_camera(camera)
+    one = camera.camera if isinstance(camera, Calibration) else camera
+    if any(part.is_meta for part in one.tensors()):
+        raise ValueError("camera: want values to write, got tensors on the device meta")
     path = file_path("path", path)
     try:
         contents = format_to_write(path, format).write(path, camera)
