@@ -84,7 +84,7 @@ def _fit_block(
     start = np.concatenate([corners - base, angles, np.zeros((len(corners), 4)), blur], axis=1)
     unknowns = torch.from_numpy(start.astype(np.float32))
     unknowns[:, 4:6] = _first_light(unknowns, grey, weight, x, y)
-    damping = torch.full((len(corners), 1), 1e-3)
+    damping = torch.full((len(corners), 1), 1e-3, dtype=unknowns.dtype, device="cpu")
     error, slopes = _residuals(unknowns, grey, x, y)
     cost = (weight * error * error).sum(-1)
     for _ in range(STEPS):
