@@ -151,6 +151,7 @@ def test_with_the_plane_objective() -> None:
         assert 0.93 < ratio < 1.07, name
 
 
+@pytest.mark.filterwarnings("ignore:.*another camera, zoom or focus:UserWarning")  # false alarms, of thousands
 def test_located_photographs() -> None:
     """New photographs, each located with a calibration of its own: both uncertainties are in."""
     cameras = truth()
