@@ -1,16 +1,15 @@
 """What becomes of a camera when its image is resized, cropped or warped: the part of `Camera` that is about images."""
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TypeVar
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from diffproj._core.arguments import Array, flag, number, whole_number
 from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, dot, has_values
+from diffproj.geometry.camera_parts import CameraParts
 from diffproj.geometry.grid import checked_size
 from diffproj.geometry.intrinsics import check_warp, warped
-from diffproj.lens.protocol import Lens
 
 C = TypeVar("C", bound="ChangedImages")
 
@@ -18,26 +17,10 @@ ROUNDED_ASPECT = 1.1
 """Factor by which rounding to whole pixels may change the aspect of an image."""
 
 
-class ChangedImages:
+class ChangedImages(CameraParts):
     """Cameras of the same image, resized, cropped or warped."""
 
     __slots__ = ()
-
-    K: Tensor
-    R: Tensor
-    t: Tensor
-    distortion: Lens | None
-    size: tuple[int, int] | None
-
-    def _with(self: C, **changes: Any) -> C:
-        raise NotImplementedError
-
-    if TYPE_CHECKING:  # what `Batched` has
-
-        @property
-        def batch_shape(self) -> torch.Size:
-            """See `Batched`."""
-            ...
 
     def resized(self: C, size: tuple[int, int], stretched: bool = False) -> C:
         """The camera of the same image resized to `size = (width, height)`: `c -> s c + (s - 1) / 2`.

@@ -1,38 +1,28 @@
 """What other libraries give and take of a camera: the part of `Camera` that is about OpenCV and Kornia."""
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
 from kornia.geometry.camera import PinholeCamera
-from torch import Tensor
 
 from diffproj._core.arguments import flag, instance
 from diffproj._core.numerics import dot, has_values
 from diffproj.geometry import interop
+from diffproj.geometry.camera_parts import CameraParts
 from diffproj.geometry.interop import ArrayLike
 from diffproj.geometry.intrinsics import upright
 from diffproj.lens.brown_conrady import BrownConrady
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.kannala_brandt import KannalaBrandt
-from diffproj.lens.protocol import Lens
 
 C = TypeVar("C", bound="Exchange")
 
 
-class Exchange:
+class Exchange(CameraParts):
     """From and to OpenCV's arrays and Kornia's `PinholeCamera`, whose conventions are those of `Camera`."""
 
     __slots__ = ()
-
-    K: Tensor
-    R: Tensor
-    t: Tensor
-    distortion: Lens | None
-    size: tuple[int, int] | None
-
-    def _with(self: C, **changes: Any) -> C:
-        raise NotImplementedError
 
     @classmethod
     def from_opencv(
