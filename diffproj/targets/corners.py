@@ -1,10 +1,11 @@
 """Corners of a board in a photograph to a hundredth of a pixel, and which of them can be trusted."""
 
+import functools
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 from diffproj.targets.corner_fit import fit_corners
 
@@ -36,7 +37,10 @@ REACH, NARROW = 0.65, 0.4
 FEWEST = 9
 """Corners below which nothing is known about their neighbours."""
 
-_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
+_POWERS = [(i, j) for i in range(4) for j in range(4 - i)]
+# What few neighbours leave open is held near zero: terms of higher degree more.
+_RIDGE = np.diag([[1e-9, 1e-9, 1e-4, 1e-3][i + j] for i, j in _POWERS])
+_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 10, 0.05)
 
 
 class Corners(NamedTuple):
@@ -121,29 +125,51 @@ def predicted(
         grid: corners; what is not used does not matter.
         use: weights of the corners from 0 to 1.
     """
-    rows, columns = grid.shape[:2]
-    weight = use.astype(float)
-    values = np.where(weight[..., None] > 0, grid, 0.0)
+    shape, weight = use.shape, use.astype(float)
+    values = np.where(weight[..., None] > 0, grid, 0.0).reshape(-1, 2)
+    near = _neighbourhoods(*shape)
+    hat = near.hat if (weight == 1).all() else near.hat_of(weight)
+    where = (hat[:, None] @ values[near.numbers])[:, 0]
+    # A ridge draws the value to zero where neighbours are few; hat sums to 1 otherwise.
+    total = hat.sum(axis=1)
+    where = where / np.where(np.abs(total) > 0.5, total, 1.0)[:, None]
+    spread = np.sqrt(1 + (hat**2).sum(axis=1))
+    return Prediction(where.reshape(*shape, 2), spread.reshape(shape))
+
+
+class _Neighbourhoods(NamedTuple):
+    """Each corner's neighbours on a board, of which there are K.
+
+    Attributes:
+        numbers: `(N, K)`, which corners they are, row by row.
+        basis: `(N, K, 10)`, powers of row and column up to the third degree at each.
+        others: `(N, K)`, 0 for the corner itself, else 1.
+        hat: `(N, K)`, what the surface's value at the corner takes from each, where all are used alike.
+    """
+
+    numbers: Int[np.ndarray, "n k"]
+    basis: Float[np.ndarray, "n k 10"]
+    others: Float[np.ndarray, "n k"]
+    hat: Float[np.ndarray, "n k"]
+
+    def hat_of(self, weight: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "n k"]:
+        """What the surface's value at each corner takes from its neighbours, for weights of the corners."""
+        weighted = self.basis * (weight.reshape(-1)[self.numbers] * self.others)[..., None]
+        transposed = np.swapaxes(weighted, 1, 2)
+        return (np.linalg.inv(transposed @ self.basis + _RIDGE)[:, :1] @ transposed)[:, 0]
+
+
+@functools.lru_cache(maxsize=16)
+def _neighbourhoods(rows: int, columns: int) -> _Neighbourhoods:
     near_r, near_c = _nearest_lines(rows), _nearest_lines(columns)
     r = np.broadcast_to(near_r[:, None, :, None], (rows, columns, near_r.shape[1], near_c.shape[1]))
     c = np.broadcast_to(near_c[None, :, None, :], r.shape)
     r, c = (part.reshape(rows * columns, -1) for part in (r, c))
     here_r, here_c = (axis.reshape(-1, 1) for axis in np.indices((rows, columns)))
     dr, dc = (r - here_r) / 2.0, (c - here_c) / 2.0
-    w = weight[r, c] * ((dr != 0) | (dc != 0)) + 0.0
-    powers = [dr**i * dc**j for i in range(4) for j in range(4 - i)]
-    # What few neighbours leave open is held near zero: terms of higher degree more.
-    degree = np.array([i + j for i in range(4) for j in range(4 - i)])
-    basis = np.stack(powers, axis=-1)
-    ridge = np.diag(np.array([1e-9, 1e-9, 1e-4, 1e-3])[degree])
-    weighted = basis * w[..., None]
-    inverse = np.linalg.inv(np.swapaxes(weighted, 1, 2) @ basis + ridge)
-    hat = (inverse[:, :1] @ np.swapaxes(weighted, 1, 2))[:, 0]  # the value at the corner itself
-    where = (hat[..., None] * values[r, c]).sum(axis=1)
-    # A ridge draws the value to zero where neighbours are few; hat sums to 1 otherwise.
-    where = where / np.where(np.abs(hat.sum(axis=1)) > 0.5, hat.sum(axis=1), 1.0)[:, None]
-    spread = np.sqrt(1 + (hat**2).sum(axis=1))
-    return Prediction(where.reshape(rows, columns, 2), spread.reshape(rows, columns))
+    basis = np.stack([dr**i * dc**j for i, j in _POWERS], axis=-1)
+    found = _Neighbourhoods(r * columns + c, basis, ((dr != 0) | (dc != 0)).astype(float), np.empty((0, 0)))
+    return found._replace(hat=found.hat_of(np.ones((rows, columns))))
 
 
 def _nearest_lines(count: int) -> np.ndarray:
