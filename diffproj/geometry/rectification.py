@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from diffproj._core.arguments import called, number, numbers
-from diffproj._core.numerics import BLOCK_POINTS, broadcast_batches, check_same_kind, check_tensor
+from diffproj._core.numerics import block_points, broadcast_batches, check_same_kind, check_tensor
 from diffproj.geometry.back_projection import back_project, warn_if_rounded
 from diffproj.geometry.camera import Camera, as_camera, meeting_camera
 from diffproj.geometry.grid import checked_size, inside, pixel_grid
@@ -195,7 +195,7 @@ def _resampled(
     part = corners.shape[:2]
     offsets = ((pixel_grid(down, right, like) + 0.5) / like.new_tensor([right, down])).reshape(-1, 2)
     total, counts = torch.zeros((), dtype=source.dtype, device=source.device), torch.zeros((), device=source.device)
-    for some in offsets.split(max(1, BLOCK_POINTS // max(1, part.numel() * valid.shape[:-1].numel()))):
+    for some in offsets.split(max(1, block_points(like.device) // max(1, part.numel() * valid.shape[:-1].numel()))):
         places, valid = look_up((corners + some[:, None, None]).reshape(-1, 2))
         sampled, seen = _sampled(source, places, valid, (len(some) * part[0], part[1]), size)
         total = total + sampled.unflatten(-2, (len(some), part[0])).sum(-3)
