@@ -379,6 +379,34 @@ def test_metashape_projects_as_its_manual_says(tmp_path: Path) -> None:
     assert load(tmp_path, "cameras.xml", camera="FC6310").size == (5472, 3648)
 
 
+def test_metashape_has_components_unused_sensors_and_labels_that_several_share(tmp_path: Path) -> None:
+    text = SAMPLES["cameras.xml"].decode()
+    place = text[text.index("    <transform>\n") : text.index("  </chunk>")]
+    other = place.replace("100 200 300", "7 8 9").replace("2.5<", "4<")
+    components = f'<components><component id="3" label="Component 1">{other}</component></components>'
+    sensor = '<sensor id="1" label="FC6310" type="frame"><resolution width="100" height="80"/></sensor>'
+    camera = text[text.index('<camera id="0"') : text.index('<camera id="1"')]
+    third = camera.replace('id="0" sensor_id', 'id="2" component_id="3" sensor_id')
+    text = text.replace("    </sensors>", f"{sensor}</sensors>{components}").replace(
+        "    </cameras>", f"{third}</cameras>"
+    )
+    of_chunk, of_component = (load(tmp_path, "cameras.xml", text, camera=f"DJI_0001 {i}") for i in (0, 2))
+    center = np.array([1.5, 2.5, 3.5]) @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # transposed
+    np.testing.assert_allclose(of_chunk.center.numpy(), 2.5 * center + [100, 200, 300], atol=1e-9)
+    np.testing.assert_allclose(of_component.center.numpy(), 4 * center + [7, 8, 9], atol=1e-9)
+    assert load(tmp_path, "cameras.xml", text, camera="FC6310 0").size == (5472, 3648)
+    with pytest.raises(ValueError, match="sensor FC6310 1: want a calibration with f"):  # a camera that needs it
+        load(tmp_path, "cameras.xml", text.replace('component_id="3" sensor_id="0"', 'component_id="3" sensor_id="1"'))
+    with pytest.raises(ValueError, match=r"camera DJI_0001: want the sensor_id of a sensor, got 5"):
+        load(
+            tmp_path,
+            "cameras.xml",
+            SAMPLES["cameras.xml"].decode().replace('sensor_id="0" label="DJI_0001"', 'sensor_id="5" label="DJI_0001"'),
+        )
+    with pytest.raises(ValueError, match="camera DJI_0002: want an id of its own, got 0"):
+        load(tmp_path, "cameras.xml", SAMPLES["cameras.xml"].decode().replace('camera id="1"', 'camera id="0"'))
+
+
 @pytest.mark.parametrize(
     ("matrix", "lens"),
     [("camMatrix", "distCoef"), ("cameraMatrix", "distCoeffs"), ("mtx", "dist"), ("camera_matrix", "distortion_coeff")],
