@@ -407,6 +407,37 @@ def test_metashape_has_components_unused_sensors_and_labels_that_several_share(t
         load(tmp_path, "cameras.xml", SAMPLES["cameras.xml"].decode().replace('camera id="1"', 'camera id="0"'))
 
 
+def test_metashape_s_calibration_of_one_sensor(tmp_path: Path) -> None:
+    text = """<calibration><projection>frame</projection><width>640</width><height>480</height>
+      <f>500</f><cx>1</cx><cy>-2</cy><k1>0.1</k1></calibration>"""
+    assert numbers(load(tmp_path, "sensor.xml", text)) == ([500.0, 500.0, 320.5, 237.5], [0.1, 0.0, 0.0, 0.0, 0.0])
+    for old, new, message in (
+        ("frame", "fisheye", "type: want a frame sensor, got 'fisheye'"),
+        ("<width>640</width><height>480</height>", "", "want the size of the image, from whose middle"),
+        ("<f>500</f>", "<fx>500</fx><fy>500</fy>", "want f, got none; export with Metashape 1.3"),
+        ("<k1>", "<k4>0.5</k4><k1>", "k4: want"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            load(tmp_path, "sensor.xml", text.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("</chunk>", "</chunk><chunk/>", "chunk: want one, got several"),
+        (">2.5</scale>", ">0</scale>", "scale: want a positive number, got 0"),
+        ('<resolution width="5472"', '<resolution width="wide"', "width: want a number, got 'wide'"),
+        ("<f>3668.1</f>", "<f>3668.1</f><f>3000</f>", "f: want"),
+        ("<f>3668.1</f>", "", "sensor FC6310: want a calibration with f"),
+        ("0.8 0.6 0 1.5", "0.8 0.6 0", "camera DJI_0001, transform"),
+        ('<sensors next_id="1">', '<sensors next_id="1"/><nothing>', "want sensors in the chunk|want XML"),
+    ],
+)
+def test_metashape_s_faults_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load(tmp_path, "cameras.xml", SAMPLES["cameras.xml"].decode().replace(old, new))
+
+
 @pytest.mark.parametrize(
     ("matrix", "lens"),
     [("camMatrix", "distCoef"), ("cameraMatrix", "distCoeffs"), ("mtx", "dist"), ("camera_matrix", "distortion_coeff")],
