@@ -45,6 +45,9 @@ from diffproj.lens.models import register_lens as register_lens
 from diffproj.lens.protocol import Lens as Lens
 from diffproj.measurement.accuracy_map import AccuracyMap as AccuracyMap
 from diffproj.measurement.choices import PixelNoiseWarning as PixelNoiseWarning
+from diffproj.measurement.fuse import CameraDisagreementWarning as CameraDisagreementWarning
+from diffproj.measurement.fuse import FusedMeasurement as FusedMeasurement
+from diffproj.measurement.fuse import fuse as fuse
 from diffproj.measurement.measure import measure as measure
 from diffproj.measurement.measurement import Measurement as Measurement
 from diffproj.measurement.quantity import Quantity as Quantity

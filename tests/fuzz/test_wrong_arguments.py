@@ -335,6 +335,7 @@ def _measurement(t: Things) -> dict[str, Call]:
             dp.measure, {"pixels": t.pixels, "calibration": t.camera, "plane": t.plane, "pixel_sigma": 0.1}
         ),
         "measure located": Call(dp.measure, {"pixels": t.pixels, "calibration": t.located, **on}, 3),
+        "fuse": Call(dp.fuse, {"measurements": [m, m]}, 3),
         "Measurement.interval": Call(m.interval, {"level": 0.9}, 2),
         "Measurement.quantity": Call(m.quantity, {"function": lambda p: p.square().sum(), "which": [[0, 1], [1, 2]]}),
         "Measurement.lengths": Call(m.lengths, {"pairs": [[0, 1]]}),
@@ -409,6 +410,7 @@ OTHER = {
     "CrossValidation",
     "Experiment",
     "AccuracyMap",
+    "FusedMeasurement",
     "Measurement",
     "PaperSetup",
     "Quantity",
