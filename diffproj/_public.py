@@ -35,7 +35,10 @@ from diffproj.geometry.back_projection import ground_resolution as ground_resolu
 from diffproj.geometry.camera import Camera as Camera
 from diffproj.geometry.euler import euler_from_rotation as euler_from_rotation
 from diffproj.geometry.euler import rotation_from_euler as rotation_from_euler
+from diffproj.geometry.geodesy import degrees_from_metres as degrees_from_metres
+from diffproj.geometry.geodesy import metres_from_degrees as metres_from_degrees
 from diffproj.geometry.plane import Plane as Plane
+from diffproj.geometry.rectification import geotransform as geotransform
 from diffproj.geometry.rectification import plane_axes as plane_axes
 from diffproj.geometry.rectification import rectify as rectify
 from diffproj.geometry.rectification import render as render
