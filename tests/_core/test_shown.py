@@ -64,7 +64,7 @@ def test_one_short_line(shown: dict[str, Any]) -> None:
     assert "f 533.5, 533.6 px, c 342.3, 234.2 px" in repr(shown["Camera"])
     assert "no pose" in repr(shown["Camera"])
     assert repr(shown["cameras"]).startswith("Camera(13 cameras, f 533.5, 533.6 px")
-    assert repr(shown["Quantity"]).startswith("Quantity(25.16 ± 0.16, 24.90 ± 0.15")
+    assert repr(shown["Quantity"]).startswith("Quantity(25.12 ± 0.14, 24.96 ± 0.13")
     assert repr(dp.Camera(torch.eye(3)).to("meta")).startswith("Camera(f ?, ? px")
 
 
