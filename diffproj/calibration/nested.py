@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.data import Data
+from diffproj.calibration.entangled import DENOMINATOR
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.options import Options
 from diffproj.calibration.outcome import minimised
 from diffproj.calibration.parametrisation import SKEW, Parametrisation, Pose
-from diffproj.calibration.restraint import DENOMINATOR, restrained
+from diffproj.calibration.restraint import restrained
 from diffproj.calibration.second_look import second_look
 from diffproj.calibration.start import Straightened
 from diffproj.lens.models import MODELS

@@ -24,6 +24,10 @@ from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
 
 
+NO_DENOMINATOR = {"brown8": "'brown5'"} | dict.fromkeys(("brown12", "brown14"), "fixed=('k4', 'k5', 'k6')")
+"""What a lens with a denominator is without it."""
+
+
 def remarks(found: Fit, status: Tensor, doubt: Entangled) -> tuple[str, ...]:
     """The remarks on each of P cameras, in one text; empty where there are none, or it did not converge."""
     task = found.task
@@ -34,6 +38,12 @@ def remarks(found: Fit, status: Tensor, doubt: Entangled) -> tuple[str, ...]:
     texts: list[list[str]] = [[] for _ in status]
     for p in (converged & held).nonzero().flatten().tolist():
         texts[p].append("k4, k5 and k6 are drawn towards 0, for without that the lens folds inside the image")
+    for p, growth in doubt.needless.items():
+        if not bool(held[p]):
+            texts[p].append(
+                f"k4, k5 and k6 stand for noise, without them the residuals are {100 * growth:.1f} % larger: "
+                f"{NO_DENOMINATOR[task.lens]} fits as well"
+            )
     for p, other in doubt.simpler.items():
         texts[p].append(_not_told(other))
     sigma = found.pixel_sigma().detach()

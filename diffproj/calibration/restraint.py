@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffproj.calibration.entangled import DENOMINATOR
 from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.parametrisation import Pose
 from diffproj.calibration.reach import folds_at_corners, reaches_image
@@ -23,7 +24,6 @@ from diffproj.calibration.solver import Prior, Status
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import replaced, view_costs
 
-DENOMINATOR = ("k4", "k5", "k6")
 FIRST = 1.0
 """Deviation to which the terms below the line are held at first: what each adds to the denominator half an image's
 diagonal from the axis, where 1 is as much as there is without it."""
