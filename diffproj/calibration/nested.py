@@ -2,7 +2,8 @@
 
 The terms of a long lens nearly cancel each other, and those of a tilted sensor, a prism and skew do much the same as a
 shifted principal point: from far off they lead into side valleys. So they come in groups, and the camera is fitted with
-none of them, then with one, with two and so on. Every fit starts from the lowest of those with one group fewer. As the solver only ever goes down, a richer lens never ends above a poorer one.
+none of them, then with one, with two and so on. Every fit starts from the lowest of those with one group fewer. As the
+solver only ever goes down, a richer lens never ends above a poorer one.
 """
 
 from dataclasses import dataclass

@@ -147,15 +147,15 @@ def _put(found: Fit, which: Tensor, other: Fit, taken: Tensor) -> Fit:
     task = found.task
     used, rejected = task.used.clone(), found.rejected.clone()
     used[which], rejected[which] = other.task.used[taken], other.rejected[taken]
-    shared = found.solution.shared
-    nothing = shared.new_zeros(*shared.shape, shared.shape[-1])
-    prior = task.prior or Prior(torch.zeros_like(shared), nothing, nothing)
-    theirs = other.task.prior or Prior(*(part.new_zeros(part[:1].shape).expand(len(taken), *part.shape[1:]) for part in prior[:2]))
-    pairs = zip(_parts(prior), _parts(theirs), strict=True)
-    new = Prior(*(a.index_put((which,), b[taken]) for a, b in pairs))
+    new = Prior(*(a.index_put((which,), b[taken]) for a, b in zip(_prior(found), _prior(other), strict=True)))
     solution = replaced(found.solution, which, other.solution, taken)
     return Fit(replace(task, used=used, prior=new), solution, rejected)
 
 
-def _parts(prior: Prior) -> tuple[Tensor, Tensor, Tensor]:
+def _prior(found: Fit) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, precision and known precision of the prior, 0 where there is none."""
+    shared, prior = found.solution.shared, found.task.prior
+    if prior is None:
+        nothing = shared.new_zeros(*shared.shape, shared.shape[-1])
+        return torch.zeros_like(shared), nothing, nothing
     return prior.mean, prior.precision, prior.precision if prior.known is None else prior.known
