@@ -29,6 +29,7 @@ from diffproj.calibration.leftover import effect
 from diffproj.calibration.parametrisation import INTRINSICS, SKEW
 from diffproj.calibration.solver import Status
 from diffproj.calibration.uncertainty import covariance_of
+from diffproj.lens.models import MODELS
 
 ONE_SIDED = (("tau_x", "tau_y"), ("s1", "s2", "s3", "s4"), (SKEW,))
 """Groups of parameters that bend the image to one side, as a shift of the principal point does."""
@@ -89,7 +90,7 @@ class Entangled:
         Such terms stand for noise, and of many places where they could, the fit ended in one.
         """
         names = tuple(name for name in DENOMINATOR if name in _free(self.found))
-        if not names:
+        if not names or not MODELS[self.found.task.lens].perspective:  # a fisheye has another k4
             return {}
         with torch.no_grad():
             sound = (self.status == Status.CONVERGED) & (self.found.pixel_sigma() > EXACT_PX)

@@ -59,7 +59,7 @@ class Nested:
         """The fit with all groups."""
         groups = self._groups()
         if not groups:
-            return self._fit(self.chosen, self.shared, self.local)
+            return self._fit(self.chosen, (self.shared, self.local))
         early = self.chosen.but(
             objective="image",
             reject_outliers=False,
@@ -73,8 +73,8 @@ class Nested:
                     continue  # no lens has it
                 held = [name for group in groups if group not in inside for name in group]
                 options = early.but(fixed=(*early.fixed, *held))
-                fits[inside] = self._fit(options, *self._start(fits, inside), DENOMINATOR in inside)
-        return self._fit(self.chosen, *self._start(fits, tuple(groups)), DENOMINATOR in groups)
+                fits[inside] = self._fit(options, self._start(fits, inside), DENOMINATOR in inside)
+        return self._fit(self.chosen, self._start(fits, tuple(groups)), DENOMINATOR in groups)
 
     def _groups(self) -> list[tuple[str, ...]]:
         """The groups of which some parameters are free; none for a short lens."""
@@ -83,7 +83,9 @@ class Nested:
         names = self.parameters.names
         return [g for g in GROUPS if set(g) <= set(names) and not set(g) <= set(self.chosen.fixed)]
 
-    def _start(self, fits: dict[tuple[tuple[str, ...], ...], Fit], inside: tuple[tuple[str, ...], ...]) -> Any:
+    def _start(
+        self, fits: dict[tuple[tuple[str, ...], ...], Fit], inside: tuple[tuple[str, ...], ...]
+    ) -> tuple[Tensor, Pose]:
         """Shared parameters and poses of the lowest fit with one group fewer, of each camera."""
         poorer = (tuple(g for g in inside if g != left) for left in inside)
         fewer = [fits[names].solution for names in poorer if names in fits]
@@ -95,10 +97,10 @@ class Nested:
         local = zip(*(solution.local for solution in fewer), strict=True)
         return shared, tuple(torch.stack(parts)[best] for parts in local)
 
-    def _fit(self, options: Options, shared: Tensor, local: Pose, rational: bool = False) -> Fit:
+    def _fit(self, options: Options, start: tuple[Tensor, Pose], rational: bool = False) -> Fit:
         """The lowest fit that is found from there."""
-        found, _ = minimised(self.data, options, self.parameters, shared, local, self.reference)
+        found, _ = minimised(self.data, options, self.parameters, *start, self.reference)
         steps: dict[str, Any] = {"max_iterations": options.max_iterations, "tolerance": options.tolerance}
         limit = options.outlier_limit
         found = second_look(found, self.straight, reject=limit, long_valley=rational, **steps)
-        return restrained(found, shared, local, self.size, reject=limit, **steps) if rational else found
+        return restrained(found, *start, self.size, reject=limit, **steps) if rational else found

@@ -37,7 +37,9 @@ def remarks(found: Fit, status: Tensor, doubt: Entangled) -> tuple[str, ...]:
         held = (task.prior.precision != task.prior.known).any(-1).any(-1)
     texts: list[list[str]] = [[] for _ in status]
     for p in (converged & held).nonzero().flatten().tolist():
-        texts[p].append("k4, k5 and k6 are drawn towards 0, for without that the lens folds inside the image")
+        texts[p].append(
+            "k4, k5 and k6 are held near those of a poorer lens, for without that the lens folds inside the image"
+        )
     for p, growth in doubt.needless.items():
         if not bool(held[p]):
             texts[p].append(

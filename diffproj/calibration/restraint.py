@@ -2,11 +2,12 @@
 
 The six radial terms of a rational lens nearly cancel each other, so that its unrestrained minimum may have a pole or a
 fold where corners were seen: the terms above and below the line go to zero together, a hair apart, and buy a
-fraction of the noise. Then the terms below the line, k4 to k6, are drawn towards 0, as little as makes the lens
-one-to-one over its corners and the image.
+fraction of the noise. Then the terms below the line, k4 to k6, are drawn towards those of the poorer lens that the fit
+starts from, 0 if it has none, as little as makes the lens one-to-one over its corners and the image. As the start costs
+nothing by this, a restrained lens does not end above the poorer one either.
 
-Drawn to 0 the valley is short, and its lowest place is found. From there the terms are let go step by step, as long as
-the lens does not fold: of several minima without restraint this leads to one that makes sense, where there is one.
+Held the valley is short, and its lowest place is found. From there the terms are let go step by step, as long as the
+lens does not fold: of several minima without restraint this leads to one that makes sense, where there is one.
 """
 
 import math
@@ -80,8 +81,10 @@ def restrained(
         nonlocal best, reached
         part = given.part(which)
         if strength < math.inf:
-            part = replace(part, prior=_drawn_to_zero(part, precision[which] / strength**2))
-        limits = steps if strength == math.inf else steps | {"max_iterations": min(max_iterations, RUNG_STEPS)}
+            part = replace(part, prior=_drawn_to(shared[which], precision[which] / strength**2, part))
+        limits: dict[str, Any] = (
+            steps if strength == math.inf else steps | {"max_iterations": min(max_iterations, RUNG_STEPS)}
+        )
         other = fit(part, near.solution.shared, near.solution.local, reject=reject, **limits)
         cost = _data_cost(other)
         reach = torch.where(cost <= dearest[which], _reached(other, size), -1.0)
@@ -124,15 +127,15 @@ def _unit_precision(start: Fit, below: list[int], size: tuple[int, int]) -> Tens
     return precision
 
 
-def _drawn_to_zero(task: Task, precision: Tensor) -> Prior:
-    """The task's prior with precisions `(P, s)` about 0 added."""
+def _drawn_to(shared: Tensor, precision: Tensor, task: Task) -> Prior:
+    """The task's prior with precisions `(P, s)` about shared parameters `(P, s)` added."""
     more = torch.diag_embed(precision)
     if task.prior is None:
-        return Prior(torch.zeros_like(precision), more, torch.zeros_like(more))
+        return Prior(torch.where(precision > 0, shared, 0.0), more, torch.zeros_like(more))
     mean, given, _ = task.prior
     own = given.diagonal(dim1=-2, dim2=-1)
     total = own + precision
-    return Prior(torch.where(total > 0, own * mean / total, 0.0), given + more, given)
+    return Prior(torch.where(total > 0, (own * mean + precision * shared) / total, 0.0), given + more, given)
 
 
 def _data_cost(found: Fit) -> Tensor:
