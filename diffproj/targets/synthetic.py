@@ -125,7 +125,7 @@ def photograph(
         if blur_px > 0:
             reach = round(4 * blur_px)
             border = "reflect" if reach < min(image.shape) else "replicate"  # a reflection is no larger than the image
-            kernel, sigma = (2 * reach + 1,) * 2, image.new_tensor([[blur_px, blur_px]])
+            kernel, sigma = (2 * reach + 1, 2 * reach + 1), image.new_tensor([[blur_px, blur_px]])
             image = gaussian_blur2d(image[None, None], kernel, sigma, border)[0, 0]
         image = image + noise * torch.randn(image.shape, generator=generator, dtype=image.dtype, device="cpu")
         images.append((image.clamp(0, 1) * 255).round().to(torch.uint8))
