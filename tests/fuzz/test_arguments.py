@@ -21,7 +21,7 @@ CAMERA = dp.Camera(
     size=(640, 480),
 )
 PIXELS = torch.tensor([[320.0, 240], [400, 300], [100, 50]], dtype=D)
-IMAGE = torch.rand(1, 48, 64, dtype=D)
+IMAGE = torch.rand(1, 480, 640, dtype=D)
 
 
 @pytest.fixture(scope="module")
