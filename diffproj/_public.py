@@ -4,6 +4,8 @@ That takes as long as PyTorch does, for which `diffproj --help` need not wait. `
 is handed on.
 """
 
+from diffproj.calibration.adjust import adjust as adjust
+from diffproj.calibration.adjustment import Adjustment as Adjustment
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning as AmbiguousPoseWarning
 from diffproj.calibration.calibrate import calibrate as calibrate
 from diffproj.calibration.comparison import LensComparison as LensComparison
@@ -14,6 +16,12 @@ from diffproj.calibration.losses import Huber as Huber
 from diffproj.calibration.losses import Loss as Loss
 from diffproj.calibration.losses import SoftL1 as SoftL1
 from diffproj.calibration.mismatch import CameraMismatchWarning as CameraMismatchWarning
+from diffproj.calibration.observation import Observation as Observation
+from diffproj.calibration.observations import Heights as Heights
+from diffproj.calibration.observations import Horizon as Horizon
+from diffproj.calibration.observations import Lengths as Lengths
+from diffproj.calibration.observations import Seen as Seen
+from diffproj.calibration.observations import VanishingPoints as VanishingPoints
 from diffproj.calibration.options import CalibrationOptions as CalibrationOptions
 from diffproj.calibration.options import LocateOptions as LocateOptions
 from diffproj.calibration.refine import refine as refine
@@ -39,6 +47,7 @@ from diffproj.geometry.plane import Plane as Plane
 from diffproj.geometry.rectification import plane_axes as plane_axes
 from diffproj.geometry.rectification import rectify as rectify
 from diffproj.geometry.rectification import render as render
+from diffproj.geometry.mounting import Mounting as Mounting
 from diffproj.lens.brown_conrady import BrownConrady as BrownConrady
 from diffproj.lens.kannala_brandt import KannalaBrandt as KannalaBrandt
 from diffproj.lens.models import register_lens as register_lens
