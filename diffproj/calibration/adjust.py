@@ -33,8 +33,8 @@ POOR = 9.0
 """Cost per spare residual from which on other starts are tried."""
 RESTRAINT = 1e-8
 """Weight of the start on each parameter in its natural unit: so small that it decides only what nothing else does."""
-TRIED = 6
-"""How many of them are followed to their minimum."""
+TRIED, FEW = 8, 8
+"""How many of them are followed, for how many steps before the best is followed to its minimum."""
 
 
 def adjust(
@@ -204,25 +204,23 @@ def _best(task: _Task, steps: int) -> _Found:
     K, P = values.shape[:2]
     flat = rotations.flatten(0, 1)
     blocks = task.evidence(task.known.parameters(flat), (K,), ()).residuals(values.flatten(0, 1))
-    cost = blocks.square().sum((-2, -1)).reshape(K, P).nan_to_num(torch.inf, torch.inf)
-    best = cost.topk(min(TRIED, K), dim=0, largest=False).indices
-    rows, each = best, torch.arange(P, device=best.device).expand_as(best)
-    k = len(rows)
+    cost = blocks.square().sum(-1).log1p().sum(-1).reshape(K, P).nan_to_num(torch.inf, torch.inf)  # mild on outliers
+    rows = cost.topk(min(TRIED, K), dim=0, largest=False).indices
+    k, each = len(rows), torch.arange(P, device=rows.device)
     many = Prior(*(part.expand(k, *part.shape).flatten(0, 1) for part in prior[:2]))
-    others = _descended(task, rotations[rows, each].flatten(0, 1), values[rows, each].flatten(0, 1), many, (k,), steps)
-    costs = torch.where(others.status == Status.CONVERGED, others.cost, torch.inf).reshape(k, P)
-    least = costs.nan_to_num(torch.inf).argmin(0)
-    chosen = least * P + torch.arange(P, device=least.device)
-    own_cost = torch.where(found.status == Status.CONVERGED, found.cost, torch.inf)
-    better = poor & (others.cost[chosen] < own_cost) & (others.status[chosen] == Status.CONVERGED)
-
-    def mixed(new: Tensor, old: Tensor) -> Tensor:
-        return torch.where(better.reshape(-1, *(1,) * (old.ndim - 1)), new[chosen], old)
-
+    near = _descended(task, rotations[rows, each].flatten(0, 1), values[rows, each].flatten(0, 1), many, (k,), FEW)
+    chosen = near.cost.nan_to_num(torch.inf).reshape(k, P).argmin(0) * P + each
+    R = R if near.parameters.start is None else near.parameters.start[chosen]
+    other = _descended(task, R, near.values[chosen], prior, (), steps)
+    ends = [torch.where(one.status == Status.CONVERGED, one.cost, torch.inf) for one in (other, found)]
+    better = poor & (ends[0] < ends[1])
     start = None
-    if found.parameters.start is not None and others.parameters.start is not None:
-        start = mixed(others.parameters.start, found.parameters.start)
-    parts = {name: mixed(getattr(others, name), getattr(found, name)) for name in _STATE}
+    if found.parameters.start is not None and other.parameters.start is not None:
+        start = torch.where(better[:, None, None], other.parameters.start, found.parameters.start)
+    parts = {
+        name: torch.where(better.reshape(-1, *(1,) * (old.ndim - 1)), getattr(other, name), old)
+        for name, old in ((name, getattr(found, name)) for name in _STATE)
+    }
     return replace(found, parameters=replace(found.parameters, start=start), **parts)
 
 

@@ -12,6 +12,7 @@ from diffproj.calibration.observation import Observation
 from diffproj.calibration.pose_parameters import PoseParameters
 from diffproj.calibration.solver import LocalState
 
+
 def jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Tensor]:
     """Values `(P, ...)` of P functions of q numbers each, and their derivatives `(q, P, ...)`.
 

@@ -6,6 +6,7 @@ are handed to the solver.
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -14,10 +15,11 @@ from diffproj.calibration.knowledge import Knowledge
 from diffproj.calibration.observation import Observation
 from diffproj.calibration.observations import Heights, Lengths, Seen
 from diffproj.calibration.parametrisation import POSE
+from diffproj.calibration.pose_parameters import PLACE
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.mounting import rotation_from_mounting
 
-TILTS = (-10.0, 3.0, 10.0, 25.0, 45.0, 65.0, 85.0)
+TILTS = (-10.0, 2.0, 5.0, 10.0, 17.0, 27.0, 40.0, 55.0, 70.0, 85.0)
 STEPS = 12
 """Headings all around."""
 ROLLS = (0.0, 90.0, 180.0, 270.0)
@@ -43,17 +45,21 @@ def starts(
     seen = [piece for piece in pieces if isinstance(piece, Seen) and len(piece) >= 2]
     angles = _directions(known, camera, begin, rolls=any(len(piece) >= 3 for piece in seen), turns=bool(seen))
     R = rotation_from_mounting(*angles.unbind(-1))  # (K, P, 3, 3)
-    place = begin[:, -3:].expand(*R.shape[:2], 3)
+    held = [known.given(name) for name in PLACE]
+    tries = [begin[:, -3:]]
+    sizes = [float(piece.height.mean()) for piece in pieces if isinstance(piece, Heights)]
+    sizes += [float(piece.length.mean()) for piece in pieces if isinstance(piece, Lengths)]
+    if sizes and not held[-1]:
+        tries += [torch.cat([tries[0][:, :2], torch.full_like(begin[:, -1:], times * sizes[0])], -1) for times in TIMES]
+    places = [one.expand(*R.shape[:2], 3) for one in tries]
     if seen:
-        place = _standing(seen, known, camera, R, begin[:, -3:], batch)
-    elif not known.given("height"):
-        sizes = [float(piece.height.mean()) for piece in pieces if isinstance(piece, Heights)]
-        sizes += [float(piece.length.mean()) for piece in pieces if isinstance(piece, Lengths)]
-        own = begin[:, -1:].clamp(min=1e-9)
-        heights = [own, *(torch.full_like(own, times * sizes[0]) for times in TIMES if sizes)]
-        place = torch.cat([torch.cat([place[..., :2], one.expand(len(R), P, 1)], dim=-1) for one in heights])
-        R, angles = (part.repeat(len(heights), *(1,) * (part.ndim - 1)) for part in (R, angles))
-    moving = torch.tensor([known.moves(name) for name in ("x", "y", "height")], device=begin.device)
+        stand = partial(_standing, seen, camera, R, batch=batch)
+        places = [stand(tries[0], held)]
+        if sizes and not held[-1]:
+            places += [stand(one, [*held[:2], True]) for one in tries]
+    place = torch.cat(places)
+    R, angles = (part.repeat(len(places), *(1,) * (part.ndim - 1)) for part in (R, angles))
+    moving = torch.tensor([known.moves(name) for name in PLACE], device=begin.device)
     place = torch.where(moving, place, begin[:, -3:])
     turned = angles if known.angles else torch.zeros_like(angles)
     front = begin[:, :-POSE].expand(*R.shape[:2], -1)
@@ -81,11 +87,14 @@ def _directions(known: Knowledge, camera: Camera, begin: Tensor, rolls: bool, tu
 
 
 def _standing(
-    seen: Sequence[Seen], known: Knowledge, camera: Camera, R: Tensor, own: Tensor, batch: Sequence[int]
+    seen: Sequence[Seen], camera: Camera, R: Tensor, own: Tensor, given: Sequence[bool], batch: Sequence[int]
 ) -> Tensor:
-    """The places `(K, P, 3)` that lie nearest to the rays of surveyed points, for each rotation `(K, P, 3, 3)`."""
+    """The places `(K, P, 3)` that lie nearest to the rays of surveyed points, for each rotation `(K, P, 3, 3)`.
+
+    Coordinates that are given keep their own values `(P, 3)`.
+    """
     identity = torch.eye(3, dtype=R.dtype, device=R.device)
-    held = torch.tensor([known.given(name) for name in ("x", "y", "height")], device=R.device).to(R)
+    held = torch.tensor(given, device=R.device).to(R)
     middle = torch.stack([piece.points.mean(0) for piece in seen]).mean(0).to(R)
     A, b = torch.zeros_like(R), torch.zeros_like(R[..., 0])
     still = camera.without_pose()
