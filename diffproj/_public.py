@@ -43,11 +43,11 @@ from diffproj.geometry.back_projection import ground_resolution as ground_resolu
 from diffproj.geometry.camera import Camera as Camera
 from diffproj.geometry.euler import euler_from_rotation as euler_from_rotation
 from diffproj.geometry.euler import rotation_from_euler as rotation_from_euler
+from diffproj.geometry.mounting import Mounting as Mounting
 from diffproj.geometry.plane import Plane as Plane
 from diffproj.geometry.rectification import plane_axes as plane_axes
 from diffproj.geometry.rectification import rectify as rectify
 from diffproj.geometry.rectification import render as render
-from diffproj.geometry.mounting import Mounting as Mounting
 from diffproj.lens.brown_conrady import BrownConrady as BrownConrady
 from diffproj.lens.kannala_brandt import KannalaBrandt as KannalaBrandt
 from diffproj.lens.models import register_lens as register_lens

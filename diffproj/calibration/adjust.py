@@ -23,7 +23,7 @@ from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.robust import robust_factors
 from diffproj.calibration.search import starts
 from diffproj.calibration.solver import Prior, Status, solve
-from diffproj.calibration.undetermined import described, inverse, natural, undetermined, units
+from diffproj.calibration.undetermined import Lacking, described, inverse, natural, undetermined, units
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.targets.views import Views
 
@@ -33,6 +33,8 @@ POOR = 9.0
 """Cost per spare residual from which on other starts are tried."""
 RESTRAINT = 1e-8
 """Weight of the start on each parameter in its natural unit: so small that it decides only what nothing else does."""
+HAIR = 1e-4
+"""Cost of half a turn away from the camera's own direction, over 4."""
 TRIED, FEW = 8, 8
 """How many of them are followed, for how many steps before the best is followed to its minimum."""
 
@@ -196,7 +198,7 @@ def _best(task: _Task, steps: int) -> _Found:
     if not task.pieces or steps == 0:
         return found
     spare = _spare(task, found)
-    poor = (found.status != Status.CONVERGED) | ~(2 * found.cost <= POOR * spare.clamp(min=1))
+    poor = (found.status == Status.DIVERGED) | ~(2 * found.cost <= POOR * spare.clamp(min=1))
     if not bool(poor.any()):
         return found
     camera = task.known.parameters(R).unpack(begin, (len(begin),), task.camera.size)
@@ -205,11 +207,13 @@ def _best(task: _Task, steps: int) -> _Found:
     flat = rotations.flatten(0, 1)
     blocks = task.evidence(task.known.parameters(flat), (K,), ()).residuals(values.flatten(0, 1))
     cost = blocks.square().sum(-1).log1p().sum(-1).reshape(K, P).nan_to_num(torch.inf, torch.inf)  # mild on outliers
-    rows = cost.topk(min(TRIED, K), dim=0, largest=False).indices
+    first = task.known.parameters(R).rotation(begin)
+    rows = (cost + _away(rotations, first)).topk(min(TRIED, K), dim=0, largest=False).indices
     k, each = len(rows), torch.arange(P, device=rows.device)
     many = Prior(*(part.expand(k, *part.shape).flatten(0, 1) for part in prior[:2]))
     near = _descended(task, rotations[rows, each].flatten(0, 1), values[rows, each].flatten(0, 1), many, (k,), FEW)
-    chosen = near.cost.nan_to_num(torch.inf).reshape(k, P).argmin(0) * P + each
+    away = _away(near.parameters.rotation(near.values), first.repeat(k, 1, 1))
+    chosen = (near.cost + away).nan_to_num(torch.inf).reshape(k, P).argmin(0) * P + each
     R = R if near.parameters.start is None else near.parameters.start[chosen]
     other = _descended(task, R, near.values[chosen], prior, (), steps)
     ends = [torch.where(one.status == Status.CONVERGED, one.cost, torch.inf) for one in (other, found)]
@@ -222,6 +226,11 @@ def _best(task: _Task, steps: int) -> _Found:
         for name, old in ((name, getattr(found, name)) for name in _STATE)
     }
     return replace(found, parameters=replace(found.parameters, start=start), **parts)
+
+
+def _away(R: Tensor, first: Tensor) -> Tensor:
+    """A hair of cost for turns from the camera's own direction: of poses that explain as much, the nearer one."""
+    return HAIR * (3 - (R * first).sum((-2, -1)))
 
 
 _STATE = ("values", "status", "iterations", "cost")
@@ -242,7 +251,7 @@ def _descended(task: _Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[
         (),
         local_size=0,
         loss=loss,
-        prior=_restrained(task, parameters, begin, prior),
+        prior=_restrained(task, begin, prior),
         basis=basis,
         max_iterations=steps,
         negligible=NEGLIGIBLE,
@@ -250,7 +259,7 @@ def _descended(task: _Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[
     return _Found(parameters, basis, prior, found.shared, found.status, found.iterations, found.cost)
 
 
-def _restrained(task: _Task, parameters: PoseParameters, begin: Tensor, prior: Prior) -> Prior:
+def _restrained(task: _Task, begin: Tensor, prior: Prior) -> Prior:
     """The prior with a hair's weight on what nothing tells, which then stays where it began."""
     own = prior.precision.diagonal(dim1=-2, dim2=-1)
     hair = RESTRAINT * natural(begin, _reach(task, begin)).square().reciprocal()
@@ -278,10 +287,10 @@ def _outcome(
         covariance, names = _covariance(task, found, calibration)
         parts = tuple(shaped(block) for block in task.evidence(found.parameters).blocks(found.values))
         spare = _spare(task, found)
-    lacking = torch.tensor([bool(each) for each in names], device=found.status.device)
+    lacking = torch.tensor([bool(each.names) for each in names], device=found.status.device)
     status = torch.where(lacking & (found.status != Status.DIVERGED), Status.DEGENERATE, found.status)
     causes = tuple(
-        described(each) if each and code == Status.DEGENERATE else ""
+        described(each) if each.names and code == Status.DEGENERATE else ""
         for each, code in zip(names, status.tolist(), strict=True)
     )
     values = differentiated(task, found) if differentiable else found.values
@@ -309,7 +318,7 @@ def _outcome(
         parts=parts,
         spare=shaped(spare),
         cost=shaped(found.cost),
-        unknown=tuple(names),
+        unknown=tuple(each.names for each in names),
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"adjust: {adjusted.message}", adjusted)
@@ -320,9 +329,7 @@ def _same(covariance: Covariance) -> Covariance:
     return covariance
 
 
-def _covariance(
-    task: _Task, found: _Found, calibration: Calibration | None
-) -> tuple[Covariance, list[tuple[str, ...]]]:
+def _covariance(task: _Task, found: _Found, calibration: Calibration | None) -> tuple[Covariance, list[Lacking]]:
     """The covariance of intrinsics and pose, and what nothing tells of each camera."""
     parameters, values, T = found.parameters, found.values, found.basis
     s, P = parameters.camera.size, len(values)
@@ -342,7 +349,9 @@ def _covariance(
         follow = torch.nn.functional.pad(torch.diag(held), (0, 0, 0, POSE)) - T @ Hr @ (T.mT @ H[..., :s] * held)
         C = C + follow @ known @ follow.mT
     unknown, names = undetermined(parameters, values, T, scale, lost, vectors)
-    names = [each if code != Status.DIVERGED else () for each, code in zip(names, found.status.tolist(), strict=True)]
+    names = [
+        each if code != Status.DIVERGED else Lacking() for each, code in zip(names, found.status.tolist(), strict=True)
+    ]
     camera = parameters.unpack(values, (P,), None)
     middle = camera.center.mean(0)
     R = camera.R
@@ -382,7 +391,7 @@ def _normal_matrices(task: _Task, found: _Found, columns: Sequence[int]) -> tupl
     rows[:, list(columns)] = slopes.movedim(0, 1)
     M, start = H, 0
     for piece, block in zip(task.pieces, evidence.blocks(found.values), strict=True):
-        count, k = block.shape[1:]
+        count = block.shape[1]
         part = rows[:, :, start : start + count].flatten(-2)
         a, b = robust_factors(getattr(piece, "loss", None), block)
         gram = part @ part.mT

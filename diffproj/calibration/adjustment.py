@@ -23,6 +23,8 @@ from diffproj.geometry.mounting import Mounting, mounting_from_rotation
 CONTRADICTION = 1e-3
 """Probability below which residuals so large for their deviations are no chance."""
 
+SHOWN = 5
+"""Numbers of cameras in a message."""
 NOTHING = 1e-12
 """Deviation, relative to the value, that is rounding: of what was held."""
 
@@ -96,7 +98,7 @@ class Adjustment(Calibration):
 
     @property
     def contradicted(self) -> tuple[str, ...]:
-        """For each camera what residuals speak against its deviations, in words; `*B` flattened, empty where nothing."""
+        """For each camera what residuals speak against its deviations, `*B` flattened; empty where none do."""
         if self.cost is None or self.spare is None:
             return ("",) * max(1, self.status.numel())
         half = self.spare.clamp(min=1).to(self.cost) / 2
@@ -196,7 +198,7 @@ class Adjustment(Calibration):
         sentences = {
             **SENTENCES,
             Status.MAX_ITERATIONS: "was still falling when the iterations ended: raise max_iterations, or start closer",
-            Status.DIVERGED: "no camera near the start sees what was observed: start closer, or look for mixed-up pixels",
+            Status.DIVERGED: "no pose was found that sees what was observed: start closer, or look for mixed-up pixels",
             Status.DEGENERATE: "the evidence does not determine the camera",
         }
         codes = [Status(code) for code in self.status.flatten().tolist()]

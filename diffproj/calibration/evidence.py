@@ -80,7 +80,7 @@ class Evidence:
         start = values.new_zeros(len(values), len(self.columns))
         return jacobian(lambda step: self.residuals(values + step @ rows), start)
 
-    def linearise(self, shared: Tensor, local: LocalState) -> Tensor:
+    def linearise(self, shared: Tensor, local: LocalState) -> Tensor:  # noqa: ARG002
         """See `solver.Problem`; one block without unknowns of its own."""
         value, slopes = self.along(shared)
         P, N, k = value.shape
@@ -89,7 +89,7 @@ class Evidence:
         panel[:, 0, -1] = value.mT
         return panel
 
-    def retract(self, local: LocalState, step: Tensor) -> LocalState:
+    def retract(self, local: LocalState, step: Tensor) -> LocalState:  # noqa: ARG002
         """See `solver.Problem`."""
         return local
 

@@ -191,6 +191,6 @@ def _check_steep(camera: Camera, known: Knowledge) -> None:
     steep = camera.mounting().tilt if tilt is None else tilt
     if bool((steep.detach().abs() > STEEPEST).any()):
         raise ValueError(
-            "priors: want turn_x, turn_y and turn_z, degrees about the camera's own axes, for a camera that looks straight "
-            "down: roll and heading turn it about the same axis there, and nothing tells how far it leans to its side"
+            "priors: want turn_x, turn_y and turn_z, degrees about the camera's own axes, for a camera that looks "
+            "straight down: roll and heading turn it about the same axis there, and nothing tells how far it leans aside"
         )

@@ -94,7 +94,7 @@ def check_broadcast(name: str, tensor: Tensor, like: str, shape: torch.Size) -> 
         whole = torch.broadcast_shapes(tensor.shape, shape)
     except RuntimeError:
         whole = torch.Size()
-    if len(whole) == 0 and len(shape) > 0 or (shape and whole[-1] != shape[-1]):
+    if (len(whole) == 0 and len(shape) > 0) or (shape and whole[-1] != shape[-1]):
         raise ValueError(f"{name}: want a number or one for each of {like} {tuple(shape)}, got {tuple(tensor.shape)}")
 
 

@@ -64,8 +64,8 @@ class PoseParameters:
         offered = ", ".join([*MOUNTING, *TURNS, *groups, *self.camera.names])
         raise ValueError(f"{option}: want names from {offered}, got {name!r}")
 
-    def pack(self, camera: Camera) -> Float[Tensor, "p q"]:
-        """The parameters of cameras of batch shape `(P,)`, upright ones."""
+    def pack(self, camera: Camera) -> Float[Tensor, "*batch q"]:
+        """The parameters of cameras `(*B, q)`, upright ones."""
         if self.start is None:
             angles = torch.stack(mounting_from_rotation(camera.R), dim=-1)
         else:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffproj.calibration.knowledge import Knowledge
 from diffproj.calibration.observation import Observation
-from diffproj.calibration.observations import Heights, Lengths, Seen
+from diffproj.calibration.observations import Heights, Horizon, Lengths, Seen
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.pose_parameters import PLACE
 from diffproj.geometry.camera import Camera
@@ -41,9 +41,9 @@ def starts(
         begin: their values `(P, q)`.
         batch: the shape of the P cameras, over which observations broadcast.
     """
-    P = len(begin)
     seen = [piece for piece in pieces if isinstance(piece, Seen) and len(piece) >= 2]
-    angles = _directions(known, camera, begin, rolls=any(len(piece) >= 3 for piece in seen), turns=bool(seen))
+    turns = any(not isinstance(piece, Horizon | Heights | Lengths) for piece in pieces)  # those know no heading
+    angles = _directions(known, camera, begin, rolls=any(len(piece) >= 3 for piece in seen), turns=turns)
     R = rotation_from_mounting(*angles.unbind(-1))  # (K, P, 3, 3)
     held = [known.given(name) for name in PLACE]
     tries = [begin[:, -3:]]

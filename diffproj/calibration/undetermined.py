@@ -1,6 +1,6 @@
 """What evidence does not tell of a camera, by name: directions of the parameters in which nothing holds them."""
 
-from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,6 +21,18 @@ SHOWN = {"x": "position", "y": "position", "f_x": "focal", "f_y": "focal"} | {
     "c_x": "principal_point",
     "c_y": "principal_point",
 }
+
+
+class Lacking(NamedTuple):
+    """What nothing tells of a camera.
+
+    Attributes:
+        names: of parameters or groups.
+        together: whether something is told of them, but not of each.
+    """
+
+    names: tuple[str, ...] = ()
+    together: bool = False
 
 
 def natural(values: Tensor, reach: Tensor) -> Tensor:
@@ -55,7 +67,7 @@ def inverse(H: Tensor, scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def undetermined(
     parameters: PoseParameters, values: Tensor, basis: Tensor, scale: Tensor, lost: Tensor, vectors: Tensor
-) -> tuple[Tensor, list[tuple[str, ...]]]:
+) -> tuple[Tensor, list[Lacking]]:
     """Which parameters nothing tells `(P, q)`, and their names for each camera.
 
     Args:
@@ -68,7 +80,7 @@ def undetermined(
     """
     along = basis @ (units(basis, scale).unsqueeze(-1) * vectors) / scale.unsqueeze(-1)
     unknown = ((along * lost.unsqueeze(-2)).square().sum(-1) > PART**2).to(torch.bool)
-    names: list[tuple[str, ...]] = [()] * len(values)
+    names = [Lacking()] * len(values)
     if not bool(lost.any()):
         return unknown, names
     if parameters.start is not None:
@@ -76,22 +88,24 @@ def undetermined(
         along = torch.cat([along[:, :-POSE], J.permute(1, 2, 0) @ along[:, -POSE:-3], along[:, -3:]], dim=1)
     shown = [*parameters.camera.names, *MOUNTING]
     said = (along * lost.unsqueeze(-2)).square().sum(-1) > PART**2
-    for camera, row in enumerate(said.tolist()):
+    for camera, (row, count) in enumerate(zip(said.tolist(), lost.sum(-1).tolist(), strict=True)):
         found = [SHOWN.get(name, name) for name, lacking in zip(shown, row, strict=True) if lacking]
-        names[camera] = tuple(dict.fromkeys(found))
+        names[camera] = Lacking(tuple(dict.fromkeys(found)), count < len(found) - found.count("focal") // 2)
     return unknown, names
 
 
-def described(names: Sequence[str]) -> str:
+def described(lacking: Lacking) -> str:
     """What is lacking, and what to do, in words."""
+    names = lacking.names
     first = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
     pose = [name for name in names if name in (*MOUNTING, "position")]
     inside = [name for name in names if name not in pose]
-    hold = ", ".join(map(repr, pose))
-    remedies = [f"fixed=({hold}{',' * (len(pose) == 1)})"] if pose else []
+    remedies = [f"fixed=({', '.join(map(repr, pose))}{',' * (len(pose) == 1)})"] if pose else []
     remedies += [f"leave {', '.join(inside)} out of free"] if inside else []
-    example = f"priors={{{names[0]!r}: (value, deviation)}}"
-    return f"{first}: no evidence; fix them or give a prior, as {' or '.join([*remedies, example])}"
+    remedies.append(f"priors={{{names[0]!r}: (value, deviation)}}")
+    them = "it" if len(names) == 1 else "some of them" if lacking.together else "them"
+    what = "the evidence does not tell them apart" if lacking.together else "no evidence"
+    return f"{first}: {what}; fix {them} or give a prior, as {' or '.join(remedies)}"
 
 
 def _angles(parameters: PoseParameters, values: Tensor, turn: Tensor) -> Tensor:
