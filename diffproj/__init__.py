@@ -69,6 +69,7 @@ __all__ = [
     "CameraMismatchWarning",
     "Cauchy",
     "Chessboard",
+    "Coplanar",
     "Covariance",
     "CrossValidation",
     "Experiment",

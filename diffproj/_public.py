@@ -9,6 +9,7 @@ from diffproj.calibration.adjustment import Adjustment as Adjustment
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning as AmbiguousPoseWarning
 from diffproj.calibration.calibrate import calibrate as calibrate
 from diffproj.calibration.comparison import LensComparison as LensComparison
+from diffproj.calibration.coplanar import Coplanar as Coplanar
 from diffproj.calibration.covariance import Covariance as Covariance
 from diffproj.calibration.locate import locate as locate
 from diffproj.calibration.losses import Cauchy as Cauchy
@@ -21,7 +22,6 @@ from diffproj.calibration.observations import Heights as Heights
 from diffproj.calibration.observations import Horizon as Horizon
 from diffproj.calibration.observations import Lengths as Lengths
 from diffproj.calibration.observations import Seen as Seen
-from diffproj.calibration.observations import VanishingPoints as VanishingPoints
 from diffproj.calibration.options import CalibrationOptions as CalibrationOptions
 from diffproj.calibration.options import LocateOptions as LocateOptions
 from diffproj.calibration.refine import refine as refine
@@ -31,6 +31,7 @@ from diffproj.calibration.solver import Status as Status
 from diffproj.calibration.validation import CrossValidation as CrossValidation
 from diffproj.calibration.validation import bootstrap as bootstrap
 from diffproj.calibration.validation import cross_validate as cross_validate
+from diffproj.calibration.vanishing import VanishingPoints as VanishingPoints
 from diffproj.files.load import load as load
 from diffproj.files.load import load_calibration as load_calibration
 from diffproj.files.load import load_camera as load_camera

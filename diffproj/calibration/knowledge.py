@@ -192,5 +192,5 @@ def _check_steep(camera: Camera, known: Knowledge) -> None:
     if bool((steep.detach().abs() > STEEPEST).any()):
         raise ValueError(
             "priors: want turn_x, turn_y and turn_z, degrees about the camera's own axes, for a camera that looks "
-            "straight down: roll and heading turn it about the same axis there, and nothing tells how far it leans aside"
+            "straight down: roll and heading turn it about the same axis there, so nothing tells how it leans aside"
         )

@@ -7,12 +7,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.arguments import called
+from diffproj._core.arguments import Array, called
 from diffproj._core.copying import Copied
-from diffproj._core.numerics import check_tensor, in_float64
+from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64
 from diffproj._core.shown import Shown
 from diffproj.calibration.losses import Loss, check_loss
 from diffproj.geometry.camera import Camera
+
+Deviation = Float[Tensor, "..."] | Array | float
+"""A standard deviation, or one for each item."""
 
 
 @runtime_checkable
@@ -111,3 +114,9 @@ def with_spread(function: Callable[..., Tensor], pixels: list[Tensor], sigma: Te
         value = function(*(each + step for each, step in zip(pixels, steps, strict=True)))
         slopes = torch.autograd.grad(value.sum(), steps, create_graph=True)
     return value, sum(slope.square().sum(-1) for slope in slopes) * sigma.square()  # type: ignore[return-value]
+
+
+def batched(pixels: Tensor, camera: Camera) -> Tensor:
+    """Pixels with the batch axes that they and the camera have together, so that each has its own slope."""
+    batch = broadcast_batches(pixels=pixels.shape[:-2], camera=camera.batch_shape)
+    return pixels.to(camera.K).expand(*batch, *pixels.shape[-2:])

@@ -1,21 +1,21 @@
-"""What cameras see besides targets: surveyed points, the horizon, upright objects, lengths, vanishing points.
+"""What cameras see besides targets: surveyed points, the horizon, upright objects, lengths.
 
 Each is a residual with a deviation. Where what was seen is a pixel, its noise is carried into what is compared by the
 derivative at the camera in question, so that far and foreshortened things weigh as little as they tell.
 """
 
-from collections.abc import Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.arguments import Array, called, tensor_of
+from diffproj._core.arguments import Array, tensor_of
 from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.observation import (
+    Deviation,
     Observed,
+    batched,
     check_broadcast,
     checked_deviation,
     checked_pixels,
@@ -26,11 +26,6 @@ from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.lens.slopes import by_direction
 from diffproj.targets.target import Target
-
-Deviation = Float[Tensor, "..."] | Array | float
-"""A standard deviation, or one for each item."""
-
-AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 class Seen(Observed):
@@ -175,7 +170,7 @@ class Horizon(Observed):
             rise = rise + self.dip.to(rise).sin() * rays.norm(dim=-1)
             return torch.where(valid, rise, torch.nan)
 
-        pixels = _batched(self.pixels, camera)
+        pixels = batched(self.pixels, camera)
         rise, variance = with_spread(above, [pixels], self.pixel_sigma.to(pixels))
         return (rise / variance.sqrt()).unsqueeze(-1)
 
@@ -248,7 +243,7 @@ class Heights(Observed):
             reach = (foot * up[..., :2]).sum(-1) / torch.where(steep, 1.0, square)
             return torch.where(below & ~steep & (reach > 0), above + up[..., 2] * reach, torch.nan)
 
-        feet, tops = _batched(self.feet, camera), _batched(self.tops, camera)
+        feet, tops = batched(self.feet, camera), batched(self.tops, camera)
         found, variance = with_spread(height, [feet, tops], self.pixel_sigma.to(feet))
         spread = (variance + self.deviation.to(feet).square()).sqrt()
         return ((found - self.height.to(feet)) / spread).unsqueeze(-1)
@@ -320,102 +315,7 @@ class Lengths(Observed):
             apart = seen & also & (square > 0)
             return torch.where(apart, torch.where(apart, square, 1.0).sqrt(), torch.nan)
 
-        starts, ends = _batched(self.starts, camera), _batched(self.ends, camera)
+        starts, ends = batched(self.starts, camera), batched(self.ends, camera)
         found, variance = with_spread(length, [starts, ends], self.pixel_sigma.to(starts))
         spread = (variance + self.deviation.to(starts).square()).sqrt()
         return ((found - self.length.to(starts)) / spread).unsqueeze(-1)
-
-
-class VanishingPoints(Observed):
-    """Where parallel lines of known directions meet in the picture, or such lines themselves.
-
-    Attributes:
-        directions: of the lines in the world `(M, 3)`.
-        pixels: where they meet `(*B, M, 2)`, or `None`.
-        segments: two pixels of each line `(*B, M, 2, 2)`, or `None`.
-
-    Example:
-        >>> import diffproj as dp
-        >>> dp.VanishingPoints(["y", "x"], pixels=[[1137.0, 209.4], [-1842.9, 174.9]], pixel_sigma=5.0)
-        VanishingPoints(2 seen)
-        >>> dp.VanishingPoints(["y"], segments=[[[400.0, 700.0], [600.0, 300.0]]])
-        VanishingPoints(1 seen)
-    """
-
-    __slots__ = ("directions", "pixel_sigma", "pixels", "segments")
-
-    def __init__(
-        self,
-        directions: Sequence[str] | Float[Tensor, "m 3"] | Array,
-        pixels: Float[Tensor, "*batch m 2"] | Array | None = None,
-        segments: Float[Tensor, "*batch m 2 2"] | Array | None = None,
-        pixel_sigma: Deviation = 1.0,
-        loss: Loss | None = None,
-    ) -> None:
-        """Copy what was seen, and check it.
-
-        Args:
-            directions: of the lines in the world `(M, 3)`, of any length and either sense; `"x"`, `"y"`, `"z"` stand
-                for the axes.
-            pixels: vanishing points `(*B, M, 2)`; or
-            segments: two pixels on each line `(*B, M, 2, 2)`, far apart, which is better where lines are nearly
-                parallel in the picture too.
-            pixel_sigma: standard deviation of a pixel's coordinate in px: a number, `(M,)` or `(*B, M)`.
-            loss: a robust loss, its scale in deviations.
-
-        Raises:
-            TypeError: not directions, pixels or numbers.
-            ValueError: neither or both of pixels and segments, or shapes that do not fit.
-        """
-        super().__init__(loss)
-        self.directions = _directions(directions)
-        if (pixels is None) == (segments is None):
-            raise ValueError(f"pixels: want pixels or segments, got {'neither' if pixels is None else 'both'}")
-        M = len(self.directions)
-        self.pixels = None if pixels is None else checked_pixels("pixels", pixels, M, 2)
-        self.segments = None if segments is None else checked_pixels("segments", segments, M, 2, 2)
-        seen = self.pixels if self.segments is None else self.segments[..., 0, :]
-        self.pixel_sigma = checked_deviation("pixel_sigma", pixel_sigma, "a deviation in px")
-        check_broadcast("pixel_sigma", self.pixel_sigma, "the lines", seen.shape[:-1])  # type: ignore[union-attr]
-
-    def __len__(self) -> int:
-        """The number of directions, M."""
-        return len(self.directions)
-
-    def residuals(self, camera: Camera) -> Float[Tensor, "*batch m k"]:
-        """Of points, predicted minus seen; of segments, the distance of the vanishing point from the line."""
-        towards = (camera.R.unsqueeze(-3) @ self.directions.to(camera.device).unsqueeze(-1)).squeeze(-1)
-        if self.pixels is not None:
-            ahead = torch.where(towards[..., 2:] < 0, -towards, towards)
-            predicted, valid = camera.without_pose().project(ahead)
-            off = (predicted - self.pixels.to(predicted)) / self.pixel_sigma.to(predicted).unsqueeze(-1)
-            return torch.where(valid.unsqueeze(-1), off, torch.nan)
-
-        def beside(one: Tensor, other: Tensor) -> Tensor:
-            (first, seen), (second, also) = camera.directions(one), camera.directions(other)
-            return torch.where(seen & also, (torch.linalg.cross(first, second) * towards).sum(-1), torch.nan)
-
-        ends = [_batched(end, camera) for end in self.segments.unbind(-2)]  # type: ignore[union-attr]
-        found, variance = with_spread(beside, ends, self.pixel_sigma.to(ends[0]))
-        return (found / variance.sqrt()).unsqueeze(-1)
-
-
-def _directions(given: Any) -> Tensor:
-    if isinstance(given, str):
-        raise TypeError(f"directions: want one for each line, as in [{given!r}], got a string")
-    if isinstance(given, list | tuple) and any(isinstance(one, str) for one in given):
-        unknown = [one for one in given if not (isinstance(one, str) and one in AXES)]
-        if unknown:
-            raise ValueError(f"directions: want 'x', 'y', 'z' or vectors (M, 3), got {called(unknown[0])}")
-        given = [AXES[one] for one in given]
-    directions = in_float64(check_tensor("directions", given, "M", 3))
-    length = directions.detach().norm(dim=-1, keepdim=True)
-    if directions.ndim != 2 or not bool(((length > 0) & length.isfinite()).all()):
-        raise ValueError(f"directions: want vectors (M, 3) other than 0, got shape {tuple(directions.shape)}")
-    return directions / directions.norm(dim=-1, keepdim=True)
-
-
-def _batched(pixels: Tensor, camera: Camera) -> Tensor:
-    """Pixels with the batch axes that they and the camera have together, so that each has its own slope."""
-    batch = broadcast_batches(pixels=pixels.shape[:-2], camera=camera.batch_shape)
-    return pixels.to(camera.K).expand(*batch, *pixels.shape[-2:])

@@ -1,5 +1,7 @@
 """`adjust`: figures of the field, error bars against sampling, what evidence does not tell, gradients, batches."""
 
+import json
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -35,6 +37,25 @@ def within(estimate: torch.Tensor, truth: torch.Tensor, deviation: torch.Tensor)
 
 
 # ------------------------------------------------------------------------------------------ figures of the field
+
+
+def test_colony_of_penguins() -> None:
+    """50 penguins of 0.75 m, two clicks on the horizon, two landmarks: figures of an independent fit of the same."""
+    given = json.loads((Path(__file__).parent / "penguins.json").read_text())
+    pieces = [
+        dp.Heights(given["feet"], given["tops"], 0.75, 0.03),
+        dp.Horizon(given["horizon"], 10.0),
+        dp.Seen(given["landmarks"], given["seen"], pixel_sigma=1e-3, sigma=[3.0, 3.0, 5.0]),
+    ]
+    start = dp.Camera.mounted(16.0, 10.0, focal=3863.64, size=(4608, 2592), principal_point=[2304.0, 1296.0])
+    found = dp.adjust(start, pieces, fixed=("position",))
+    value, spread = found.mounting, found.mounting_deviations
+    expected = {"height": (20.47, 0.19), "tilt": (90 - 83.48, 0.10), "roll": (-1.01, 0.22), "heading": (101.72, 0.23)}
+    for name, (truth, deviation) in expected.items():
+        assert float(getattr(value, name)) == pytest.approx(truth, abs=0.02), name
+        assert float(getattr(spread, name)) == pytest.approx(deviation, rel=0.05), name
+    assert "Heights (2.0 times)" in found.doubts  # penguins are less alike than 3 cm
+
 
 VANISHING = [[1136.941176, 209.411765], [-1842.891566, 174.939760]]
 """Of a traffic camera, along the road and across; its scale makes the camera's height 0.09158."""
@@ -164,6 +185,23 @@ def test_intrinsics_of_a_calibration_go_along() -> None:
     torch.testing.assert_close(both.covariance.shared, calibration.covariance_of_kept_poses.shared)
     assert both.knows_intrinsics
     assert not exact.knows_intrinsics
+
+
+@pytest.mark.slow
+def test_a_waterline_of_unknown_level_tells() -> None:
+    """Its level is found along, exactly without noise; and error bars hold with it."""
+    shore = torch.tensor([[2.0, 20], [10, 26], [18, 22], [25, 35], [6, 14]], dtype=D)
+    points = torch.cat([shore, torch.full((5, 1), -1.3, dtype=D)], dim=-1)
+    exact = dp.adjust(START, [dp.Coplanar(shore, seen(TRUE, points)), dp.Seen(LANDMARKS[:1], seen()[:1])])
+    torch.testing.assert_close(exact.cameras.R[0], TRUE.R, atol=1e-7, rtol=0)
+    random = torch.Generator().manual_seed(4)
+    noisy = (
+        pixels + torch.randn(600, *pixels.shape, dtype=D, generator=random)
+        for pixels in (seen(TRUE, points), seen()[:2])
+    )
+    found = dp.adjust(START, [dp.Coplanar(shore, next(noisy)), dp.Seen(LANDMARKS[:2], next(noisy))])
+    parts = [within(*each) for each in zip(found.mounting, TRUE.mounting(), found.mounting_deviations, strict=True)]
+    assert all(0.92 <= part <= 0.98 for part in parts), parts
 
 
 # --------------------------------------------------------------------------------- what evidence does not tell
