@@ -16,7 +16,7 @@ STEPS = 6
 
 
 class Coplanar(Observed):
-    """Points that a map or an orthophoto tells by x and y, and that lie on one level: a waterline, a floor, a roof edge.
+    """Points that a map tells by x and y, and that lie on one level: a waterline, a floor, a roof edge.
 
     The level itself is not known: the one that fits best is taken for each camera, and what the points tell of it is
     not counted twice. Three of them and more tell something.

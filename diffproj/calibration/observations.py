@@ -4,7 +4,6 @@ Each is a residual with a deviation. Where what was seen is a pixel, its noise i
 derivative at the camera in question, so that far and foreshortened things weigh as little as they tell.
 """
 
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
