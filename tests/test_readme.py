@@ -1,6 +1,7 @@
 """Every call of the README's table works as it is written, in an empty folder with photographs and camera files."""
 
 import doctest
+import importlib
 import io
 import re
 import shlex
@@ -147,3 +148,10 @@ def test_calls_work_as_they_are_written(wish: str, names: dict[str, Any]) -> Non
             assert cli.main(shlex.split(call)[1:]) == 0
         else:
             exec(compile(call, "README.md", "exec"), names)  # noqa: S102
+
+
+def test_the_figure_of_a_mounted_camera_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / ".readme"))
+    drawn = importlib.import_module("mounting").figure()
+    assert [axes.get_title() for axes in drawn.axes] == ["from the side", "the picture", "from above"]
+    assert len(dp.figures.png(drawn, dpi=40)) > 3000

@@ -5,9 +5,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from diffproj._core.arguments import Array, number
-from diffproj._core.numerics import check_tensor, in_float64
 from diffproj.calibration.losses import Loss
-from diffproj.calibration.observation import Deviation, Observed, check_broadcast, checked_deviation, checked_pixels
+from diffproj.calibration.observation import (
+    Deviation,
+    Observed,
+    check_broadcast,
+    checked_deviation,
+    checked_pixels,
+    valued,
+)
 from diffproj.geometry.camera import Camera
 from diffproj.lens.slopes import by_direction
 
@@ -56,7 +62,7 @@ class Coplanar(Observed):
             ValueError: shapes do not fit, fewer than three points, or a value that cannot be.
         """
         super().__init__(loss)
-        self.places = in_float64(check_tensor("places", places, "M", 2))
+        self.places = valued("places", places, "M", 2)
         if self.places.ndim != 2 or len(self.places) < 3 or not bool(self.places.detach().isfinite().all()):
             raise ValueError(f"places: want x and y of at least 3 points (M, 2), got {tuple(self.places.shape)}")
         self.pixels = checked_pixels("pixels", pixels, len(self.places), 2)
@@ -68,7 +74,7 @@ class Coplanar(Observed):
         """The number of points, M."""
         return len(self.places)
 
-    def residuals(self, camera: Camera) -> Float[Tensor, "*batch m 2"]:
+    def _residuals(self, camera: Camera) -> Float[Tensor, "*batch m 2"]:
         """Projected minus seen at the level that fits best, over the deviation."""
         places, up = self.places.to(camera.K), camera.R[..., None, :, 2]
         sigma = self.pixel_sigma.to(places).unsqueeze(-1)

@@ -12,7 +12,7 @@ from diffproj._core.copying import Copied
 from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64
 from diffproj._core.shown import Shown
 from diffproj.calibration.losses import Loss, check_loss
-from diffproj.geometry.camera import Camera
+from diffproj.geometry.camera import Camera, as_camera
 
 Deviation = Float[Tensor, "..."] | Array | float
 """A standard deviation, or one for each item."""
@@ -47,7 +47,19 @@ class Observed(Copied, Shown):
         self.loss = loss
 
     def residuals(self, camera: Camera) -> Float[Tensor, "*batch m k"]:
-        """See `Observation`."""
+        """What the camera predicts minus what was seen, over the deviation, in float64: see `Observation`.
+
+        Raises:
+            TypeError: it is no camera.
+        ValueError: it has no values, on the device meta.
+        """
+        camera = as_camera(camera)
+        if camera.K.is_meta:
+            raise ValueError("camera: want values, got tensors on the device meta")
+        return self._residuals(camera if camera.dtype == torch.float64 else camera.to(torch.float64))
+
+    def _residuals(self, camera: Camera) -> Float[Tensor, "*batch m k"]:
+        """The same of a camera in float64."""
         raise NotImplementedError
 
     def __len__(self) -> int:
@@ -58,6 +70,19 @@ class Observed(Copied, Shown):
         return [f"{len(self)} seen", *([] if self.loss is None else [repr(self.loss)])]
 
 
+def valued(name: str, value: Any, *shape: int | str) -> Tensor:
+    """Numbers of that shape in float64, with their graph.
+
+    Raises:
+        TypeError: no numbers.
+        ValueError: another shape, or a tensor without values, on the device meta.
+    """
+    tensor = in_float64(check_tensor(name, value, *shape))
+    if tensor.is_meta:
+        raise ValueError(f"{name}: want values, got a tensor on the device meta")
+    return tensor
+
+
 def checked_pixels(name: str, value: Any, *shape: int | str) -> Tensor:
     """Pixels `(*B, *shape)` in float64, all finite, with their graph.
 
@@ -65,7 +90,7 @@ def checked_pixels(name: str, value: Any, *shape: int | str) -> Tensor:
         TypeError: no numbers.
         ValueError: another shape, or values that are not finite.
     """
-    pixels = in_float64(check_tensor(name, value, *shape))
+    pixels = valued(name, value, *shape)
     if not bool(pixels.detach().isfinite().all()):
         raise ValueError(f"{name}: want finite pixels, got NaN or infinity; leave out what was not seen")
     return pixels
@@ -80,7 +105,7 @@ def checked_deviation(name: str, value: Any, want: str, *, zero: bool = False) -
     """
     if value is None or isinstance(value, bool | str):
         raise TypeError(f"{name}: want {want}, got {called(value)}")
-    sigma = in_float64(check_tensor(name, value))
+    sigma = valued(name, value)
     known = sigma.detach()
     if not bool(((known >= 0 if zero else known > 0) & known.isfinite()).all()):
         raise ValueError(f"{name}: want {want}, {'at least' if zero else 'more than'} 0 and finite, got others")

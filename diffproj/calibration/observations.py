@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.arguments import Array, tensor_of
-from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64
+from diffproj._core.arguments import Array, number, tensor_of
+from diffproj._core.numerics import broadcast_batches, in_float64
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.observation import (
     Deviation,
@@ -18,6 +18,7 @@ from diffproj.calibration.observation import (
     check_broadcast,
     checked_deviation,
     checked_pixels,
+    valued,
     with_spread,
 )
 from diffproj.geometry.back_projection import back_project
@@ -68,11 +69,13 @@ class Seen(Observed):
         given = landmarks.points if isinstance(landmarks, Target) else tensor_of("landmarks", landmarks)
         if given.ndim != 2 or given.shape[-1] not in (2, 3):
             raise ValueError(f"landmarks: want points (N, 3), or (N, 2) on z = 0, got shape {tuple(given.shape)}")
-        points = in_float64(check_tensor("landmarks", given))
+        points = valued("landmarks", given)
         points = torch.nn.functional.pad(points, (0, 3 - points.shape[-1]))
         if not bool(points.detach().isfinite().all()):
             raise ValueError("landmarks: want finite coordinates, got others")
-        pixels = in_float64(check_tensor("pixels", pixels, len(points), 2))
+        pixels = valued("pixels", pixels, "N", 2)
+        if pixels.shape[-2] != len(points):
+            raise ValueError(f"pixels: want one for each of {len(points)} landmarks, got {pixels.shape[-2]}")
         self.visible = pixels.detach().isfinite().all(-1)
         self.points, self.pixels = points, torch.where(self.visible.unsqueeze(-1), pixels, 0.0)
         self.pixel_sigma = checked_deviation("pixel_sigma", pixel_sigma, "a deviation in px")
@@ -93,7 +96,7 @@ class Seen(Observed):
         """The number of points, N."""
         return len(self.points)
 
-    def residuals(self, camera: Camera) -> Float[Tensor, "*batch m 2"]:
+    def _residuals(self, camera: Camera) -> Float[Tensor, "*batch m 2"]:
         """Projected minus seen, over the deviation that pixels and points have together."""
         points = self.points.to(camera.device)
         projected, valid = camera.project(points)
@@ -154,13 +157,13 @@ class Horizon(Observed):
         self.pixels = checked_pixels("pixels", pixels, "M", 2)
         self.pixel_sigma = checked_deviation("pixel_sigma", pixel_sigma, "a deviation in px")
         check_broadcast("pixel_sigma", self.pixel_sigma, "the pixels", self.pixels.shape[:-1])
-        self.dip = in_float64(check_tensor("dip_deg", dip_deg)).deg2rad()
+        self.dip = torch.tensor(number("dip_deg", dip_deg, "degrees"), dtype=torch.float64, device="cpu").deg2rad()
 
     def __len__(self) -> int:
         """The number of pixels, M."""
         return self.pixels.shape[-2]
 
-    def residuals(self, camera: Camera) -> Float[Tensor, "*batch m 1"]:
+    def _residuals(self, camera: Camera) -> Float[Tensor, "*batch m 1"]:
         """The distance from the horizon, over its deviation; positive above it."""
 
         def above(pixels: Tensor) -> Tensor:
@@ -227,7 +230,7 @@ class Heights(Observed):
         """The number of objects, M."""
         return self.feet.shape[-2]
 
-    def residuals(self, camera: Camera) -> Float[Tensor, "*batch m 1"]:
+    def _residuals(self, camera: Camera) -> Float[Tensor, "*batch m 1"]:
         """The height at which a top is seen over its foot, minus that of the object, over the deviation."""
 
         def height(feet: Tensor, tops: Tensor) -> Tensor:
@@ -304,7 +307,7 @@ class Lengths(Observed):
         """The number of lengths, M."""
         return self.starts.shape[-2]
 
-    def residuals(self, camera: Camera) -> Float[Tensor, "*batch m 1"]:
+    def _residuals(self, camera: Camera) -> Float[Tensor, "*batch m 1"]:
         """The length on the plane minus the one that is known, over the deviation."""
         plane = self.plane.to(camera.device)
 

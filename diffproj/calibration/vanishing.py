@@ -8,7 +8,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from diffproj._core.arguments import Array, called
-from diffproj._core.numerics import check_tensor, in_float64
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.observation import (
     Deviation,
@@ -17,6 +16,7 @@ from diffproj.calibration.observation import (
     check_broadcast,
     checked_deviation,
     checked_pixels,
+    valued,
     with_spread,
 )
 from diffproj.geometry.camera import Camera
@@ -70,9 +70,12 @@ class VanishingPoints(Observed):
         if (pixels is None) == (segments is None):
             raise ValueError(f"pixels: want pixels or segments, got {'neither' if pixels is None else 'both'}")
         M = len(self.directions)
-        self.pixels = None if pixels is None else checked_pixels("pixels", pixels, M, 2)
-        self.segments = None if segments is None else checked_pixels("segments", segments, M, 2, 2)
+        self.pixels = None if pixels is None else checked_pixels("pixels", pixels, "M", 2)
+        self.segments = None if segments is None else checked_pixels("segments", segments, "M", 2, 2)
         seen = self.pixels if self.segments is None else self.segments[..., 0, :]
+        if seen.shape[-2] != M:  # type: ignore[union-attr]
+            what = "segments" if pixels is None else "pixels"
+            raise ValueError(f"directions: want one for each of {seen.shape[-2]} {what}, got {M}")  # type: ignore[union-attr]
         self.pixel_sigma = checked_deviation("pixel_sigma", pixel_sigma, "a deviation in px")
         check_broadcast("pixel_sigma", self.pixel_sigma, "the lines", seen.shape[:-1])  # type: ignore[union-attr]
 
@@ -80,7 +83,7 @@ class VanishingPoints(Observed):
         """The number of directions, M."""
         return len(self.directions)
 
-    def residuals(self, camera: Camera) -> Float[Tensor, "*batch m k"]:
+    def _residuals(self, camera: Camera) -> Float[Tensor, "*batch m k"]:
         """Of points, predicted minus seen; of segments, the distance of the vanishing point from the line."""
         towards = (camera.R.unsqueeze(-3) @ self.directions.to(camera.device).unsqueeze(-1)).squeeze(-1)
         if self.pixels is not None:
@@ -106,7 +109,7 @@ def _directions(given: Any) -> Tensor:
         if unknown:
             raise ValueError(f"directions: want 'x', 'y', 'z' or vectors (M, 3), got {called(unknown[0])}")
         given = [AXES[one] for one in given]
-    directions = in_float64(check_tensor("directions", given, "M", 3))
+    directions = valued("directions", given, "M", 3)
     length = directions.detach().norm(dim=-1, keepdim=True)
     if directions.ndim != 2 or not bool(((length > 0) & length.isfinite()).all()):
         raise ValueError(f"directions: want vectors (M, 3) other than 0, got shape {tuple(directions.shape)}")

@@ -216,22 +216,24 @@ def _focal(
         raise ValueError(f"focal_mm: want focal_mm and sensor_mm together, got {got} alone")
     width, height = size
     if focal is not None:
-        pair = _parts(focal)
-        x, *y = (_number("focal", one, kind, "a focal length in px, more than 0", lambda f: f > 0) for one in pair)
+        want = "a focal length in px, more than 0"
+        x, *y = (_number("focal", one, kind, want, _positive) for one in _parts(focal))
         return x, y[0] if y else x
     if fov_deg is not None:
-        angle = _number(
-            "fov_deg", fov_deg, kind, "degrees from edge to edge, between 0 and 180", lambda x: (x > 0) & (x < 180)
-        )
+        want = "degrees from edge to edge, between 0 and 180"
+        angle = _number("fov_deg", fov_deg, kind, want, lambda x: (x > 1e-9) & (x < 180))
         f = width / 2 / (angle.deg2rad() / 2).tan()
         return f, f
-    length = _number("focal_mm", focal_mm, kind, "a focal length in mm, more than 0", lambda x: x > 0)
-    sides = [
-        _number("sensor_mm", side, kind, "the sensor's width in mm, more than 0", lambda x: x > 0)
-        for side in (sensor_mm if isinstance(sensor_mm, tuple | list) and len(sensor_mm) == 2 else (sensor_mm,))
-    ]
+    length = _number("focal_mm", focal_mm, kind, "a focal length in mm, more than 0", _positive)
+    given = sensor_mm if isinstance(sensor_mm, tuple | list) and len(sensor_mm) == 2 else (sensor_mm,)
+    sides = [_number("sensor_mm", side, kind, "the sensor's width in mm, more than 0", _positive) for side in given]
     f = length / sides[0] * width
     return f, length / sides[1] * height if len(sides) == 2 else f
+
+
+def _positive(length: Tensor) -> Tensor:
+    """Which lengths are such, and neither vanish nor overflow where they are squared."""
+    return (length > 1e-30) & (length < 1e30)
 
 
 def _parts(focal: Any) -> tuple[Any, ...]:
