@@ -101,7 +101,7 @@ def test_a_mounted_camera_is_a_calibration(tmp_path: Path) -> None:
     pixels = [[320.0, 300.0], [400.0, 320.0]]
     measured = dp.measure(pixels, known, GROUND, pixel_sigma=1.0)
     dp.save_camera(tmp_path / "mast.json", known)
-    for same in (dp.load_calibration(tmp_path / "mast.json"), copy.deepcopy(known), pickle.loads(pickle.dumps(known))):
+    for same in (dp.load_calibration(tmp_path / "mast.json"), copy.deepcopy(known), pickle.loads(pickle.dumps(known))):  # noqa: S301
         again = dp.measure(pixels, same, GROUND, pixel_sigma=1.0)
         torch.testing.assert_close(again.joint(), measured.joint())
     assert float(dp.CalibrationPrior(known, view=0)(known.cameras[0])) == pytest.approx(0, abs=1e-12)
