@@ -73,6 +73,7 @@ __all__ = [
     "Experiment",
     "Huber",
     "KannalaBrandt",
+    "Landmarks",
     "LearnableCamera",
     "LearnablePlane",
     "Lens",

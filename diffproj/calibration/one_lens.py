@@ -1,15 +1,20 @@
 """A calibration with one lens: a start in closed form, refined, looked at twice, and kept from folding."""
 
 import torch
+from torch import Tensor
 
 from diffproj.calibration import start
 from diffproj.calibration.data import Data
+from diffproj.calibration.fit import Fit
 from diffproj.calibration.options import Options
 from diffproj.calibration.outcome import minimised, outcome
-from diffproj.calibration.parametrisation import Parametrisation
+from diffproj.calibration.own_frame import are_solid
+from diffproj.calibration.parametrisation import Parametrisation, Pose
 from diffproj.calibration.restraint import restrained
 from diffproj.calibration.result import Calibration
-from diffproj.calibration.second_look import second_look
+from diffproj.calibration.second_look import lower_fit, second_look
+from diffproj.calibration.space_start import space_starts
+from diffproj.calibration.start import Straightened
 from diffproj.lens.models import LensModel, model_named
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
@@ -19,16 +24,31 @@ def calibrated(
     views: Views, target: Target, distortion: LensModel, chosen: Options, who: str = "calibrate"
 ) -> Calibration:
     """What `calibrate` promises, for one lens and checked options; errors name `who` was asked."""
-    model = model_named(distortion)
-    data = Data(views, target, chosen.weights)
+    model_named(distortion)
+    data = Data(views, target, chosen.weights, chosen.pixel_sigma)
     if views.size is None:
         raise ValueError("views: want the photographs' size, got None; give Views(..., size=(width, height))")
     parameters = Parametrisation(distortion, chosen.bow, chosen.skew)
-    shared, local, straight = start.from_nothing(data, views.size, chosen.tied_focal, parameters)
+    if are_solid(data.points):
+        starts, straight = space_starts(data, views.size, parameters)
+    else:
+        *first, straight = start.from_nothing(data, views.size, chosen.tied_focal, parameters)
+        starts = [tuple(first)]
+    found = _from_start(data, chosen, parameters, *starts[0], straight)
+    every = torch.arange(len(data.pixels), device=data.pixels.device)
+    for other in starts[1:]:
+        found = lower_fit(found, _from_start(data, chosen, parameters, *other, straight), every, chosen.outlier_limit)
+    return outcome(who, data, found, views.size, chosen.throw)
+
+
+def _from_start(
+    data: Data, chosen: Options, parameters: Parametrisation, shared: Tensor, local: Pose, straight: Straightened
+) -> Fit:
+    """The minimum from a start, looked at twice, and kept from folding."""
     # The start is a guess from the corners; what is held, or known, is not.
     reference = shared.clone()
     reference[:, :2], reference[:, 4:] = torch.nan, 0.0
-    near = None
+    near, model = None, model_named(parameters.lens)
     if model.count > 5:
         # The rational terms nearly cancel each other: from far off they lead into side valleys.
         early = chosen.but(
@@ -41,7 +61,8 @@ def calibrated(
         shared, local = near = poorer.solution.shared, poorer.solution.local
     found, _ = minimised(data, chosen, parameters, shared, local, reference)
     limits = {"max_iterations": chosen.max_iterations, "tolerance": chosen.tolerance}
-    found = second_look(found, straight, reject=chosen.outlier_limit, **limits)
+    if not found.task.solid:  # a plane's focal length and tilt go together; points in space have had other starts
+        found = second_look(found, straight, reject=chosen.outlier_limit, **limits)
     if near is not None:
-        found = restrained(found, *near, views.size, reject=chosen.outlier_limit, **limits)
-    return outcome(who, data, found, views.size, chosen.throw)
+        found = restrained(found, *near, straight.size, reject=chosen.outlier_limit, **limits)
+    return found

@@ -65,7 +65,9 @@ def _other_poses(found: Fit, variance: Tensor, freedom: Tensor) -> tuple[Tensor,
         one = tuple(z[p, v].expand(len(starts), *z[p, v].shape) for z in kept)
         step = difference(one, poses, task.points.mean(0))
         apart = (step.unsqueeze(-2) @ found.solution.equations.W[p, v] @ step.unsqueeze(-1)).squeeze(-1).squeeze(-1)
-        another = (apart > APART**2 * variance[p, 0]) & _faces_alike(one, poses, task.points) & costs.isfinite()
+        another = (apart > APART**2 * variance[p, 0]) & costs.isfinite()
+        if not task.solid:
+            another &= _faces_alike(one, poses, task.points)
         lowest, chosen = torch.where(another, costs, torch.inf).min(0)
         taken = lowest.isfinite()
         p, v, chosen = p[taken], v[taken], chosen[taken]

@@ -112,7 +112,7 @@ class Recorded:
             _later(fields, "pixel_sigma", batch),
             skew=_flag("skew", fields.get("skew", False)),
             shares=_later(fields, "shares", (*batch, V)),
-            degrees_of_freedom=_later(fields, "degrees_of_freedom", batch),
+            degrees_of_freedom=_freedom(fields, batch),
             lens_region=_region(fields),
             unit=_unit(fields.get("unit")),
             _covariance=None if covariance is None else partial(_same, covariance),
@@ -167,6 +167,12 @@ def _mismatch(fields: dict[str, Any] | None, shape: tuple[int, ...]) -> Callable
 def _later(fields: dict[str, Any], name: str, shape: tuple[int, ...]) -> Tensor | None:
     """A field of numbers that cannot be negative, or `None`; NaN where a number is missing."""
     return tensor(fields, name, shape, least=0, gaps=True) if present(fields, name) else None
+
+
+def _freedom(fields: dict[str, Any], batch: tuple[int, ...]) -> Tensor | None:
+    """Degrees of freedom, infinite where the noise was known, which a file has no number for."""
+    found = _later(fields, "degrees_of_freedom", batch)
+    return None if found is None else found.nan_to_num(torch.inf)
 
 
 def _region(fields: dict[str, Any]) -> Tensor | None:

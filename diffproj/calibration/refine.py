@@ -64,7 +64,7 @@ def refine(
         )
     differentiable = flag("differentiable", differentiable)
     chosen = calibration_options("refine", options)
-    data = Data(views, target, chosen.weights)
+    data = Data(views, target, chosen.weights, chosen.pixel_sigma)
     camera = as_camera(camera)
     shared, local, parameters = start.from_camera(camera, data, chosen.bow, chosen.skew)
     found, prior = minimised(data, chosen, parameters, shared, local, shared)

@@ -111,12 +111,12 @@ def second_look(
     rows = torch.arange(len(which), device=which.device)
     best = others.part(rows)
     for rank in range(1, len(starts)):
-        best = _lower(best, others.part(rows + rank * len(which)), rows, reject)
+        best = lower_fit(best, others.part(rows + rank * len(which)), rows, reject)
     last = fit(task, best.solution.shared, best.solution.local, reject=reject, **steps)
-    found = _lower(found, last, which, reject)
+    found = lower_fit(found, last, which, reject)
     if straight.lens == "none" and (task.basis is None or bool(task.basis[:, 2:4].any())):
         start = _other_side(found.task.parameters, found.part(which).solution, straight.middle[which])
-        found = _lower(found, fit(task, *start, reject=reject, **steps), which, reject)
+        found = lower_fit(found, fit(task, *start, reject=reject, **steps), which, reject)
     return found if reject is not None else _with_views_turned_over(found, which, short, steps)
 
 
@@ -143,7 +143,7 @@ def _with_views_turned_over(found: Fit, which: Tensor, short: dict[str, Any], st
         best = tried.part(number[lower, view[lower]])
         which = which[lower]
         last = fit(found.task.part(which), best.solution.shared, best.solution.local, **steps)
-        found = _lower(found, last, which, None)
+        found = lower_fit(found, last, which, None)
     return found
 
 
@@ -181,7 +181,7 @@ def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Ten
     order = task.used.sum(-1).argsort(dim=-1, descending=True, stable=True)
     sample = order[:, spread_evenly(V, count, order.device)]
     costs = torch.stack([_profile(task, straight, grid[i].expand(P), sample) for i in range(len(grid))])
-    best = _lowest(costs)
+    best = lowest(costs)
     starts = []
     for rank in range(best.shape[0]):
         f = grid[best[rank]]
@@ -225,7 +225,7 @@ def _both_poses(task: Task, straight: Straightened, f: Tensor, views: Tensor) ->
     return torch.minimum(*costs), (R, torch.where(better[..., None], other[1], one[1]))
 
 
-def _lowest(costs: Tensor) -> Tensor:
+def lowest(costs: Tensor) -> Tensor:
     """Positions `(BEST, P)` on the grid `(G, P)` of its lowest local minima, then of its lowest nodes."""
     padded = torch.nn.functional.pad(costs, (0, 0, 1, 1), value=torch.inf)
     local = (costs <= padded[:-2]) & (costs <= padded[2:])
@@ -235,7 +235,7 @@ def _lowest(costs: Tensor) -> Tensor:
     return order.gather(0, rank.gather(0, order).argsort(dim=0, stable=True))[:BEST]
 
 
-def _lower(found: Fit, other: Fit, which: Tensor, reject: float | None) -> Fit:
+def lower_fit(found: Fit, other: Fit, which: Tensor, reject: float | None) -> Fit:
     """The fit with the minima of some cameras `(n,)` replaced where the others are lower."""
     before, now = found.solution.cost[which], other.solution.cost
     if reject is not None:

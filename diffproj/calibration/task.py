@@ -9,6 +9,7 @@ from torch import Tensor
 from diffproj.calibration.board_error import BoardError
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.options import Progress
+from diffproj.calibration.own_frame import are_solid
 from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.reprojection import Reprojection
 from diffproj.calibration.result import Objective
@@ -27,12 +28,13 @@ class Task:
     """A minimisation problem: P cameras of V views with N corners.
 
     Attributes:
-        points: the board's points `(N, 3)`.
+        points: the target's points `(N, 3)` in their own frame.
         pixels: `(P, V, N, 2)`.
         used: which corners count `(P, V, N)`.
         lens, bow, skew: the model.
         objective: residuals on the image or on the board.
         weights: of the corners `(P, V, N)`, or `None` for 1.
+        known_noise: whether the weights are one over the variances, so that the residuals need not tell their level.
         shares: how much each view counts in what all views share `(P, V)`, or `None` for 1: see `distinct.py`. A pose
             is determined by all of its view's corners, whatever the view's share.
         loss: a robust loss, or `None` for least squares.
@@ -48,10 +50,16 @@ class Task:
     skew: bool = False
     objective: Objective = "image"
     weights: Tensor | None = None
+    known_noise: bool = False
     shares: Tensor | None = None
     loss: Loss | None = None
     prior: Prior | None = None
     basis: Tensor | None = None
+
+    @property
+    def solid(self) -> bool:
+        """Whether the points do not lie on a plane."""
+        return are_solid(self.points)
 
     @property
     def parameters(self) -> Parametrisation:

@@ -14,6 +14,7 @@ from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import mean_squares
 from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.landmarks import Landmarks
 
 MAX_RELATIVE_STD = 0.1
 """Standard deviation of a focal length or principal point, relative to the focal length, above which it counts as
@@ -137,6 +138,8 @@ def _leans_on_one_view(task: Task) -> Tensor:
     if task.prior is not None:
         free = free & (task.prior.precision.diagonal(dim1=-2, dim2=-1) == 0)
     more = free[:, 2:].any(-1)
+    if task.solid:  # points in space tell even in one view
+        return torch.zeros_like(more)
     return more & one_view(task.points, task.pixels, task.used) if bool(more.any()) else more
 
 
@@ -165,6 +168,8 @@ def _mirrored(R: Tensor, t: Tensor, points: Tensor, used: Tensor, board: object)
     """Which views show the board mirrored `(P, V)`: against a `Chessboard`'s axes, or else against the majority."""
     middle = R @ points.mean(0) + t
     away = (R[..., 2] * middle).sum(-1) > 0  # the board's z points away from the camera
+    if isinstance(board, Landmarks):  # not printed on one face of anything
+        return torch.zeros_like(used)
     if isinstance(board, Chessboard):
         expected = torch.full_like(away[:, :1], board.axes == "opencv")
     else:
