@@ -20,6 +20,7 @@ from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.mismatch import Mismatch
 from diffproj.calibration.parametrisation import Parametrisation
+from diffproj.calibration.positions import Positions, positions
 from diffproj.calibration.record import Recorded
 from diffproj.calibration.region import covered_region
 from diffproj.calibration.solver import Status
@@ -224,6 +225,21 @@ class Calibration(Account, Copied, Recorded):
         if self._covariance is None:
             raise ValueError("covariance: want a calibration that was computed here, got one from a file without it")
         return self._covariance()
+
+    @cached_property
+    def positions(self) -> Positions:
+        """Where the camera stood in each view, `(*B, V, 3)` in the world, with the covariance of each.
+
+        Raises:
+            ValueError: the calibration came from a file without a covariance.
+
+        Example:
+            >>> import diffproj as dp
+            >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+            >>> calibration.positions.points.shape, bool((calibration.positions.deviations < 3).all())  # millimetres
+            (torch.Size([13, 3]), True)
+        """
+        return positions(self.cameras, self.covariance, self.views.names)
 
     @property
     def has_alternatives(self) -> bool:
