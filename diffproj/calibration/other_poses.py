@@ -91,13 +91,19 @@ def _improbability(task: Task, shared: Tensor, poses: Pose, variance: Tensor) ->
 
 
 def _noise(found: Fit, known: Noise | None) -> Noise:
-    """The noise of the corners, where few of them tell little with what is usual of photographs."""
+    """The noise of the corners, where few of them tell little with what is usual of photographs.
+
+    That counts even where the residuals contradict it: a pose with an error several times as large takes a noise that
+    is even less usual. (Of 1500 views of four points with a noise of 3 px, odds told of 2.2 wrong poses, and 2 were; of
+    8 px of 31, and 23 were.)
+    """
     own = own_noise(found)
     if found.task.weights is not None or found.task.objective != "image":
         return own
     if known is None:
         typical = torch.where(own.variance > SYNTHETIC_PX**2, TYPICAL_PX**2, 0.0).to(own.variance)
-        known = Noise(typical, torch.full_like(own.freedom, TYPICAL_FREEDOM))
+        freedom = own.freedom + TYPICAL_FREEDOM
+        return Noise((own.variance * own.freedom + typical * TYPICAL_FREEDOM) / freedom, freedom)
     return pooled(own, known)
 
 

@@ -23,6 +23,7 @@ from diffproj.calibration.solver import Prior, Status
 from diffproj.calibration.uncertainty import covariance_of
 from diffproj.calibration.verdict import verdicts
 from diffproj.geometry.camera import Camera
+from diffproj.targets.landmarks import Landmarks
 
 
 def minimised(
@@ -94,6 +95,7 @@ def outcome(
     )
 
     doubt = Entangled(found, status)
+    landmarks = data.target.names if isinstance(data.target, Landmarks) else None
     calibration = Calibration(
         camera,
         posed,
@@ -113,7 +115,8 @@ def outcome(
         lens_region=None if known is None else known.region,
         _covariance=partial(_covariance, found, data, before, known, doubt),
         _others=partial(_others, found, data, before),
-        _remarks=partial(remarks, found, status, doubt),
+        _remarks=partial(remarks, found, status, doubt, of_landmarks=landmarks is not None),
+        landmarks=landmarks,
         _mismatch=None if known is None else partial(mismatch, found, known, tuple(batch)),
     )
     if throw and bool((status != Status.CONVERGED).any()):

@@ -49,6 +49,7 @@ class Recorded:
         return {
             "objective": self.objective,
             "unit": self.unit,
+            "landmarks": None if self.landmarks is None else list(self.landmarks),
             "skew": self.skew,
             "causes": list(self.causes),
             "remarks": list(self.remarks),
@@ -115,6 +116,7 @@ class Recorded:
             degrees_of_freedom=_freedom(fields, batch),
             lens_region=_region(fields),
             unit=_unit(fields.get("unit")),
+            landmarks=_landmarks(fields.get("landmarks"), N),
             _covariance=None if covariance is None else partial(_same, covariance),
             _others=None if others is None else partial(_same, others),
             _remarks=partial(_same, _texts("remarks", fields["remarks"])) if "remarks" in fields else None,
@@ -186,6 +188,16 @@ def _names(names: Any, count: int) -> tuple[str, ...]:
     found = _texts("names", names)
     if len(found) != count:
         raise ValueError(f"names: want {count}, one for each view, got {len(found)}")
+    return found
+
+
+def _landmarks(names: Any, count: int) -> tuple[str, ...] | None:
+    """The names of the points, where they are landmarks; files of earlier releases lack them."""
+    if names is None:
+        return None
+    found = _texts("landmarks", names)
+    if len(found) != count:
+        raise ValueError(f"landmarks: want {count} names, one for each point, got {len(found)}")
     return found
 
 

@@ -74,6 +74,7 @@ class Calibration(Account, Copied, Recorded):
             board as it does, to within 2 px, which bring nothing new. `None` where all counted fully.
         skew: whether the skew of K is among the parameters: it was fitted, or K had some that was held.
         comparison: how the lenses fared, where `distortion="auto"` compared them.
+        landmarks: the names of the N points, where they are `Landmarks`; `None` for a board.
         unit: the world's unit, such as `"mm"`, where it is known; files keep it.
     """
 
@@ -95,6 +96,7 @@ class Calibration(Account, Copied, Recorded):
     lens_region: Float[Tensor, "*#batch directions"] | None = None
     comparison: LensComparison | None = None
     unit: str | None = None
+    landmarks: tuple[str, ...] | None = None
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
     _remarks: Callable[[], tuple[str, ...]] | None = None
