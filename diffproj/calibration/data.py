@@ -10,7 +10,7 @@ from diffproj._core.arguments import Array, tensor_of
 from diffproj._core.numerics import in_float64
 from diffproj.calibration.distinct import shares
 from diffproj.calibration.losses import SMALLEST
-from diffproj.calibration.own_frame import flattened, own_frame
+from diffproj.calibration.own_frame import OwnFrame, flattened, own_frame
 from diffproj.calibration.task import Task
 from diffproj.lens.models import LensModel
 from diffproj.targets.landmarks import Landmarks
@@ -35,6 +35,7 @@ class Data:
         pixels: `(P, V, N, 2)`, without graph.
         used: `(P, V, N)`: seen, in a view with at least 4 corners.
         weights: `(P, V, N)`, without graph, or `None`.
+        spread: the covariances of landmarks in their own frame `(N, 3, 3)`; `None` where they are exact.
         known_noise: whether the weights are one over the variances, and not only proportional to them.
         given_points, given_pixels, given_weights: with graph, and with `*B` in front; points in the world.
 
@@ -71,6 +72,7 @@ class Data:
         self.frame = own_frame(points)
         self.middle = self.frame.middle
         self.points = flattened(self.frame.own(points), points)
+        self.spread = _spread(target, self.frame)
         self.pixels = self.given_pixels.detach().reshape(-1, *views.pixels.shape[-3:])
         visible = views.visible
         self.given_weights, self.weights = None, None
@@ -96,10 +98,42 @@ class Data:
         """How much each view counts in what all views share `(P, V)`; `None` where all count fully."""
         return shares(self.points, self.pixels, self.used)
 
+    def check_options(self, objective: str, bow: bool) -> None:
+        """Check what a target can be asked for in `calibrate` and `refine`.
+
+        Raises:
+            ValueError: it cannot.
+        """
+        level = bool((self.given_points.detach()[:, 2] == 0).all())
+        if objective == "plane" and not level:
+            raise ValueError(
+                "objective: want 'image' for points that are not all on z = 0, got 'plane', which puts corners back there"
+            )
+        if bow and not level:
+            raise ValueError("bow: want False for points that are not all on z = 0; a bow is that of a flat board")
+        if self.spread is None:
+            return
+        if objective == "plane":
+            raise ValueError("objective: want 'image' for landmarks with a sigma, got 'plane'; or leave out the sigma")
+        if int(self.used.any(-1).sum(-1).amax()) > 1:
+            raise ValueError(
+                "target: want landmarks without sigma, or one view: several views see a landmark off in the same way, "
+                "which calibrate and refine do not carry; dp.locate does, for each view"
+            )
+
     def task(self, model: LensModel, **options: Any) -> Task:
         """What is to be minimised on these corners."""
-        noise = {"weights": self.weights, "known_noise": self.known_noise}
+        noise = {"weights": self.weights, "known_noise": self.known_noise, "spread": self.spread}
         return Task(self.points, self.pixels, self.used, model, **noise, **options)
+
+
+def _spread(target: Target, frame: OwnFrame) -> Tensor | None:
+    """The covariances of landmarks in their own frame; `None` where there are none."""
+    given = target.covariances if isinstance(target, Landmarks) else None
+    if given is None or not bool((given != 0).any()):
+        return None
+    given = given.detach().to(frame.middle)
+    return given if frame.axes is None else frame.axes @ given @ frame.axes.mT
 
 
 def _of_corners(name: str, value: Tensor | Array | float, views: Views) -> Tensor:

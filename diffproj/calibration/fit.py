@@ -15,11 +15,14 @@ from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.options import Progress
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.solver import Solution, select
+from diffproj.calibration.surveyed import whitening
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import found_again, settled
 
 MAX_REJECTION_ROUNDS = 10
 """Maximum number of rounds of outlier rejection."""
+WEIGHING_ROUNDS = (6, 3)
+"""How often uncertain landmarks are weighed anew: where the pixels' noise is estimated, and where it is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +136,12 @@ def fit(
     """
     with torch.inference_mode():  # a fifth faster where call overhead dominates; derivatives are added afterwards
         found = _fit(task, shared, local, reject, max_iterations, tolerance, progress)
+        if task.spread is not None:
+            for _ in range(WEIGHING_ROUNDS[task.known_noise]):
+                state = found.solution.shared, found.solution.local
+                matrices = whitening(found.task, *state, found.residual_variance())
+                again = _fit(replace(found.task, whitening=matrices), *state, reject, max_iterations, tolerance, None)
+                found = Fit(again.task, again.solution, found.rejected | again.rejected)
     return Fit(*normal_tensors((found.task, found.solution, found.rejected)))
 
 

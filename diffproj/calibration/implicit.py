@@ -78,6 +78,8 @@ def _costs(
     seen = torch.where(task.used.unsqueeze(-1), pixels, 0.0).flatten(0, 1).unsqueeze(1)
     error = put_back_minus_known if task.objective == "plane" else projected_minus_seen
     residual, _ = error(cameras, points, seen, task.used.flatten(0, 1).unsqueeze(1))
+    if task.whitening is not None:
+        residual = (task.whitening.flatten(0, 1).unsqueeze(1) @ residual.unsqueeze(-1)).squeeze(-1)
     squared = residual[..., :2].square().sum(-1)
     value = squared if task.loss is None else task.loss.value(squared)
     if weights is not None:

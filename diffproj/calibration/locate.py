@@ -132,4 +132,6 @@ def located(
         ),
     )
     found = Fit(replace(task, used=used), joined, rejected)
+    if best.task.whitening is not None:
+        found = replace(found, task=replace(found.task, whitening=best.task.whitening.squeeze(1).unflatten(0, seen.shape)))
     return outcome("locate", data, found, camera.size or views.size, chosen.throw, calibration)

@@ -26,6 +26,7 @@ def calibrated(
     """What `calibrate` promises, for one lens and checked options; errors name `who` was asked."""
     model_named(distortion)
     data = Data(views, target, chosen.weights, chosen.pixel_sigma)
+    data.check_options(chosen.objective, chosen.bow)
     if views.size is None:
         raise ValueError("views: want the photographs' size, got None; give Views(..., size=(width, height))")
     parameters = Parametrisation(distortion, chosen.bow, chosen.skew)

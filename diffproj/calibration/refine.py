@@ -65,6 +65,7 @@ def refine(
     differentiable = flag("differentiable", differentiable)
     chosen = calibration_options("refine", options)
     data = Data(views, target, chosen.weights, chosen.pixel_sigma)
+    data.check_options(chosen.objective, chosen.bow)
     camera = as_camera(camera)
     shared, local, parameters = start.from_camera(camera, data, chosen.bow, chosen.skew)
     found, prior = minimised(data, chosen, parameters, shared, local, shared)

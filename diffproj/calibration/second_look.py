@@ -61,7 +61,8 @@ def correlation(found: Fit) -> Tensor:
     """Correlation of each corner's residual with that of its nearest neighbour on the target `(P,)`, in some views."""
     V = found.task.used.shape[1]
     some = spread_evenly(V, min(V, SAMPLE_VIEWS), found.task.used.device)
-    task = replace(found.task, pixels=found.task.pixels[:, some], used=found.task.used[:, some])
+    cut = {name: getattr(found.task, name)[:, some] for name in ("pixels", "used")}
+    task = replace(found.task, **cut, whitening=None)
     poses = tuple(z[:, some] for z in found.solution.local)
     residual = task.problem.linearise(found.solution.shared, poses)[:, :, -1]
     apart = torch.cdist(task.points, task.points).fill_diagonal_(torch.inf)
