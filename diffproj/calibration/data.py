@@ -65,9 +65,7 @@ class Data:
         if points.shape != (count, 3):
             of_landmarks = isinstance(target, Landmarks)
             remedy = "a pixel for each, in their order, or visible=False" if of_landmarks else BOARD_SIZE
-            raise ValueError(
-                f"views: want {points.shape[0]} corners in each as the target has, got {count}; {remedy}"
-            )
+            raise ValueError(f"views: want {points.shape[0]} corners in each as the target has, got {count}; {remedy}")
         _check_points(points)
         self.frame = own_frame(points)
         self.middle = self.frame.middle
@@ -107,7 +105,8 @@ class Data:
         level = bool((self.given_points.detach()[:, 2] == 0).all())
         if objective == "plane" and not level:
             raise ValueError(
-                "objective: want 'image' for points that are not all on z = 0, got 'plane', which puts corners back there"
+                "objective: want 'image' for points that are not all on z = 0, got 'plane', which puts corners back "
+                "there"
             )
         if bow and not level:
             raise ValueError("bow: want False for points that are not all on z = 0; a bow is that of a flat board")

@@ -91,8 +91,8 @@ class Fit:
     def _given_sigma(self) -> Tensor:
         """The root mean square of the deviations that were given, `(P,)`."""
         weights, used = self.task.weights, self.task.used
-        assert weights is not None  # noise is known by weights
-        variance = torch.where(used, 1 / torch.where(used, weights, 1.0), 0.0).sum((1, 2))
+        each = torch.ones_like(self.task.pixels[..., 0]) if weights is None else torch.where(used, weights, 1.0)
+        variance = torch.where(used, 1 / each, 0.0).sum((1, 2))
         return (variance / used.sum((1, 2)).clamp(min=1)).sqrt()
 
     def degrees_of_freedom(self) -> Tensor:

@@ -5,8 +5,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from diffproj.calibration.space_poses import space_poses
 from diffproj.calibration.solver import Solution
+from diffproj.calibration.space_poses import space_poses
 from diffproj.calibration.task import Task, solved
 from diffproj.calibration.two_poses import posed
 

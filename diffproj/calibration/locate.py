@@ -42,14 +42,16 @@ def locate(
     says so.
     With a calibration in the place of a camera a `CameraMismatchWarning` names the views whose corners are not where it
     sees them, as photographs of another camera, zoom or focus: see `mismatch`.
-    The board is taken to be flat, also where a calibration found a bow.
+    The board is taken to be flat, also where a calibration found a bow. `Landmarks` may lie anywhere; where they come
+    with a sigma of their own, each view's pose carries it, as if other views had other landmarks.
 
     Args:
         views: corners `(*B, V, N, 2)`.
-        target: anything with `.points (N, 3)` on z = 0.
+        target: a board, `Landmarks`, or anything with `.points (N, 3)`.
         camera: batch shape broadcasting to `*B`; its own pose does not matter. A calibration brings its uncertainty
             along, and the noise of its corners, which few corners do not tell.
-        options: `weights`, `loss`, `max_iterations`, `tolerance`, `progress` and `throw`: see `LocateOptions`.
+        options: `weights`, `pixel_sigma`, `loss`, `reject_outliers`, `max_iterations`, `tolerance`, `progress` and
+            `throw`: see `LocateOptions`.
 
     Returns:
         A calibration with the given intrinsics and the poses found, in float64; where the image is turned, with those
@@ -133,5 +135,6 @@ def located(
     )
     found = Fit(replace(task, used=used), joined, rejected)
     if best.task.whitening is not None:
-        found = replace(found, task=replace(found.task, whitening=best.task.whitening.squeeze(1).unflatten(0, seen.shape)))
+        whole = best.task.whitening.squeeze(1).unflatten(0, seen.shape)
+        found = replace(found, task=replace(found.task, whitening=whole))
     return outcome("locate", data, found, camera.size or views.size, chosen.throw, calibration)

@@ -45,7 +45,7 @@ class OwnFrame(NamedTuple):
 
 
 def own_frame(points: Float[Tensor, "n 3"]) -> OwnFrame:
-    """The own frame of points `(N, 3)`: of those on z = 0 along the world's axes, else along the points' principal axes.
+    """The own frame of points `(N, 3)`: along the world's axes if they are on z = 0, else along their principal axes.
 
     Example:
         >>> wall = torch.tensor([[7.0, 0, 0], [7, 4, 0], [7, 4, 2], [7, 0, 2]], dtype=torch.float64)

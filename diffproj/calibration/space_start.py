@@ -10,8 +10,7 @@ from torch import Tensor
 from diffproj.calibration.data import Data
 from diffproj.calibration.parametrisation import Parametrisation, Pose
 from diffproj.calibration.second_look import FISHEYE_GRID, FOCAL_GRID, lowest
-from diffproj.calibration.start import best_pose, candidate_poses
-from diffproj.calibration.start import Straightened
+from diffproj.calibration.start import Straightened, best_pose, candidate_poses
 from diffproj.calibration.two_poses import view_costs
 
 

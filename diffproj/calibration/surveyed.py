@@ -32,10 +32,10 @@ def whitening(task: Task, shared: Tensor, local: tuple[Tensor, ...], variance: T
         local: poses.
         variance: of residuals of weight 1 `(P,)`.
     """
-    assert task.spread is not None  # asked only where landmarks are uncertain
+    spread = task.points.new_zeros(3, 3) if task.spread is None else task.spread
     panel = replace(task, whitening=None).problem.linearise(shared, local)
     by_point = torch.einsum("pvikn,pvij->pvnkj", panel[:, :, -4:-1], local[0])
-    seen = by_point @ task.spread @ by_point.mT
+    seen = by_point @ spread @ by_point.mT
     each = variance.nan_to_num(0.0).clamp(min=FINEST_PX**2)[:, None, None].expand(task.used.shape)
     if task.weights is not None:
         each = (variance[:, None, None] if task.known_noise else each) / torch.where(task.used, task.weights, 1.0)

@@ -6,6 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from diffproj._core.arguments import Array
 from diffproj._core.numerics import check_tensor
 from diffproj._core.warn import warn_caller
 from diffproj.calibration import ambiguity, mismatch
@@ -13,8 +14,9 @@ from diffproj.calibration.mismatch import CameraMismatchWarning
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.result import Calibration
 
-PixelSigma = float | Tensor | Literal["detector"] | None
-"""A number of pixels, one or two or a covariance for each pixel, `"detector"` for that of the calibration's corners; `None` was not said."""
+PixelSigma = float | Tensor | Array | Literal["detector"] | None
+"""A number of pixels, one or two or a covariance for each pixel; `"detector"` stands for that of the calibration's
+corners, and `None` was not said."""
 
 HAND_PX = 0.5
 """Standard deviation of a coordinate that a hand picked on a screen."""
@@ -60,7 +62,7 @@ def detector_noise(calibration: Calibration, view: int) -> Tensor | None:
 
 def pixel_noise(
     pixels: Tensor, pixel_sigma: PixelSigma, calibration: Calibration | None, view: int
-) -> tuple[float | Tensor, bool]:
+) -> tuple[float | Tensor | Array, bool]:
     """The standard deviation of the pixels' coordinates, and whether the calibration's residuals told it.
 
     Where nothing was said, a warning says what was taken, unless the pixels are corners that the view was given with.
@@ -108,7 +110,7 @@ def _are_corners(pixels: Tensor, corners: Tensor) -> bool:
     return bool(same.any(-1).all())
 
 
-def deviation_matrices(pixel_sigma: float | Tensor | None, points: Tensor) -> Tensor:
+def deviation_matrices(pixel_sigma: float | Tensor | Array, points: Tensor) -> Tensor:
     """A matrix L `(*B, N, 2, 2)` for each pixel, whose error is L times two independent ones of deviation 1.
 
     Args:
@@ -133,7 +135,7 @@ def deviation_matrices(pixel_sigma: float | Tensor | None, points: Tensor) -> Te
         return torch.diag_embed(given.expand(*batch, N, 2))
     if given.shape[-2:] == (2, 2) and given.ndim >= 3 and _expands(given.shape, (*batch, N, 2, 2)):
         return _root2(given).expand(*batch, N, 2, 2)
-    want = tuple((*batch, N))
+    want = (*batch, N)
     raise ValueError(
         f"pixel_sigma: want a number or a shape that broadcasts to {want}, (*{want}, 2) or (*{want}, 2, 2), got "
         f"{tuple(given.shape)}"

@@ -59,9 +59,7 @@ class Ellipses(Copied, Shown):
         return self.to_dict()
 
 
-def plane_ellipses(
-    points: Tensor, covariance: Tensor, tangents: Tensor, freedom: Tensor, level: float
-) -> Ellipses:
+def plane_ellipses(points: Tensor, covariance: Tensor, tangents: Tensor, freedom: Tensor, level: float) -> Ellipses:
     """Ellipses of points `(*B, N, 3)` with these covariances `(*B, N, 3, 3)` on a plane with tangents `(*B, N, 3, 2)`.
 
     Two coordinates whose scale was estimated with n degrees of freedom are, squared and over it, twice Fisher's F with

@@ -9,11 +9,12 @@ so that the covariance of all points together is
 
     C_ij = G_i Sigma G_j^T  +  [i = j] D_i S_i D_i^T
 
-with `D = dX / d uv`, S the covariance of a pixel, G the derivative by theta and by the plane, and Sigma their joint covariance: the calibration's,
-with its correlations between intrinsics and pose, and the plane's where one is given. A quantity of some of the points
-has the variance `g^T C g`, g its gradient. This is first order: sampling agrees as long as standard deviations are
-small beside the distance. Beyond, `interval` follows the curve, and `lens_reach` tells how much less is known where the
-lens is extrapolated. The covariance of all pairs of points is computed only where it is asked for (`joint`).
+with `D = dX / d uv`, S the covariance of a pixel, G the derivative by theta and by the plane, and Sigma their joint
+covariance: the calibration's, with its correlations between intrinsics and pose, and the plane's where one is given. A
+quantity of some of the points has the variance `g^T C g`, g its gradient. This is first order: sampling agrees as long
+as standard deviations are small beside the distance. Beyond, `interval` follows the curve, and `lens_reach` tells how
+much less is known where the lens is extrapolated. The covariance of all pairs of points is computed only where it is
+asked for (`joint`).
 
 Where a view's pose may be the wrong one of two, the other is too far away for that: see `doubt.py`.
 """
@@ -65,9 +66,9 @@ def measure(
             where there is one only.
         pixel_sigma: how far off the measured pixels are, in px: the standard deviation of both coordinates, a number or
             `(*B, N)`, that of u and v `(*B, N, 2)`, or their covariance in squared px `(*B, N, 2, 2)`. About 0.5 for
-            points that a hand picked; for the foot of a detector's box a share of its width and height. `"detector"` stands for that of the calibration's corners, as its
-            residuals tell it. It is that if left out, too, with a `PixelNoiseWarning` unless the pixels are corners of
-            that view.
+            points that a hand picked; for the foot of a detector's box a share of its width and height. `"detector"`
+            stands for that of the calibration's corners, as its residuals tell it. It is that if left out, too, with a
+            `PixelNoiseWarning` unless the pixels are corners of that view.
         plane_covariance: of the plane's normal and offset as they are given, `(*B, 4, 4)`; exact if left out.
 
     Returns:
@@ -173,7 +174,8 @@ def _degrees_of_freedom(calibration: Calibration | Camera | PinholeCamera, like:
 def _at_view(calibration: Calibration, number: int) -> tuple[Camera, Tensor | None, Tensor | None]:
     """The camera at the pose of a view, the covariance of both, and the point `(3,)` that the pose turns about in it.
 
-    Of many cameras some may have no pose, for they used no corner of the view. What is not known is `None`. The covariance is larger where the calibration does not fit the view.
+    Of many cameras some may have no pose, for they used no corner of the view. What is not known is `None`. The
+    covariance is larger where the calibration does not fit the view.
     """
     if not bool(calibration.used[..., number, :].any(-1).any()):
         name = calibration.views.names[number]
