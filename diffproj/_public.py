@@ -16,6 +16,7 @@ from diffproj.calibration.losses import SoftL1 as SoftL1
 from diffproj.calibration.mismatch import CameraMismatchWarning as CameraMismatchWarning
 from diffproj.calibration.options import CalibrationOptions as CalibrationOptions
 from diffproj.calibration.options import LocateOptions as LocateOptions
+from diffproj.calibration.positions import Positions as Positions
 from diffproj.calibration.refine import refine as refine
 from diffproj.calibration.result import Calibration as Calibration
 from diffproj.calibration.result import CalibrationError as CalibrationError
@@ -45,6 +46,7 @@ from diffproj.lens.models import register_lens as register_lens
 from diffproj.lens.protocol import Lens as Lens
 from diffproj.measurement.accuracy_map import AccuracyMap as AccuracyMap
 from diffproj.measurement.choices import PixelNoiseWarning as PixelNoiseWarning
+from diffproj.measurement.ellipses import Ellipses as Ellipses
 from diffproj.measurement.measure import measure as measure
 from diffproj.measurement.measurement import Measurement as Measurement
 from diffproj.measurement.quantity import Quantity as Quantity

@@ -46,7 +46,11 @@ class Account(Shown):
         shares: Tensor | None
         lens_region: Tensor | None
         landmarks: tuple[str, ...] | None
-        residuals: Tensor
+
+        @property
+        def residuals(self) -> Tensor:
+            """See `Calibration`."""
+            ...
 
         @property
         def parameters(self) -> Parametrisation:

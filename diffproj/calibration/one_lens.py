@@ -33,19 +33,20 @@ def calibrated(
     if are_solid(data.points):
         starts, straight = space_starts(data, views.size, parameters)
     else:
-        *first, straight = start.from_nothing(data, views.size, chosen.tied_focal, parameters)
-        starts = [tuple(first)]
-    found = _from_start(data, chosen, parameters, *starts[0], straight)
+        first, pose, straight = start.from_nothing(data, views.size, chosen.tied_focal, parameters)
+        starts = [(first, pose)]
+    found = _from_start(data, chosen, parameters, starts[0], straight)
     every = torch.arange(len(data.pixels), device=data.pixels.device)
     for other in starts[1:]:
-        found = lower_fit(found, _from_start(data, chosen, parameters, *other, straight), every, chosen.outlier_limit)
+        found = lower_fit(found, _from_start(data, chosen, parameters, other, straight), every, chosen.outlier_limit)
     return outcome(who, data, found, views.size, chosen.throw)
 
 
 def _from_start(
-    data: Data, chosen: Options, parameters: Parametrisation, shared: Tensor, local: Pose, straight: Straightened
+    data: Data, chosen: Options, parameters: Parametrisation, begin: tuple[Tensor, Pose], straight: Straightened
 ) -> Fit:
     """The minimum from a start, looked at twice, and kept from folding."""
+    shared, local = begin
     # The start is a guess from the corners; what is held, or known, is not.
     reference = shared.clone()
     reference[:, :2], reference[:, 4:] = torch.nan, 0.0

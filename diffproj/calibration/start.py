@@ -20,7 +20,7 @@ from diffproj.lens.models import MODELS, LensModel, model_of
 
 def from_camera(
     camera: Camera, data: Data, bow: bool, skew: bool = False, with_poses: bool = True
-) -> tuple[Tensor, tuple[Tensor, Tensor], Parametrisation]:
+) -> tuple[Tensor, Pose, Parametrisation]:
     """Shared parameters and poses to start from, and which parameters they are.
 
     A camera whose image is turned is replaced by the one that is turned itself, and sees the same.
@@ -80,7 +80,8 @@ def poses_from_camera(task: Task, shared: Tensor) -> list[Pose]:
     A plane has two, each the mirror image of the other at the line of sight; points in space may have more.
     """
     poses = candidate_poses(task, shared)
-    return [*poses, closed_form.other_pose(*poses[0], task.points)]
+    R, t = poses[0]
+    return [*poses, closed_form.other_pose(R, t, task.points)]
 
 
 def candidate_poses(task: Task, shared: Tensor) -> list[Pose]:

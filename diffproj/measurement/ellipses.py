@@ -11,7 +11,9 @@ from torch import Tensor
 from diffproj._core.arguments import whole_number
 from diffproj._core.copying import Copied
 from diffproj._core.shown import Shown, counted, number
-from diffproj.measurement.student import check_level
+from diffproj.geometry.rectification import plane_axes
+from diffproj.measurement.folded import longest_first
+from diffproj.measurement.propagation import Noise, Propagated
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -59,35 +61,41 @@ class Ellipses(Copied, Shown):
         return self.to_dict()
 
 
-def plane_ellipses(points: Tensor, covariance: Tensor, tangents: Tensor, freedom: Tensor, level: float) -> Ellipses:
-    """Ellipses of points `(*B, N, 3)` with these covariances `(*B, N, 3, 3)` on a plane with tangents `(*B, N, 3, 2)`.
+def plane_ellipses(noise: Noise, points: Tensor, covariance: Tensor, level: float) -> Ellipses:
+    """Ellipses of points `(*B, N, 3)` with these covariances `(*B, N, 3, 3)` on the plane that they were measured on.
 
     Two coordinates whose scale was estimated with n degrees of freedom are, squared and over it, twice Fisher's F with
     2 and n of them, whose quantile is `n / 2 ((1 - level)^(-2 / n) - 1)`; with a known scale it is `-ln(1 - level)`.
 
     Args:
+        noise: of the points.
         points: the centres.
         covariance: NaN where not valid, infinite on the diagonal where not determined.
-        tangents: orthonormal.
-        freedom: `(*B, N)`.
         level: the probability.
     """
-    level = check_level(level)
+    plane = noise.sight.plane
+    _, *axes = plane_axes(plane)
+    tangents = torch.stack(axes, dim=-1)
+    tangents = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)
+    index = torch.arange(points.shape[-2], device=points.device).unsqueeze(-1)
+    every = torch.eye(3, dtype=points.dtype, device=points.device).unsqueeze(-2).expand(*points.shape, 1, 3)
+    spread = Propagated.of(noise, index, every)
+    freedom = spread.degrees_of_freedom(longest_first(spread.covariance.detach())[1])
     lost = covariance.isinf().any(-1).any(-1)
     gone = covariance.isnan().any(-1).any(-1)
     C = torch.where((lost | gone)[..., None, None], 0.0, covariance)
-    spread, turn = torch.linalg.eigh(tangents.mT @ C @ tangents)
-    spread, turn = spread.flip(-1).clamp(min=0), turn.flip(-1)
+    sizes, turn = torch.linalg.eigh(tangents.mT @ C @ tangents)
+    sizes, turn = sizes.flip(-1).clamp(min=0), turn.flip(-1)
     few = -math.log1p(-level)
     n = freedom.clamp(max=1e12)
     reach = torch.where(n > 0, n * torch.expm1(2 * few / n.clamp(min=1e-300)), torch.inf).sqrt()
-    axes = torch.where(spread > 0, spread.sqrt() * reach.unsqueeze(-1), 0.0)
-    axes = torch.where(lost.unsqueeze(-1), torch.inf, axes)
-    axes = torch.where(gone.unsqueeze(-1), torch.nan, axes)
+    unit = torch.where(sizes > 0, torch.where(sizes > 0, sizes, 1.0).sqrt(), 0.0)
+    half = torch.where(lost.unsqueeze(-1), torch.inf, unit * reach.unsqueeze(-1))
+    half = torch.where(gone.unsqueeze(-1), torch.nan, half)
     along = turn[..., 0]
     along = torch.where(((along[..., :1] < 0) | ((along[..., :1] == 0) & (along[..., 1:] < 0))), -along, along)
     angle = torch.where(gone, torch.nan, torch.atan2(along[..., 1], along[..., 0]))
     across = torch.stack([-along[..., 1], along[..., 0]], dim=-1)
     directions = torch.stack([along, across], dim=-2) @ tangents.mT
     nowhere = gone[..., None]
-    return Ellipses(torch.where(nowhere, torch.nan, points), axes, directions, angle, level)
+    return Ellipses(torch.where(nowhere, torch.nan, points), half, directions, angle, level)

@@ -1,6 +1,5 @@
 """`Measurement`: points on a plane with their joint covariance, and what follows from them with error bars."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -16,13 +15,13 @@ from diffproj._core.shown import Shown, counted, rounded
 from diffproj.calibration.covariance import zero_where_infinite
 from diffproj.calibration.region import in_region
 from diffproj.geometry.back_projection import Reason, explain
-from diffproj.geometry.rectification import plane_axes
 from diffproj.measurement.ellipses import Ellipses, plane_ellipses
 from diffproj.measurement.folded import longest_first, norm_variance
 from diffproj.measurement.intervals import angle_interval, curved_interval, norm_interval
 from diffproj.measurement.propagation import Noise, Propagated, kink_variance
-from diffproj.measurement.quantity import Bounds, Quantity
+from diffproj.measurement.quantity import Bounds, Quantity, described
 from diffproj.measurement.shapes import area_vector, difference, length, turn
+from diffproj.measurement.student import check_level
 
 EXTRAPOLATED = (
     "Extrapolated: outside of the region that the calibration's corners covered. Only the lens model tells the lens "
@@ -129,16 +128,7 @@ class Measurement(Copied, Shown):
             >>> measured.ellipses(0.95).half_axes  # 2.4477 deviations of 4 and 2 cm
             tensor([[0.0979, 0.0490]], dtype=torch.float64)
         """
-        noise = self._noise
-        _, *axes = plane_axes(noise.sight.plane)
-        tangents = torch.stack(axes, dim=-1)
-        tangents = tangents if noise.sight.plane.is_per_point else tangents.unsqueeze(-3)
-        tangents = tangents.expand(*self.points.shape, 2)
-        index = torch.arange(self.points.shape[-2], device=self.points.device).unsqueeze(-1)
-        every = torch.eye(3, dtype=self.points.dtype, device=self.points.device)
-        spread = Propagated.of(noise, index, every.unsqueeze(-2).expand(*self.points.shape, 1, 3))
-        _, worst = longest_first(spread.covariance.detach())
-        return plane_ellipses(self.points, self.covariance, tangents, spread.degrees_of_freedom(worst), level)
+        return plane_ellipses(self._noise, self.points, self.covariance, check_level(level))
 
     @cached_property
     def nonlinear(self) -> Bool[Tensor, "*batch n"]:
@@ -249,7 +239,7 @@ class Measurement(Copied, Shown):
             lines.append(f"point {n:<3} {'  '.join(texts) + notes if valid[n] else 'not on the plane'}")
         if len(lines) > 1:
             found = self.lengths()
-            lines += [f"{n} to {n + 1:<4} {text}" for n, text in enumerate(_lines(found))]
+            lines += [f"{n} to {n + 1:<4} {text}" for n, text in enumerate(described(found))]
             bent = [*bent, *found.nonlinear.tolist()]
         if any(beyond[n] for n in range(len(valid)) if valid[n]):
             lines.append(EXTRAPOLATED)
@@ -405,17 +395,3 @@ def _without(C: Tensor, unknown: Tensor) -> Tensor:
     """The covariance with infinite variances, and no covariances, where a coordinate `(..., r, 1)` is not known."""
     kept = torch.where(unknown | unknown.mT, 0.0, C)
     return kept + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(C).squeeze(-1))
-
-
-def _lines(found: Quantity) -> list[str]:
-    """Lengths with their deviations, and with their intervals where the deviations mislead."""
-    columns = (found.value, found.deviation, *found.interval(), found.nonlinear, found.significant)
-    lines = []
-    for value, deviation, low, high, bent, significant in zip(*(column.tolist() for column in columns), strict=True):
-        if math.isnan(value):
-            lines.append("not both points are on the plane")
-            continue
-        note = f"  nonlinear, 95 %: {low:.3f} to {high:.3f}" * bent
-        note += "" if significant else "  less than three deviations from 0"
-        lines.append(f"{value:10.3f} ± {deviation:.3f}{note}")
-    return lines
