@@ -18,7 +18,7 @@ from diffproj.geometry.back_projection import Reason, explain
 from diffproj.measurement.ellipses import Ellipses, plane_ellipses
 from diffproj.measurement.folded import longest_first, norm_variance
 from diffproj.measurement.intervals import angle_interval, curved_interval, norm_interval
-from diffproj.measurement.propagation import Noise, Propagated, kink_variance
+from diffproj.measurement.propagation import Noise, Propagated, kink_variance, without_unknown
 from diffproj.measurement.quantity import Bounds, Quantity, described
 from diffproj.measurement.shapes import area_vector, difference, length, turn
 from diffproj.measurement.sight import Sight
@@ -72,7 +72,7 @@ class Measurement(Copied, Shown):
         """The covariance of each point `(*B, N, 3, 3)` in squared world units; infinite where it is not determined."""
         noise = self._noise
         C = noise.common @ zero_where_infinite(noise.sigma).unsqueeze(-3) @ noise.common.mT + noise.own @ noise.own.mT
-        return torch.where(self.valid[..., None, None], _without(C, noise.unknown(noise.common)), torch.nan)
+        return torch.where(self.valid[..., None, None], without_unknown(C, noise.unknown(noise.common)), torch.nan)
 
     @property
     def deviations(self) -> Float[Tensor, "*batch n 3"]:
@@ -89,7 +89,7 @@ class Measurement(Copied, Shown):
         N = own.shape[-3]
         apart = torch.eye(N, dtype=own.dtype, device=own.device)[:, None, :, None]
         blocks = (own.unsqueeze(-2) * apart).flatten(-2).flatten(-3, -2)
-        C = _without(G @ zero_where_infinite(noise.sigma) @ G.mT + blocks, noise.unknown(G))
+        C = without_unknown(G @ zero_where_infinite(noise.sigma) @ G.mT + blocks, noise.unknown(G))
         valid = self.valid.repeat_interleave(3, dim=-1)
         return torch.where(valid.unsqueeze(-1) & valid.unsqueeze(-2), C, torch.nan)
 
@@ -395,9 +395,3 @@ class Measurement(Copied, Shown):
 
 def _coordinate(axis: int, points: Tensor) -> Tensor:
     return points[0, axis]
-
-
-def _without(C: Tensor, unknown: Tensor) -> Tensor:
-    """The covariance with infinite variances, and no covariances, where a coordinate `(..., r, 1)` is not known."""
-    kept = torch.where(unknown | unknown.mT, 0.0, C)
-    return kept + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(C).squeeze(-1))
