@@ -132,7 +132,7 @@ def test_a_river_of_unknown_focal_length() -> None:
         (98.38713, 161.31339, 138.51091),
         (106.66182, 165.641, 138.5616),
     ]
-    landmarks = dp.Landmarks([*np.array(points), 192000, 313000, 0])
+    landmarks = dp.Landmarks(np.array(points) + np.array([192000, 313000, 0]))
     fixed = ("principal_point", "k2", "p1", "p2")
     found = dp.calibrate(seen(pixels, (1920, 1080)), landmarks, "brown4", tied_focal=True, fixed=fixed).to_dict()
     assert found["f_x"] == pytest.approx(1556.5, abs=0.1)

@@ -74,11 +74,11 @@ def test_points_that_cannot_be(points: object, message: str) -> None:
 @pytest.mark.parametrize(
     "points",
     [
-        [*np.array(SQUARE), 642735, 8304292],  # UTM
+        np.array(SQUARE) + np.array([642735, 8304292]),  # UTM
         np.array(SQUARE) * 0.01 + [0.4, 0.3],  # a marker of centimetres
         np.array(SQUARE) * 0.01 + [150.0, 300.0],
-        [*np.array(SQUARE), 43.6, 79.4],  # a hall
-        [*np.column_stack([SQUARE, [1.0, 2, 3, 4]]), 3780000.0, 900000.0, 5040000.0],  # earth-centred
+        np.array(SQUARE) + np.array([43.6, 79.4]),  # a hall
+        np.column_stack([SQUARE, [1.0, 2, 3, 4]]) + np.array([3.78e6, 9.0e5, 5.04e6]),  # earth-centred
     ],
 )
 def test_lengths_are_not_taken_for_degrees(points: np.ndarray) -> None:
