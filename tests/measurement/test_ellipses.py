@@ -119,3 +119,15 @@ def test_a_shifted_camera_measures_in_float32() -> None:
     torch.testing.assert_close(found.to(torch.float64), truth - origin, atol=1e-5, rtol=0)
     many = far.shifted(torch.stack([origin, origin + 1]))
     assert many.batch_shape == (2,)
+
+
+def test_maps_of_a_bare_camera() -> None:
+    """With a number for the pixels' noise they are those of its own measurements."""
+    camera = dp.Camera(T([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]]), t=T([0.0, 0, 10]), size=(640, 480))
+    found = dp.AccuracyMap.over_image(camera, step=100, pixel_sigma=0.5)
+    assert found.valid.all()
+    torch.testing.assert_close(found.deviation, torch.full_like(found.deviation, 0.5 * 10 / 800))
+    plane = dp.AccuracyMap.over_plane(camera, (-1, -1, 1, 1), shape=(3, 4), pixel_sigma=0.5)
+    torch.testing.assert_close(plane.deviation, torch.full_like(plane.deviation, 0.5 * 10 / 800))
+    with pytest.raises(ValueError, match="a camera alone does not know it"):
+        dp.AccuracyMap.over_image(camera)
