@@ -14,8 +14,9 @@ DOUBTFUL = 0.003
 """RMS residual of a view, relative to its corners' spread, from which on the mirror image is tried."""
 BETTER = 0.04
 """Part of the cost that the mirror image must come below."""
-FOCAL_FACTORS = (1.0, 0.5, 0.7, 1.4, 2.0)
-"""Focal lengths that it is tried with, relative to that of the fit, where it is free."""
+FOCAL_LENGTHS = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)
+"""Focal lengths that it is tried with where they are free, relative to the corners' extent in the image: that of the fit
+may be anything, for from infinitely far away points and their mirror image look alike."""
 
 
 def left_handed(task: Task, solution: Solution, error: Tensor) -> Tensor:
@@ -34,9 +35,12 @@ def left_handed(task: Task, solution: Solution, error: Tensor) -> Tensor:
     mirrored = replace(part, points=part.points * part.points.new_tensor([1.0, 1.0, -1.0]))
     free = part.basis is None or bool(part.basis[:, :2].any())
     lowest = torch.full_like(solution.cost[which], torch.inf)
-    for factor in FOCAL_FACTORS if free else FOCAL_FACTORS[:1]:
+    seen = part.pixels.masked_fill(~part.used.unsqueeze(-1), torch.nan).flatten(1, 2)
+    low, high = (seen.nan_to_num(side * torch.inf) for side in (1, -1))
+    extent = (high.amax(1) - low.amin(1)).amax(-1, keepdim=True)
+    for factor in FOCAL_LENGTHS if free else (0.0,):
         shared = solution.shared[which].clone()
-        shared[:, :2] *= factor
+        shared[:, :2] = factor * extent if free else shared[:, :2]
         lowest = lowest.minimum(_cost(mirrored, shared))
     return found.index_put((which,), lowest < BETTER * solution.cost[which])
 

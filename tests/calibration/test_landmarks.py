@@ -283,7 +283,7 @@ def test_known_noise_gives_its_covariance() -> None:
 def test_noise_that_is_known_is_kept_in_a_file(tmp_path: object) -> None:
     """Infinite degrees of freedom, the landmarks' names, and the summary."""
     known = dp.locate(
-        seen(BEACH_PIXELS, (3840, 2160)), dp.Landmarks(BEACH_POINTS, names="abcde"), BEACH, pixel_sigma=2.0
+        seen(BEACH_PIXELS, (3840, 2160)), dp.Landmarks(BEACH_POINTS, names=list("abcde")), BEACH, pixel_sigma=2.0
     )
     again = dp.Calibration.from_fields(known.to_fields(), known.camera)
     assert again.degrees_of_freedom == torch.inf
