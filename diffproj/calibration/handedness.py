@@ -15,7 +15,7 @@ DOUBTFUL = 0.003
 BETTER = 0.04
 """Part of the cost that the mirror image must come below."""
 FOCAL_LENGTHS = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)
-"""Focal lengths that it is tried with where they are free, relative to the corners' extent in the image: that of the fit
+"""Focal lengths that it is tried with where they are free, relative to the corners' extent in px: that of the fit
 may be anything, for from infinitely far away points and their mirror image look alike."""
 
 
