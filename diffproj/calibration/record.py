@@ -174,7 +174,7 @@ def _later(fields: dict[str, Any], name: str, shape: tuple[int, ...]) -> Tensor 
 def _freedom(fields: dict[str, Any], batch: tuple[int, ...]) -> Tensor | None:
     """Degrees of freedom, infinite where the noise was known, which a file has no number for."""
     found = _later(fields, "degrees_of_freedom", batch)
-    return None if found is None else found.nan_to_num(torch.inf)
+    return None if found is None else torch.where(found.isnan(), torch.inf, found)
 
 
 def _region(fields: dict[str, Any]) -> Tensor | None:
