@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import Kind, tensor_of
-from diffproj._core.torch_private import in_forward_mode, in_functional_transform
+from diffproj._core.torch_private import has_no_values, in_forward_mode, in_functional_transform
 
 BLOCK_POINTS = 2**16
 """Points handled at once on a CPU when no derivative is asked: large enough to hide the cost of dispatch, small enough
@@ -104,9 +104,9 @@ def broadcast_batches(**shapes: Sequence[int]) -> torch.Size:
 
 
 def has_values(*tensors: Tensor) -> bool:
-    """Whether the values of these tensors can be read here: not while compiling, exporting or under `vmap`."""
+    """Whether the values of these tensors can be read here: not while compiling, under `vmap`, or of a fake tensor."""
     tracing = torch.compiler.is_compiling() or in_functional_transform()
-    return not (tracing or any(tensor.is_meta for tensor in tensors))
+    return not (tracing or any(has_no_values(tensor) for tensor in tensors))
 
 
 def spread_evenly(total: int, count: int, device: torch.device) -> Tensor:

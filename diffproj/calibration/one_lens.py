@@ -6,13 +6,13 @@ from torch import Tensor
 from diffproj.calibration import start
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit
+from diffproj.calibration.nested import Nested
 from diffproj.calibration.options import Options
-from diffproj.calibration.outcome import minimised, outcome
+from diffproj.calibration.outcome import outcome
 from diffproj.calibration.own_frame import are_solid
 from diffproj.calibration.parametrisation import Parametrisation, Pose
-from diffproj.calibration.restraint import restrained
 from diffproj.calibration.result import Calibration
-from diffproj.calibration.second_look import lower_fit, second_look
+from diffproj.calibration.second_look import lower_fit
 from diffproj.calibration.space_start import space_starts
 from diffproj.calibration.start import Straightened
 from diffproj.lens.models import LensModel, model_named
@@ -45,26 +45,9 @@ def calibrated(
 def _from_start(
     data: Data, chosen: Options, parameters: Parametrisation, begin: tuple[Tensor, Pose], straight: Straightened
 ) -> Fit:
-    """The minimum from a start, looked at twice, and kept from folding."""
+    """The minimum from a start."""
     shared, local = begin
     # The start is a guess from the corners; what is held, or known, is not.
     reference = shared.clone()
     reference[:, :2], reference[:, 4:] = torch.nan, 0.0
-    near, model = None, model_named(parameters.lens)
-    if model.count > 5:
-        # The rational terms nearly cancel each other: from far off they lead into side valleys.
-        early = chosen.but(
-            fixed=(*chosen.fixed, *model.coefficient_names[5:]),
-            objective="image",
-            reject_outliers=False,
-            loss=None if chosen.objective == "plane" else chosen.loss,  # its scale is in world units
-        )
-        poorer, _ = minimised(data, early, parameters, shared, local, reference)
-        shared, local = near = poorer.solution.shared, poorer.solution.local
-    found, _ = minimised(data, chosen, parameters, shared, local, reference)
-    limits = {"max_iterations": chosen.max_iterations, "tolerance": chosen.tolerance}
-    if not found.task.solid:  # a plane's focal length and tilt go together; points in space have had other starts
-        found = second_look(found, straight, reject=chosen.outlier_limit, **limits)
-    if near is not None:
-        found = restrained(found, *near, straight.size, reject=chosen.outlier_limit, **limits)
-    return found
+    return Nested(data, chosen, parameters, shared, local, reference, straight, straight.size).richest()
