@@ -28,6 +28,8 @@ UNSURE = 0.1
 """Deviation of a focal length, relative to it, from which on it is known roughly."""
 CONTRADICTION = 1e-4
 """Chance of the residuals under the noise that was given below which they contradict it."""
+NOTABLE = 1.25
+"""Times that noise that residuals must be for a word."""
 NO_DENOMINATOR = {"brown8": "'brown5'"} | dict.fromkeys(("brown12", "brown14"), "fixed=('k4', 'k5', 'k6')")
 """What a lens with a denominator is without it."""
 
@@ -97,7 +99,8 @@ def _contradicts_noise(found: Fit) -> Tensor:
         return torch.zeros_like(found.solution.status, dtype=torch.bool)
     spare = found.degrees_of_freedom().to(torch.float64)
     squares = found.variance_of_residuals().detach().nan_to_num(0.0) * spare
-    return torch.special.gammaincc(spare.clamp(min=1) / 2, squares / 2) < CONTRADICTION
+    rare = torch.special.gammaincc(spare.clamp(min=1) / 2, squares / 2) < CONTRADICTION
+    return rare & (squares > NOTABLE**2 * spare)
 
 
 def _not_told(other: Simpler) -> str:
