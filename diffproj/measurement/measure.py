@@ -96,7 +96,7 @@ def measure(
     if isinstance(calibration, Calibration):
         number = view_number(chosen_view(calibration, view), calibration.views.names)
         camera, known, middle = _at_view(calibration, number)
-        posed = calibration.used[..., number, :].any(-1)
+        posed = calibration.posed[..., number]
         parameters = replace(calibration.parameters, bow=False)
         doubtful = doubts(calibration, number)
     else:
@@ -177,9 +177,9 @@ def _at_view(calibration: Calibration, number: int) -> tuple[Camera, Tensor | No
     Of many cameras some may have no pose, for they used no corner of the view. What is not known is `None`. The
     covariance is larger where the calibration does not fit the view.
     """
-    if not bool(calibration.used[..., number, :].any(-1).any()):
+    if not bool(calibration.posed[..., number].any()):
         name = calibration.views.names[number]
-        raise ValueError(f"view: want one whose pose is known, got {number} ({name}), of which no corner was used")
+        raise ValueError(f"view: want one whose pose is known, got {number} ({name}), which nothing tells")
     known, middle = None, None
     if calibration.has_covariance:
         covariance = calibration.covariance_of_kept_poses
