@@ -57,6 +57,7 @@ __version__ = "0.1.0"
 __all__ = [
     "AccuracyMap",
     "AmbiguousPoseWarning",
+    "AprilGrid",
     "BoardNotFoundError",
     "BoardNotFoundWarning",
     "BrownConrady",
@@ -67,6 +68,7 @@ __all__ = [
     "Camera",
     "CameraMismatchWarning",
     "Cauchy",
+    "CharucoBoard",
     "Chessboard",
     "Covariance",
     "CrossValidation",

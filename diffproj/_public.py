@@ -59,6 +59,8 @@ from diffproj.paper.route import paper_route as paper_route
 from diffproj.paper.setup import PaperSetup as PaperSetup
 from diffproj.paper.setup import paper_setup as paper_setup
 from diffproj.targets import synthetic as synthetic
+from diffproj.targets.april_grid import AprilGrid as AprilGrid
+from diffproj.targets.charuco import CharucoBoard as CharucoBoard
 from diffproj.targets.chessboard import Chessboard as Chessboard
 from diffproj.targets.detection import BoardNotFoundError as BoardNotFoundError
 from diffproj.targets.detection import BoardNotFoundWarning as BoardNotFoundWarning

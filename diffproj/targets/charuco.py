@@ -1,6 +1,6 @@
 """The ChArUco target: a chessboard with a square marker in each white square, as OpenCV makes it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -70,7 +70,8 @@ class CharucoBoard:
         """The number of inner corners, N."""
         return (self.columns - 1) * (self.rows - 1)
 
-    def __str__(self) -> str:
+    @property
+    def title(self) -> str:
         """What it is, in words."""
         return f"ChArUco board with {self.columns} x {self.rows} squares"
 
@@ -88,6 +89,11 @@ class CharucoBoard:
     @property
     def pitch(self) -> float:
         """The distance from one marker's place to the next, in world units."""
+        return self.square
+
+    @property
+    def apart(self) -> float:
+        """The least distance between two corners, in world units."""
         return self.square
 
     @property
@@ -134,3 +140,11 @@ class CharucoBoard:
     def _marked(self) -> list[tuple[int, int]]:
         """Row and column of the squares with markers, in the order of their numbers."""
         return [(r, c) for r in range(self.rows) for c in range(self.columns) if (r + c) % 2 != self._first]
+
+
+def with_other_start(board: CharucoBoard) -> CharucoBoard | None:
+    """The board with the first square of the other colour: the legacy one of an ordinary one, and back.
+
+    None where both are the same: boards of an odd number of rows.
+    """
+    return replace(board, legacy=not board.legacy) if board.rows % 2 == 0 else None

@@ -3,11 +3,13 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from diffproj._core.arguments import choice, instance, number, whole_number
+from diffproj.targets.artwork import Artwork
 
 Axes = Literal["opencv", "paper"]
 """The board's two world frames; see `Chessboard`."""
@@ -72,6 +74,11 @@ class Chessboard:
         return self.columns, self.rows
 
     @property
+    def title(self) -> str:
+        """What it is, in words."""
+        return f"board with {self.columns} x {self.rows} inner corners"
+
+    @property
     def turns(self) -> int:
         """The number of turns in its plane after which the board looks the same: 1, 2 or 4.
 
@@ -110,6 +117,16 @@ class Chessboard:
             torch.tensor([top, top, bottom, bottom], dtype=torch.float64, device="cpu"),
             torch.tensor([left, right, right, left], dtype=torch.float64, device="cpu"),
         )
+
+    @property
+    def artwork(self) -> Artwork:
+        """What is printed: its squares, dark at the top left."""
+        lines = [self.square * np.arange(count + 2.0) for count in self.size]
+        dark = np.indices((self.rows + 1, self.columns + 1)).sum(axis=0) % 2 == 0
+        corner, right, _, down = self.outline.numpy()
+        along, below = right - corner, down - corner
+        axes = corner, along / np.linalg.norm(along), below / np.linalg.norm(below)
+        return Artwork(*lines, dark, np.zeros((0, 3)), axes)
 
     def _placed(self, row: Float[Tensor, " n"], column: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
         """World points in this board's frame from rows and columns in units of squares."""

@@ -1,21 +1,21 @@
-"""Detect a chessboard's corners in photographs, with sub-pixel accuracy and in a defined order."""
+"""Detect a target's points in photographs, with sub-pixel accuracy and in a defined order."""
 
 import functools
 import warnings
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from diffproj._core.arguments import function, whole_number
-from diffproj.targets.chessboard import Chessboard, as_board
-from diffproj.targets.corners import refine_grid
-from diffproj.targets.images import Orientation, Photograph, Source, as_8_bit, grey, listed
-from diffproj.targets.numbering import follow, in_order
-from diffproj.targets.search import find_pattern
+from diffproj.targets.april_grid import AprilGrid
+from diffproj.targets.charuco import CharucoBoard
+from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.finders import Board, Found, as_target, find
+from diffproj.targets.images import Orientation, Photograph, Source, grey, listed
+from diffproj.targets.numbering import follow
 from diffproj.targets.tasks import results_of
 from diffproj.targets.videos import Frame, distinct
 from diffproj.targets.views import Views
@@ -46,16 +46,21 @@ class BoardNotFoundError(ValueError):
 
 def detect(
     photographs: Source | Iterable[Source],
-    board: Chessboard,
+    target: Board,
     progress: Callable[[int, int], object] | None = None,
     *,
     orientation: Orientation | str = "sensor",
     frames: int | None = None,
     executor: Executor | None = None,
 ) -> Views:
-    """Detect the board's inner corners in photographs of one camera.
+    """Detect a target's points in photographs of one camera.
 
-    The board is found as a pattern of saddle points of brightness, in copies of several sizes, and where only a part of
+    A `CharucoBoard` or an `AprilGrid` is found by its markers, as much of it as is in view: its corners are placed by fitting the whole
+    print around each, and those that do not fit, or lie off the surface through their neighbours, are hidden
+    (`Views.visible`). At least 6 must be visible, on two rows and two columns. Each is known by itself: neither the
+    order nor the numbers depend on how the board is turned. The rest is about chessboards.
+
+    A `Chessboard` is found as a pattern of saddle points of brightness, in copies of several sizes, and where only a part of
     it is found so, by OpenCV's detectors. Its dark and light may be exchanged, as in thermal images. Each corner is
     then placed by fitting its neighbourhood with two crossing edges, their blur and the light. Corners that do not look
     like corners, or lie off the surface through their neighbours, are sought once more, and hidden (`Views.visible`) if
@@ -76,7 +81,7 @@ def detect(
             Kornia has it, `(C, H, W)` in RGB, of the same types, or `(B, C, H, W)`. All of one size. Of a folder,
             hidden files and those of other kinds are left out. A video (`.mp4`, `.avi`, `.mov`, `.mkv`) gives sharp
             frames, at most 60 from all its parts, without those in which the board hardly moved.
-        board: the board to look for, with at least 3 x 3 inner corners.
+        target: the board to look for; a chessboard has at least 3 x 3 inner corners.
         progress: called with `(done, total)` after each photograph.
         orientation: `"sensor"` counts a file's pixels as the sensor recorded them, whichever way up the camera was
             held: one lens has one principal point. `"upright"` turns each file as its EXIF data ask, as viewers do.
@@ -106,7 +111,7 @@ def detect(
         >>> views.pixels[0, :2].round(decimals=1).tolist()  # each edge is half a pixel before its first pixel
         [[69.5, 69.5], [109.5, 69.5]]
     """
-    _check_board(board)
+    as_target(target)
     if progress is not None:
         function("progress", progress, "a function of (done, total)")
     if orientation not in get_args(Orientation):
@@ -118,58 +123,33 @@ def detect(
         frames = whole_number("frames", frames, "a whole number from 1 on", least=1)
     listing = listed(photographs, frames)
     size = _common_size(listing, results_of(functools.partial(_size, orientation=raster), listing, executor))
-    find = functools.partial(_find, board=board, orientation=raster)
+    find = functools.partial(_find, target=target, orientation=raster)
     found = results_of(find, listing, executor, progress)
     pairs = [(photograph, one.grid) for photograph, one in zip(listing, found, strict=True) if one.grid is not None]
     if not pairs:
-        raise BoardNotFoundError(_advice([photograph.label for photograph in listing], found, board))
+        raise BoardNotFoundError(_advice([photograph.label for photograph in listing], found, target))
     for photograph, one in zip(listing, found, strict=True):
         if one.grid is None and _sharpness(photograph) is None:
-            text = f"{_miss(photograph, one.seen, board)}; photograph skipped"
+            text = f"{_miss(photograph, one, target)}; photograph skipped"
             warnings.warn(text, BoardNotFoundWarning, stacklevel=2)
     seen, grids = zip(*pairs, strict=True)
-    grids = follow(list(grids), board)
+    grids = follow(list(grids), target) if isinstance(target, Chessboard) else list(grids)
     # Of a video, one view of each place: copies of a view make error bars too small.
     chosen = [k for k, photograph in enumerate(seen) if _sharpness(photograph) is not None]
     new = distinct([grids[k] for k in chosen], [_sharpness(seen[k]) or 0.0 for k in chosen], size)
     kept = sorted({*range(len(seen))} - {k for k, differs in zip(chosen, new, strict=True) if not differs})
-    pixels = torch.from_numpy(np.stack([grids[k] for k in kept])).reshape(len(kept), len(board), 2)
+    pixels = torch.from_numpy(np.stack([grids[k] for k in kept])).reshape(len(kept), len(target), 2)
     names = [seen[k].name for k in kept]
     return Views(pixels, pixels.isfinite().all(dim=-1), names=names, size=size)
 
 
-class _Found(NamedTuple):
-    """What was found in one photograph.
-
-    Attributes:
-        grid: `(rows, columns, 2)` px, in order, NaN where hidden; None where there is no such board.
-        seen: `(columns, rows)` of the largest pattern where there is no such board; (0, 0) for none.
-    """
-
-    grid: Float[np.ndarray, "rows columns 2"] | None
-    seen: tuple[int, int]
-
-
-def _find(photograph: Photograph, board: Chessboard, orientation: Orientation) -> _Found:
-    """Read one photograph and find the board in it: the work of one task."""
+def _find(photograph: Photograph, target: Board, orientation: Orientation) -> Found:
+    """Read one photograph and find the target in it: the work of one task."""
     image = grey(photograph, orientation)
     try:
-        pattern = find_pattern(as_8_bit(image), board)
-        if pattern.grid is None:
-            return _Found(None, pattern.seen)
-        refined = refine_grid(image, pattern.grid)
-        if not refined.is_board():
-            return _Found(None, (0, 0))
-        return _Found(in_order(refined.grid, image, board), board.size)
+        return find(image, target)
     except Exception as error:
         raise RuntimeError(f"{photograph.label}: {type(error).__name__} while searching it: {error}") from error
-
-
-def _check_board(board: Chessboard) -> None:
-    as_board(board)
-    if min(board.size) < 3:
-        got = f"{board.columns} x {board.rows}"
-        raise ValueError(f"board: want at least 3 x 3 inner corners for OpenCV's detector, got {got}")
 
 
 def _sharpness(photograph: Photograph) -> float | None:
@@ -202,10 +182,12 @@ def _named(labels: list[str]) -> str:
     return ", ".join(labels[:3]) + (f" and {len(labels) - 3} more" if len(labels) > 3 else "")
 
 
-def _miss(photograph: Photograph, seen: tuple[int, int], board: Chessboard) -> str:
+def _miss(photograph: Photograph, found: Found, target: Board) -> str:
     """What is said of a photograph without the board."""
-    text = f"{photograph.label}: found no board with {board.columns} x {board.rows} inner corners"
-    return text + (f", but a pattern with {seen[0]} x {seen[1]}" if _telling(seen) else "")
+    text = f"{photograph.label}: found no {target.title}"
+    if found.hint:
+        return f"{text}, but {found.hint}"
+    return text + (f", but a pattern with {found.seen[0]} x {found.seen[1]}" if _telling(found.seen) else "")
 
 
 def _telling(seen: tuple[int, int]) -> bool:
@@ -213,7 +195,7 @@ def _telling(seen: tuple[int, int]) -> bool:
     return min(seen) >= 3
 
 
-def _advice(labels: list[str], found: list[_Found], board: Chessboard) -> str:
+def _advice(labels: list[str], found: list[Found], target: Board) -> str:
     seen = [one.seen for one in found if _telling(one.seen)]
     there = ""
     if seen:
@@ -222,8 +204,18 @@ def _advice(labels: list[str], found: list[_Found], board: Chessboard) -> str:
             f" There is a pattern with {usual[0]} x {usual[1]} inner corners in {seen.count(usual)} of them: if that "
         )
         there += f"is the board, give Chessboard({usual[0]}, {usual[1]}, ...)."
-    return (
-        f"photographs: want a board with {board.columns} x {board.rows} inner corners, found none in "
-        f"{_named(labels)}.{there} Check that the numbers count inner corners (one less than the squares each way), "
-        "that the whole board is in view with a margin around it, and that the photographs are sharp and evenly lit"
-    )
+    hints = [one.hint for one in found if one.hint]
+    if hints:
+        there = f" There is {hints[0]}."
+    return f"photographs: want a {target.title}, found none in {_named(labels)}.{there} Check that {_CHECKS[type(target)]}"
+
+
+_CHECKS: dict[type, str] = {
+    Chessboard: "the numbers count inner corners (one less than the squares each way), that the whole board is in view "
+    "with a margin around it, and that the photographs are sharp and evenly lit",
+    CharucoBoard: "the numbers count squares, columns first, that dictionary and legacy are those that the board was "
+    "made with, and that the photographs are sharp and evenly lit, with markers of 15 px or more",
+    AprilGrid: "the numbers count tags, columns first, that the tags are of the family 36h11 and begin with number 0, "
+    "and that the photographs are sharp and evenly lit, with tags of 25 px or more",
+}
+"""What may be wrong where a target is in no photograph."""

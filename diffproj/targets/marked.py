@@ -5,13 +5,14 @@ with the print around it, and from corners that fit, those whose markers were no
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
-from diffproj.targets.artwork import Artwork
+from diffproj.targets.april_grid import AprilGrid
+from diffproj.targets.charuco import CharucoBoard
 from diffproj.targets.corner_fit import Fitted
 from diffproj.targets.dictionaries import dictionary_named
 from diffproj.targets.pattern_fit import LARGEST, SMALLEST, Patches, fit_patches, patches_of
@@ -39,22 +40,8 @@ WIDEST = 2400
 """Longer side in px from which markers are sought in a smaller copy first."""
 
 
-class MarkedBoard(Protocol):
-    """A board with markers: what `find_marked` asks of it. Corners and markers are in the artwork's frame."""
-
-    @property
-    def dictionary(self) -> str: ...
-    @property
-    def corners(self) -> Float[np.ndarray, "n 2"]: ...
-    @property
-    def markers(self) -> dict[int, Float[np.ndarray, "4 2"]]: ...
-    @property
-    def pitch(self) -> float: ...
-    @property
-    def reach(self) -> float: ...
-    @property
-    def borders(self) -> tuple[int, ...]: ...
-    def artwork_with(self, border: int) -> Artwork: ...
+MarkedBoard = AprilGrid | CharucoBoard
+"""Boards with markers."""
 
 
 class Marker(NamedTuple):
@@ -125,7 +112,7 @@ class _Search:
     def _fitted(self, which: np.ndarray, start: np.ndarray, jacobians: np.ndarray) -> "_Tried | None":
         height, width = self.image.shape
         scale = np.linalg.norm(jacobians, axis=1).min(axis=-1)
-        inside = ((start > 1) & (start < [width - 2, height - 2])).all(axis=-1) & (scale * self.board.pitch > 5)
+        inside = ((start > 1) & (start < [width - 2, height - 2])).all(axis=-1) & (scale * self.board.apart > 4)
         if not inside.any():
             return None
         radius = np.clip(scale[inside] * self.board.reach, SMALLEST, LARGEST)
@@ -142,7 +129,7 @@ class _Search:
         usual = float(np.median(dark[fit.misfit < MISFIT])) if (fit.misfit < MISFIT).any() else 1.0
         height, width = self.image.shape
         good = (fit.misfit < MISFIT) & (dark > FAINT * usual) & (dark > 2) & (fit.sigma < VAGUE)
-        good &= np.linalg.norm(fit.corners - start, axis=-1) < 0.25 * scale * self.board.pitch
+        good &= np.linalg.norm(fit.corners - start, axis=-1) < 0.3 * scale * self.board.apart
         return good & ((fit.corners >= 1) & (fit.corners <= [width - 2, height - 2])).all(axis=-1)
 
     def _smooth(self, known: np.ndarray, good: np.ndarray) -> np.ndarray:

@@ -259,7 +259,7 @@ def _targets(t: Things) -> dict[str, Call]:
         "Views.hiding": Call(v.hiding, {"mask": torch.arange(12) == 3}),
         "Views.stack": Call(dp.Views.stack, {"items": [v, v], "dim": 0}),
         "detect": Call(
-            dp.detect, {"photographs": t.photograph, "board": dp.Chessboard(6, 5), "progress": print_nothing}, 3
+            dp.detect, {"photographs": t.photograph, "target": dp.Chessboard(6, 5), "progress": print_nothing}, 3
         ),
         "example_views": Call(dp.example_views, {"side": "left"}, 1),
         "image_residuals": Call(dp.image_residuals, {"camera": t.cameras, "views": v, "target": b}),
