@@ -36,6 +36,9 @@ AGREED = 0.35
 FEWEST = 6
 """Corners that a view must show, on at least two rows and two columns."""
 
+ENOUGH = 8
+"""Markers that agree from which no other copy of the image is searched: corners lead to the rest of the board."""
+
 WIDEST = 2400
 """Longer side in px from which markers are sought in a smaller copy first."""
 
@@ -68,10 +71,13 @@ def find_marked(image: Shaped[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"]
         grey: the same in 8 bits.
         board: the board.
     """
-    best, border = max(((_agreeing(grey, board, border), border) for border in board.borders), key=lambda pair: len(pair[0]))
-    if len(best) < 2:
-        return None
-    return _Search(image, board, border).corners(best)
+    for border in board.borders:
+        markers = _agreeing(grey, board, border)
+        if len(markers) > 1:
+            corners = _Search(image, board, border).corners(markers)
+            if corners is not None:
+                return corners
+    return None
 
 
 class _Search:
@@ -157,7 +163,7 @@ def _agreeing(grey: UInt8[np.ndarray, "h w"], board: MarkedBoard, border: int) -
         agreed = _consistent(found, board.pitch)
         if len(agreed) > len(best):
             best = agreed
-        if len(best) >= 0.5 * len(board.markers):
+        if len(best) >= min(ENOUGH, 0.5 * len(board.markers)):
             break
     return best
 

@@ -36,14 +36,15 @@ class Patches(NamedTuple):
 
     Attributes:
         x, y: `(N, k)`, `(N, m)`, lines; far away where there are fewer.
-        dark: `(N, m + 1, k + 1)`, 1 for black; the outer cells go on for ever.
+        dark: `(N, m + 1, k + 1)`, 1 for black, as steps from cell to cell: the first cell, those along x, those along
+            y, and what both say together. The outer cells go on for ever.
     """
 
     x: Float[Tensor, "n k"]
     y: Float[Tensor, "n m"]
     dark: Float[Tensor, "n m1 k1"]
 
-    def only(self, which: slice) -> "Patches":
+    def only(self, which: slice | Tensor) -> "Patches":
         """Some of them."""
         return Patches(self.x[which], self.y[which], self.dark[which])
 
@@ -65,12 +66,27 @@ def patches_of(art: Artwork, corners: Float[np.ndarray, "n 2"], reach: float) ->
         c, r = (_cells(part) for part in (columns, rows))
         dark[i, : len(r), : len(c)] = padded[np.ix_(r, c)]
     x, y = (torch.from_numpy(lines * np.where(lines == _FAR, 1, reach)).float() for lines in (x, y))
-    return Patches(x, y, torch.from_numpy(dark))
+    steps = np.diff(np.diff(dark, axis=1, prepend=0), axis=2, prepend=0).astype(np.float32)
+    # Lines that are far away part nothing.
+    steps[:, 1:][y.numpy() == _FAR] = 0
+    steps[:, :, 1:] *= (x.numpy() != _FAR)[:, None]
+    return Patches(x, y, torch.from_numpy(steps))
 
 
 def _cells(lines: np.ndarray) -> np.ndarray:
     """The padded numbers of the cells that lines part: those before each, and the one after the last."""
     return np.append(lines, lines[-1] + 1) if len(lines) else np.zeros(1, dtype=int)
+
+
+class _Part(NamedTuple):
+    """Corners that have not settled."""
+
+    patches: Patches
+    grey: Tensor
+    weight: Tensor
+
+    def only(self, which: Tensor) -> "_Part":
+        return _Part(self.patches.only(which), self.grey[which], self.weight[which])
 
 
 def fit_patches(
@@ -115,29 +131,37 @@ def _fit_block(
     shape = torch.from_numpy(start).float()
     light = _first_light(shape, patches, grey, weight, place)
     unknowns = torch.cat([shape, light], dim=1)
+    solved = unknowns.clone()
     damping = torch.full((len(corners), 1), 1e-3, dtype=torch.float32, device="cpu")
+    active = torch.arange(len(corners), device="cpu")
+    part = _Part(patches, grey, weight)
     error, slopes = _residuals(unknowns, patches, grey, place)
     cost = (weight * error * error).sum(-1)
+    every_cost, every_slope = cost.clone(), slopes.clone()
     for _ in range(STEPS):
-        weighted = slopes * weight.unsqueeze(1)
+        weighted = slopes * part.weight.unsqueeze(1)
         normal, gradient = (weighted @ slopes.mT).double(), (weighted @ error.unsqueeze(-1)).squeeze(-1).double()
-        diagonal = normal.diagonal(dim1=-2, dim2=-1)
-        scale = diagonal.clamp_min(1e-12).rsqrt()
+        scale = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).rsqrt()
         scaled = normal * scale.unsqueeze(-1) * scale.unsqueeze(-2) + torch.diag_embed(damping.double().expand_as(scale))
         step = (torch.linalg.solve_ex(scaled, gradient * scale)[0] * scale).float().nan_to_num()
         proposed = unknowns + step
         proposed[:, 6].clamp_(0.3, 8.0)
-        new_error, new_slopes = _residuals(proposed, patches, grey, place)
-        new_cost = (weight * new_error * new_error).sum(-1)
+        new_error, new_slopes = _residuals(proposed, part.patches, part.grey, place)
+        new_cost = (part.weight * new_error * new_error).sum(-1)
         better = new_cost < cost
         unknowns = torch.where(better[:, None], proposed, unknowns)
         error = torch.where(better[:, None], new_error, error)
         slopes = torch.where(better[:, None, None], new_slopes, slopes)
         cost = torch.where(better, new_cost, cost)
         damping = torch.where(better[:, None], damping * 0.1, damping * 10).clamp(1e-7, 1e6)
-        if bool((step[:, :2].abs().amax(-1) < CLOSE).all()) and bool((step[:, 6].abs() < 0.05).all()):
+        solved[active], every_cost[active], every_slope[active] = unknowns, cost, slopes
+        going = (step[:, :2].abs().amax(-1) >= CLOSE) | (step[:, 6].abs() >= 0.05)
+        if not bool(going.any()):
             break
-    return _judged(unknowns, cost, slopes, weight, corners, base, radius)
+        if float(going.float().mean()) < 0.7:
+            active, unknowns, error, slopes = active[going], unknowns[going], error[going], slopes[going]
+            cost, damping, part = cost[going], damping[going], part.only(going)
+    return _judged(solved, every_cost, every_slope, weight, corners, base, radius)
 
 
 def _pixels(
@@ -181,22 +205,16 @@ def _print(shape: Tensor, patches: Patches, place: Tensor) -> tuple[Tensor, ...]
     for axis, lines in enumerate((patches.x, patches.y)):
         row = rows[:, axis]
         length = row.norm(dim=-1)[:, None, None]
-        distance = ((offset @ row.unsqueeze(-1)) - lines[:, None, :]) / length
-        scaled = (distance / blur).clamp(-8, 8)
+        scaled = (((offset @ row.unsqueeze(-1)) - lines[:, None, :]) / (length * blur)).clamp(-8, 8)
         step = 0.5 + 0.5 * torch.erf(scaled * _ROOT_HALF)
         density = torch.exp(-0.5 * scaled * scaled) * (_DENSITY / blur)
-        ends = torch.ones_like(step[..., :1])
-        within = torch.cat([ends, step], -1) - torch.cat([step, torch.zeros_like(ends)], -1)
-        none = torch.zeros_like(ends)
-        slope = torch.cat([none, density], -1) - torch.cat([density, none], -1)
-        moment = density * scaled * blur
-        moment = torch.cat([none, moment], -1) - torch.cat([moment, none], -1)
-        parts.append((within, slope, moment, row, length.squeeze(-1)))
-    (across, across_slope, across_moment, row_x, length_x), (down, down_slope, down_moment, row_y, length_y) = parts
-    by_row = down @ patches.dark
-    dark = (by_row * across).sum(-1)
-    slope_x, moment_x = (by_row * across_slope).sum(-1), (by_row * across_moment).sum(-1)
-    slope_y, moment_y = (((part @ patches.dark) * across).sum(-1) for part in (down_slope, down_moment))
+        parts.append((step, density, density * scaled * blur, row, length.squeeze(-1)))
+    (across, slope_x, moment_x, row_x, length_x), (down, slope_y, moment_y, row_y, length_y) = parts
+    by_row = down @ patches.dark[:, 1:] + patches.dark[:, :1]
+    dark = by_row[..., 0] + (by_row[..., 1:] * across).sum(-1)
+    slope_x, moment_x = ((by_row[..., 1:] * part).sum(-1) for part in (slope_x, moment_x))
+    by_slope, by_moment = (part @ patches.dark[:, 1:] for part in (slope_y, moment_y))
+    slope_y, moment_y = (part[..., 0] + (part[..., 1:] * across).sum(-1) for part in (by_slope, by_moment))
     return dark, slope_x, slope_y, moment_x, moment_y, offset, row_x, row_y, length_x, length_y
 
 
