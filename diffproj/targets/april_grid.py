@@ -68,6 +68,16 @@ class AprilGrid:
         return 4 * self.columns * self.rows
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of its points."""
+        return 2 * self.rows, 2 * self.columns
+
+    @property
+    def side(self) -> float:
+        """The side of a tag, in world units."""
+        return self.tag
+
+    @property
     def title(self) -> str:
         """What it is, in words."""
         return f"AprilGrid with {self.columns} x {self.rows} tags"

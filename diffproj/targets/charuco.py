@@ -71,6 +71,16 @@ class CharucoBoard:
         return (self.columns - 1) * (self.rows - 1)
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of its points."""
+        return self.rows - 1, self.columns - 1
+
+    @property
+    def side(self) -> float:
+        """The side of a square, in world units."""
+        return self.square
+
+    @property
     def title(self) -> str:
         """What it is, in words."""
         return f"ChArUco board with {self.columns} x {self.rows} squares"

@@ -74,6 +74,16 @@ class Chessboard:
         return self.columns, self.rows
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of its points."""
+        return self.rows, self.columns
+
+    @property
+    def side(self) -> float:
+        """The side of a square, in world units."""
+        return self.square
+
+    @property
     def title(self) -> str:
         """What it is, in words."""
         return f"board with {self.columns} x {self.rows} inner corners"

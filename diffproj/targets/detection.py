@@ -11,9 +11,10 @@ import torch
 
 from diffproj._core.arguments import function, whole_number
 from diffproj.targets.april_grid import AprilGrid
+from diffproj.targets.boards import Board, as_target
 from diffproj.targets.charuco import CharucoBoard
 from diffproj.targets.chessboard import Chessboard
-from diffproj.targets.finders import Board, Found, as_target, find
+from diffproj.targets.finders import Found, find
 from diffproj.targets.images import Orientation, Photograph, Source, grey, listed
 from diffproj.targets.numbering import follow
 from diffproj.targets.tasks import results_of

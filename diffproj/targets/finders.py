@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from diffproj._core.arguments import called
 from diffproj.targets.april_grid import AprilGrid
+from diffproj.targets.boards import Board
 from diffproj.targets.charuco import CharucoBoard, with_other_start
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.corners import refine_grid
@@ -14,10 +14,6 @@ from diffproj.targets.images import as_8_bit
 from diffproj.targets.marked import find_marked
 from diffproj.targets.numbering import in_order
 from diffproj.targets.search import find_pattern
-
-Board = Chessboard | CharucoBoard | AprilGrid
-"""The targets that photographs are searched for."""
-
 
 class Found(NamedTuple):
     """What was found in one photograph.
@@ -33,31 +29,13 @@ class Found(NamedTuple):
     hint: str = ""
 
 
-def as_target(target: Board) -> Board:
-    """A target that can be found, as it is.
-
-    Raises:
-        TypeError: it is another thing.
-        ValueError: it is a chessboard of fewer than 3 x 3 inner corners.
-    """
-    if not isinstance(target, Board):
-        raise TypeError(
-            f"target: want a dp.Chessboard, dp.CharucoBoard or dp.AprilGrid, got {called(target)}; "
-            "dp.Chessboard(columns, rows, square) makes one"
-        )
-    if isinstance(target, Chessboard) and min(target.size) < 3:
-        got = f"{target.columns} x {target.rows}"
-        raise ValueError(f"target: want at least 3 x 3 inner corners for the board to be found, got {got}")
-    return target
-
-
 def find(image: Shaped[np.ndarray, "h w"], target: Board) -> Found:
     """Find the target in a grey image from 0 to 255, uint8 or float32."""
     if isinstance(target, Chessboard):
         return _chessboard(image, target)
     if isinstance(target, AprilGrid):
         corners = find_marked(image, as_8_bit(image), target)
-        return Found(None if corners is None else corners.reshape(2 * target.rows, 2 * target.columns, 2))
+        return Found(None if corners is None else corners.reshape(*target.shape, 2))
     return _charuco(image, target)
 
 
@@ -74,7 +52,7 @@ def _chessboard(image: Shaped[np.ndarray, "h w"], board: Chessboard) -> Found:
 def _charuco(image: Shaped[np.ndarray, "h w"], board: CharucoBoard) -> Found:
     corners = find_marked(image, as_8_bit(image), board)
     if corners is not None:
-        return Found(corners.reshape(board.rows - 1, board.columns - 1, 2))
+        return Found(corners.reshape(*board.shape, 2))
     other = with_other_start(board)
     if other is not None and find_marked(image, as_8_bit(image), other) is not None:
         kind = "legacy" if other.legacy else "ordinary"
