@@ -70,6 +70,7 @@ __all__ = [
     "Cauchy",
     "CharucoBoard",
     "Chessboard",
+    "CircleGrid",
     "Covariance",
     "CrossValidation",
     "Experiment",

@@ -62,6 +62,7 @@ from diffproj.targets import synthetic as synthetic
 from diffproj.targets.april_grid import AprilGrid as AprilGrid
 from diffproj.targets.charuco import CharucoBoard as CharucoBoard
 from diffproj.targets.chessboard import Chessboard as Chessboard
+from diffproj.targets.circle_grid import CircleGrid as CircleGrid
 from diffproj.targets.detection import BoardNotFoundError as BoardNotFoundError
 from diffproj.targets.detection import BoardNotFoundWarning as BoardNotFoundWarning
 from diffproj.targets.detection import detect as detect

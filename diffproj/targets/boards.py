@@ -2,15 +2,18 @@
 
 from typing import Any
 
+import numpy as np
+
 from diffproj._core.arguments import called
 from diffproj.targets.april_grid import AprilGrid
 from diffproj.targets.charuco import CharucoBoard
 from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.circle_grid import CircleGrid
 
-Board = Chessboard | CharucoBoard | AprilGrid
+Board = Chessboard | CharucoBoard | AprilGrid | CircleGrid
 """The targets that photographs are searched for."""
 
-_KINDS = "dp.Chessboard, dp.CharucoBoard or dp.AprilGrid"
+_KINDS = "dp.Chessboard, dp.CharucoBoard, dp.AprilGrid or dp.CircleGrid"
 
 
 def as_printed(board: Any, name: str = "board") -> Board:
@@ -24,6 +27,12 @@ def as_printed(board: Any, name: str = "board") -> Board:
             f"{name}: want a {_KINDS}, got {called(board)}; dp.Chessboard(columns, rows, square) makes one"
         )
     return board
+
+
+def faces_away(board: Board) -> bool:
+    """Whether the board's z points into it, away from the camera, as its frame has it."""
+    _, right, down = board.artwork.axes
+    return float(np.cross(right, down)[2]) > 0
 
 
 def as_target(target: Any) -> Board:

@@ -14,6 +14,7 @@ from diffproj.targets.april_grid import AprilGrid
 from diffproj.targets.boards import Board, as_target
 from diffproj.targets.charuco import CharucoBoard
 from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.finders import Found, find
 from diffproj.targets.images import Orientation, Photograph, Source, grey, listed
 from diffproj.targets.numbering import follow
@@ -134,7 +135,7 @@ def detect(
             text = f"{_miss(photograph, one, target)}; photograph skipped"
             warnings.warn(text, BoardNotFoundWarning, stacklevel=2)
     seen, grids = zip(*pairs, strict=True)
-    grids = follow(list(grids), target) if isinstance(target, Chessboard) else list(grids)
+    grids = follow(list(grids), target) if isinstance(target, Chessboard | CircleGrid) else list(grids)
     # Of a video, one view of each place: copies of a view make error bars too small.
     chosen = [k for k, photograph in enumerate(seen) if _sharpness(photograph) is not None]
     new = distinct([grids[k] for k in chosen], [_sharpness(seen[k]) or 0.0 for k in chosen], size)
@@ -218,5 +219,7 @@ _CHECKS: dict[type, str] = {
     "made with, and that the photographs are sharp and evenly lit, with markers of 15 px or more",
     AprilGrid: "the numbers count tags, columns first, that the tags are of the family 36h11 and begin with number 0, "
     "and that the photographs are sharp and evenly lit, with tags of 25 px or more",
+    CircleGrid: "the numbers count circles, columns first, that every second line is shifted where asymmetric says so, "
+    "that the whole board is in view, and that the photographs are sharp and evenly lit, with circles of 6 px or more",
 }
 """What may be wrong where a target is in no photograph."""

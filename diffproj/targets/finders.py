@@ -9,6 +9,8 @@ from diffproj.targets.april_grid import AprilGrid
 from diffproj.targets.boards import Board
 from diffproj.targets.charuco import CharucoBoard, with_other_start
 from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.circle_grid import CircleGrid
+from diffproj.targets.circles import find_circles
 from diffproj.targets.corners import refine_grid
 from diffproj.targets.images import as_8_bit
 from diffproj.targets.marked import find_marked
@@ -36,6 +38,9 @@ def find(image: Shaped[np.ndarray, "h w"], target: Board) -> Found:
     if isinstance(target, AprilGrid):
         corners = find_marked(image, as_8_bit(image), target)
         return Found(None if corners is None else corners.reshape(*target.shape, 2))
+    if isinstance(target, CircleGrid):
+        centres = find_circles(image, as_8_bit(image), target)
+        return Found(None if centres is None else centres.reshape(*target.shape, 2))
     return _charuco(image, target)
 
 
