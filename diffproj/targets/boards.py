@@ -35,6 +35,23 @@ def faces_away(board: Board) -> bool:
     return float(np.cross(right, down)[2]) > 0
 
 
+def origin_doubt(board: Chessboard | CircleGrid) -> str:
+    """What to know about a board that looks the same when turned: which point is the first is not seen.
+
+    Example:
+        >>> origin_doubt(Chessboard(8, 6))[:74]
+        'a board with 8 x 6 inner corners looks the same when turned by 180 degrees'
+    """
+    what, other = "corner", "one whose columns + rows is odd, such as 9 x 6"
+    if isinstance(board, CircleGrid):
+        what, other = "circle", "an asymmetric one of an odd number of lines, such as 11 x 4"
+    return (
+        f"{'an' if board.title[0] == 'a' else 'a'} {board.title} looks the same when turned by {360 // board.turns} "
+        f"degrees: the first {what}, and with it the origin of the world, is one nearest to the photograph's top left, "
+        f"and may be another in the next photograph; keep the board as it is, or use {other}"
+    )
+
+
 def as_target(target: Any) -> Board:
     """A board that can be found, as it is.
 

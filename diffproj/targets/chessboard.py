@@ -144,21 +144,6 @@ class Chessboard:
         return torch.stack([*along, torch.zeros_like(row)], dim=-1) * self.square
 
 
-def origin_doubt(board: Chessboard) -> str:
-    """What to know about a board that looks the same when turned: which corner is the first is not seen.
-
-    Example:
-        >>> origin_doubt(Chessboard(8, 6))[:74]
-        'a board with 8 x 6 inner corners looks the same when turned by 180 degrees'
-    """
-    return (
-        f"a board with {board.columns} x {board.rows} inner corners looks the same when turned by "
-        f"{360 // board.turns} degrees: the first corner, and with it the origin of the world, is one nearest to the "
-        "photograph's top left, and may be another in the next photograph; keep the board as it is, or use one whose "
-        "columns + rows is odd, such as 9 x 6"
-    )
-
-
 def as_board(board: Chessboard) -> Chessboard:
     """A board as it is.
 
