@@ -156,7 +156,9 @@ class AprilGrid:
                 code = marker_modules(FAMILY, r * self.columns + c, border)
                 dark[y : y + modules, x : x + modules] = code[::-1, ::-1]
         x, y = (
-            np.concatenate([(np.arange(count)[:, None] * self.pitch + within).ravel(), count * self.pitch + np.array([0, gap])])
+            np.concatenate(
+                [(np.arange(count)[:, None] * self.pitch + within).ravel(), count * self.pitch + np.array([0, gap])]
+            )
             for count in (self.columns, self.rows)
         )
         corner = np.array([-gap, self.artwork_size[1] - gap, 0.0])

@@ -23,9 +23,7 @@ def as_printed(board: Any, name: str = "board") -> Board:
         TypeError: it is none.
     """
     if not isinstance(board, Board):
-        raise TypeError(
-            f"{name}: want a {_KINDS}, got {called(board)}; dp.Chessboard(columns, rows, square) makes one"
-        )
+        raise TypeError(f"{name}: want a {_KINDS}, got {called(board)}; dp.Chessboard(columns, rows, square) makes one")
     return board
 
 

@@ -132,7 +132,9 @@ class CharucoBoard:
         modules = dictionary_named(self.dictionary).markerSize + 2 * border
         margin = (self.square - self.marker) / 2
         within = np.concatenate([[0.0], margin + self.marker * np.arange(modules + 1) / modules])
-        dark = np.kron(np.indices((self.rows, self.columns)).sum(axis=0) % 2 == self._first, np.ones((modules + 2,) * 2))
+        dark = np.kron(
+            np.indices((self.rows, self.columns)).sum(axis=0) % 2 == self._first, np.ones((modules + 2,) * 2)
+        )
         for k, (r, c) in enumerate(self._marked()):
             y, x = (place * (modules + 2) + 1 for place in (r, c))
             dark[y : y + modules, x : x + modules] = marker_modules(self.dictionary, k, border)

@@ -67,7 +67,9 @@ class CircleGrid:
             asymmetric = "columns" if self.columns > self.rows else "rows"
         object.__setattr__(self, "asymmetric", asymmetric)
         if self.diameter >= 0.95 * self.apart:
-            raise ValueError(f"diameter: want circles that do not touch, less than {self.apart:g}, got {self.diameter:g}")
+            raise ValueError(
+                f"diameter: want circles that do not touch, less than {self.apart:g}, got {self.diameter:g}"
+            )
 
     def __len__(self) -> int:
         """The number of circles, N."""

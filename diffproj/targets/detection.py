@@ -57,19 +57,23 @@ def detect(
 ) -> Views:
     """Detect a target's points in photographs of one camera.
 
-    A `CharucoBoard` or an `AprilGrid` is found by its markers, as much of it as is in view: its corners are placed by fitting the whole
-    print around each, and those that do not fit, or lie off the surface through their neighbours, are hidden
-    (`Views.visible`). At least 6 must be visible, on two rows and two columns. Each is known by itself: neither the
-    order nor the numbers depend on how the board is turned. The rest is about chessboards.
+    A `CharucoBoard` or an `AprilGrid` is found by its markers, as much of it as is in view. Each corner is placed by
+    fitting the whole print around it; corners that do not fit, or lie off the surface through their neighbours, are
+    hidden (`Views.visible`). At least 6 must be visible, on two rows and two columns. Each is known by itself, however
+    the board is turned.
 
-    A `Chessboard` is found as a pattern of saddle points of brightness, in copies of several sizes, and where only a part of
-    it is found so, by OpenCV's detectors. Its dark and light may be exchanged, as in thermal images. Each corner is
-    then placed by fitting its neighbourhood with two crossing edges, their blur and the light. Corners that do not look
-    like corners, or lie off the surface through their neighbours, are sought once more, and hidden (`Views.visible`) if
-    they stay so: behind a hand or a clip, in glare, beyond the photograph's border. Half of all corners, and of those
-    along each side, must be visible.
+    A `CircleGrid` is found as dark ellipses on a lattice, of which up to a quarter may be hidden. The pixels are the
+    middles of the ellipses; `calibrate` knows that a centre is seen elsewhere. Its order is never mirrored, and where
+    the board looks the same when turned (`CircleGrid.turns`), the rule for chessboards holds.
 
-    The order is that of `Chessboard.points`. It is never mirrored: along a row, then down a column, is clockwise in the
+    A `Chessboard` is found as a pattern of saddle points of brightness, in copies of several sizes, and where only a
+    part of it is found so, by OpenCV's detectors. Its dark and light may be exchanged, as in thermal images. Each
+    corner is then placed by fitting its neighbourhood with two crossing edges, their blur and the light. Corners that
+    do not look like corners, or lie off the surface through their neighbours, are sought once more, and hidden
+    (`Views.visible`) if they stay so: behind a hand or a clip, in glare, beyond the photograph's border. Half of all
+    corners, and of those along each side, must be visible.
+
+    A chessboard's order is that of `Chessboard.points`. It is never mirrored: along a row, then down a column, is clockwise in the
     image. It starts at a dark corner of the board: the square between the first four corners is dark, and so is the one
     diagonally outside the first corner. Where columns + rows is odd, as on a 9 x 6 board, this determines the order:
     each corner keeps its number however the board is rotated. Other boards look the same when turned
@@ -209,7 +213,9 @@ def _advice(labels: list[str], found: list[Found], target: Board) -> str:
     hints = [one.hint for one in found if one.hint]
     if hints:
         there = f" There is {hints[0]}."
-    return f"photographs: want a {target.title}, found none in {_named(labels)}.{there} Check that {_CHECKS[type(target)]}"
+    return (
+        f"photographs: want a {target.title}, found none in {_named(labels)}.{there} Check that {_CHECKS[type(target)]}"
+    )
 
 
 _CHECKS: dict[type, str] = {

@@ -17,6 +17,7 @@ from diffproj.targets.marked import find_marked
 from diffproj.targets.numbering import in_order
 from diffproj.targets.search import find_pattern
 
+
 class Found(NamedTuple):
     """What was found in one photograph.
 

@@ -63,7 +63,9 @@ class Marker(NamedTuple):
     affine: Float[np.ndarray, "2 3"]
 
 
-def find_marked(image: Shaped[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], board: MarkedBoard) -> Float[np.ndarray, "n 2"] | None:
+def find_marked(
+    image: Shaped[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], board: MarkedBoard
+) -> Float[np.ndarray, "n 2"] | None:
     """The board's corners in px, NaN where not seen; None where too little of it is seen.
 
     Args:
@@ -178,7 +180,9 @@ def _copies(grey: UInt8[np.ndarray, "h w"]) -> Iterator[UInt8[np.ndarray, "_h _w
         yield cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
 
 
-def _read(small: UInt8[np.ndarray, "_h _w"], grey: UInt8[np.ndarray, "h w"], board: MarkedBoard, border: int) -> list[Marker]:
+def _read(
+    small: UInt8[np.ndarray, "_h _w"], grey: UInt8[np.ndarray, "h w"], board: MarkedBoard, border: int
+) -> list[Marker]:
     """The board's markers that OpenCV reads in a copy, in px of the image."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border
@@ -264,7 +268,9 @@ def _predicted(
         spread = float(np.hypot(u, v).mean()) + 1e-9
         held = np.zeros((2, 8))
         held[0, 6] = held[1, 7] = spread * 0.3
-        h = np.linalg.lstsq(np.concatenate([rows, held]), np.concatenate([u * weight, v * weight, [0, 0]]), rcond=None)[0]
+        h = np.linalg.lstsq(np.concatenate([rows, held]), np.concatenate([u * weight, v * weight, [0, 0]]), rcond=None)[
+            0
+        ]
         start[i] = h[[2, 5]] + seen[nearest].mean(axis=0)
         jacobians[i] = [h[:2] - h[2] * h[6:], h[3:5] - h[5] * h[6:]]
     jacobians /= pitch

@@ -142,7 +142,9 @@ def _fit_block(
         weighted = slopes * part.weight.unsqueeze(1)
         normal, gradient = (weighted @ slopes.mT).double(), (weighted @ error.unsqueeze(-1)).squeeze(-1).double()
         scale = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).rsqrt()
-        scaled = normal * scale.unsqueeze(-1) * scale.unsqueeze(-2) + torch.diag_embed(damping.double().expand_as(scale))
+        scaled = normal * scale.unsqueeze(-1) * scale.unsqueeze(-2) + torch.diag_embed(
+            damping.double().expand_as(scale)
+        )
         step = (torch.linalg.solve_ex(scaled, gradient * scale)[0] * scale).float().nan_to_num()
         proposed = unknowns + step
         proposed[:, 6].clamp_(0.3, 8.0)

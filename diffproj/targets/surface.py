@@ -44,7 +44,9 @@ def off_surface(
     hat = (np.linalg.inv(weighted @ basis + ridge) @ weighted)[:, 0]
     put = (hat[..., None] * seen[which][nearest]).sum(axis=1) / hat.sum(axis=1)[:, None]
     distance = np.linalg.norm(put - seen[which], axis=-1) / np.sqrt(1 + (hat**2).sum(axis=1))
-    step = np.linalg.norm(seen[which][nearest[:, 0]] - seen[which], axis=-1) / apart[np.arange(len(which)), nearest[:, 0]]
+    step = (
+        np.linalg.norm(seen[which][nearest[:, 0]] - seen[which], axis=-1) / apart[np.arange(len(which)), nearest[:, 0]]
+    )
     off[which] = distance
     limit[which] = np.maximum(DEVIATIONS * np.median(distance), LOOSE * step * pitch + LEAST)
     return off, limit

@@ -278,7 +278,7 @@ def test_corners_that_no_pose_explains(capsys: pytest.CaptureFixture[str], monke
     monkeypatch.setattr("diffproj.cli.scene.locate", fail)
     code, out, err = run(capsys, "photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS)
     assert (code, out) == (1, "")
-    assert "photo.png: no pose of the board explains its corners; check --camera, --board and --square" in err
+    assert "photo.png: no pose of the board explains its corners; check --camera and the board's options" in err
 
 
 @pytest.mark.parametrize(
