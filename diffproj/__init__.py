@@ -99,6 +99,7 @@ __all__ = [
     "calibrate",
     "cross_validate",
     "detect",
+    "draw_target",
     "euler_from_rotation",
     "example_views",
     "explain",

@@ -67,6 +67,7 @@ from diffproj.targets.detection import BoardNotFoundError as BoardNotFoundError
 from diffproj.targets.detection import BoardNotFoundWarning as BoardNotFoundWarning
 from diffproj.targets.detection import detect as detect
 from diffproj.targets.examples import example_views as example_views
+from diffproj.targets.printing import draw_target as draw_target
 from diffproj.targets.residuals import image_residuals as image_residuals
 from diffproj.targets.residuals import plane_residuals as plane_residuals
 from diffproj.targets.views import Views as Views

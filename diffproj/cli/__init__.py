@@ -16,6 +16,7 @@ from importlib import import_module
 from diffproj import __version__
 
 COMMANDS = {
+    "board": "write a page with a board to print at true scale",
     "calibrate": "find a camera from photographs of a board, and write a camera file",
     "measure": "measure points, lengths and an area on a plane in a photograph, with error bars",
     "convert": "turn a camera file of one program into that of another",

@@ -5,9 +5,9 @@ import functools
 from pathlib import Path
 from typing import get_args
 
-from diffproj.cli.board import add_kinds, add_measures, check_board
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import add_orientation, camera_file, some_path
+from diffproj.cli.which_board import add_kinds, add_measures, check_board
 from diffproj.lens.names import LensModel
 
 DESCRIPTION = """\

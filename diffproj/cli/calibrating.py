@@ -9,11 +9,11 @@ from rich.table import Table
 
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.result import Calibration
-from diffproj.cli.board import given_board
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
 from diffproj.cli.inputs import check_writable, writing
 from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import RESULTS, aligned, in_options, progress_bars, result, rounded
+from diffproj.cli.which_board import given_board
 from diffproj.files.save import save_camera
 
 

@@ -3,10 +3,10 @@
 import argparse
 import functools
 
-from diffproj.cli.board import add_kinds, add_measures, check_board
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import DETECTOR, HAND, LARGEST_NUMBER, add_orientation, numbers, some_path
 from diffproj.cli.units import Length, height
+from diffproj.cli.which_board import add_kinds, add_measures, check_board
 
 DESCRIPTION = """\
 Turns pixels of a photograph into points on a plane, and prints them with the

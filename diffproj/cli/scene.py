@@ -9,10 +9,10 @@ import torch
 
 from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration, CalibrationError
-from diffproj.cli.board import given_board
 from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import progress_bars
 from diffproj.cli.units import Length, agreed, heading
+from diffproj.cli.which_board import given_board
 from diffproj.files.load import load
 from diffproj.geometry.camera import Camera
 
