@@ -73,12 +73,12 @@ def detect(
     (`Views.visible`) if they stay so: behind a hand or a clip, in glare, beyond the photograph's border. Half of all
     corners, and of those along each side, must be visible.
 
-    A chessboard's order is that of `Chessboard.points`. It is never mirrored: along a row, then down a column, is clockwise in the
-    image. It starts at a dark corner of the board: the square between the first four corners is dark, and so is the one
-    diagonally outside the first corner. Where columns + rows is odd, as on a 9 x 6 board, this determines the order:
-    each corner keeps its number however the board is rotated. Other boards look the same when turned
-    (`Chessboard.turns`): the first photograph takes the order whose first corner is closest to its top left, and each
-    later one the order whose rows turn least from the photograph before.
+    A chessboard's order is that of `Chessboard.points`. It is never mirrored: along a row, then down a column, is
+    clockwise in the image. It starts at a dark corner of the board: the square between the first four corners is dark,
+    and so is the one diagonally outside the first corner. Where columns + rows is odd, as on a 9 x 6 board, this
+    determines the order: each corner keeps its number however the board is rotated. Other boards look the same when
+    turned (`Chessboard.turns`): the first photograph takes the order whose first corner is closest to its top left, and
+    each later one the order whose rows turn least from the photograph before.
 
     Args:
         photographs: a file, a folder, a pattern such as `"photos/left*.jpg"`, one image, or a list of files and

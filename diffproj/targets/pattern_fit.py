@@ -23,6 +23,9 @@ STEPS = 15
 BLOCK = 40
 """Corners fitted at a time."""
 
+HELD = 1e-3
+"""How much relative changes of the map are held, relative to places in px."""
+
 CLOSE = 3e-3
 """Steps in px below which the fit has settled."""
 
@@ -141,10 +144,10 @@ def _fit_block(
     for _ in range(STEPS):
         weighted = slopes * part.weight.unsqueeze(1)
         normal, gradient = (weighted @ slopes.mT).double(), (weighted @ error.unsqueeze(-1)).squeeze(-1).double()
-        scale = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).rsqrt()
-        scaled = normal * scale.unsqueeze(-1) * scale.unsqueeze(-2) + torch.diag_embed(
-            damping.double().expand_as(scale)
-        )
+        diagonal, known = normal.diagonal(dim1=-2, dim2=-1), _held(unknowns, normal)
+        scale = (diagonal + known).clamp_min(1e-12).rsqrt()
+        scaled = (normal + torch.diag_embed(known)) * scale.unsqueeze(-1) * scale.unsqueeze(-2)
+        scaled = scaled + torch.diag_embed(damping.double().expand_as(scale))
         step = (torch.linalg.solve_ex(scaled, gradient * scale)[0] * scale).float().nan_to_num()
         proposed = unknowns + step
         proposed[:, 6].clamp_(0.3, 8.0)
@@ -164,6 +167,18 @@ def _fit_block(
             active, unknowns, error, slopes = active[going], unknowns[going], error[going], slopes[going]
             cost, damping, part = cost[going], damping[going], part.only(going)
     return _judged(solved, every_cost, every_slope, weight, corners, base, radius)
+
+
+def _held(unknowns: Tensor, normal: Tensor) -> Tensor:
+    """What holds the map near its start `(N, 11)`: a trace of what holds the place.
+
+    Where two lines alone are near, how far apart others are is not seen at all.
+    """
+    place = normal.diagonal(dim1=-2, dim2=-1)[:, :2].mean(-1, keepdim=True)
+    square = unknowns[:, 2:6].double().reshape(-1, 2, 2).square().sum(-1).repeat_interleave(2, dim=1)
+    held = torch.zeros_like(normal[..., 0])
+    held[:, 2:6] = HELD * place / square.clamp_min(1e-30)
+    return held
 
 
 def _pixels(
