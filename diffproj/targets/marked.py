@@ -33,6 +33,9 @@ NEAR = 2.3
 AGREED = 0.35
 """How far off a marker may be from where another puts it, in pitches."""
 
+RIVALS = 0.3
+"""Share of markers that stand amid those that agree, and elsewhere on the board, from which none is believed."""
+
 FEWEST = 6
 """Corners that a view must show, on at least two rows and two columns."""
 
@@ -226,11 +229,19 @@ def _consistent(found: list[Marker], pitch: float) -> list[Marker]:
             left -= edge
         if len({found[k].number for k in group}) > len({found[k].number for k in best}):
             best = group
-    votes = agree[:, sorted(best)].sum(axis=1)
+    members = sorted(best)
+    if len({found[k].number for k in members}) < 2:
+        return []
+    # Markers amid the group that stand elsewhere on the board: it is another board that has some places in common.
+    apart = np.linalg.norm(seen[:, None] - seen[None, members], axis=-1) / size[None, members]
+    rivals = [k for k in range(len(found)) if k not in best and apart[k].min() < NEAR]
+    if len(rivals) > RIVALS * len(members):
+        return []
+    votes = agree[:, members].sum(axis=1)
     chosen: dict[int, int] = {}
-    for k in sorted(best, key=lambda k: -votes[k]):
+    for k in sorted(members, key=lambda k: -votes[k]):
         chosen.setdefault(found[k].number, k)
-    return [found[k] for k in sorted(chosen.values())] if len(chosen) > 1 else []
+    return [found[k] for k in sorted(chosen.values())]
 
 
 def _predicted(
