@@ -173,7 +173,8 @@ def _grown(
 def _whole(seen: Shaped[np.ndarray, " n"], board: CircleGrid) -> bool:
     """Whether enough of the board is there, and enough of each side."""
     grid = seen.reshape(board.shape)
-    return seen.mean() >= WHOLE and min(part.mean() for part in (grid[0], grid[-1], grid[:, 0], grid[:, -1])) >= FULL
+    sides = grid[0], grid[-1], grid[:, 0], grid[:, -1]
+    return bool(seen.mean() >= WHOLE and min(part.mean() for part in sides) >= FULL)
 
 
 def _goes_on(there: dict[tuple[int, int], int], board: CircleGrid) -> bool:
