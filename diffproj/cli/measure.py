@@ -14,7 +14,8 @@ lengths between successive points, and from three points on the area that they
 enclose in their order, each with its standard deviation and 95 % interval.
 
 Where the camera stood is taken from a board in the photograph (--board and
---square, or another board), or from a view that the camera was calibrated with (--view).
+--square, or another board), or from a view that the camera was calibrated with
+(--view).
 """
 
 EPILOG = """\

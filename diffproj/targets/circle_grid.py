@@ -11,6 +11,9 @@ from torch import Tensor
 from diffproj._core.arguments import number, whole_number
 from diffproj.targets.artwork import Artwork
 
+Lines = Literal["rows", "columns"]
+"""Which lines of an asymmetric grid are shifted, every second of them."""
+
 MOST = 1000
 """Circles in a row or a column that a board may have."""
 
@@ -50,7 +53,7 @@ class CircleGrid:
     rows: int
     spacing: float
     diameter: float
-    asymmetric: bool | Literal["rows", "columns"] = False
+    asymmetric: bool | Lines | str = False
 
     def __post_init__(self) -> None:
         want = f"at least 2 circles, a whole number up to {MOST:,}"
