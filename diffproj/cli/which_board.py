@@ -138,17 +138,21 @@ def given_board(options: argparse.Namespace) -> Given:
         if kind == "charuco":
             side, option = options.square, "square"
             marker = _in(options.marker, side.unit, "marker")
-            board = CharucoBoard(*options.charuco, side.value, marker, options.dictionary, options.legacy)
+            columns, rows = options.charuco
+            board = CharucoBoard(columns, rows, side.value, marker, options.dictionary, options.legacy)
         elif kind == "aprilgrid":
             side, option = options.tag, "tag"
-            board = AprilGrid(*options.aprilgrid, side.value, options.spacing.value)
+            columns, rows = options.aprilgrid
+            board = AprilGrid(columns, rows, side.value, options.spacing.value)
         elif kind == "circles":
             side, option = options.spacing, "spacing"
             diameter = _in(options.diameter, side.unit, "diameter")
-            board = CircleGrid(*options.circles, side.value, diameter, options.asymmetric)
+            columns, rows = options.circles
+            board = CircleGrid(columns, rows, side.value, diameter, options.asymmetric)
         else:
             side, option = options.square, "square"
-            board = Chessboard(*options.board, side.value)
+            columns, rows = options.board
+            board = Chessboard(columns, rows, side.value)
     except ValueError as error:
         text = str(error)
         raise ValueError(f"--{text}" if text.partition(":")[0] in options else text) from None

@@ -131,12 +131,12 @@ class Chessboard:
     @property
     def artwork(self) -> Artwork:
         """What is printed: its squares, dark at the top left."""
-        lines = [self.square * np.arange(count + 2.0) for count in self.size]
+        x, y = (self.square * np.arange(count + 2.0) for count in self.size)
         dark = np.indices((self.rows + 1, self.columns + 1)).sum(axis=0) % 2 == 0
         corner, right, _, down = self.outline.numpy()
         along, below = right - corner, down - corner
         axes = corner, along / np.linalg.norm(along), below / np.linalg.norm(below)
-        return Artwork(*lines, dark, np.zeros((0, 3)), axes)
+        return Artwork(x, y, dark, np.zeros((0, 3)), axes)
 
     def _placed(self, row: Float[Tensor, " n"], column: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
         """World points in this board's frame from rows and columns in units of squares."""

@@ -135,5 +135,5 @@ class CircleGrid:
         width, height = centres.max(axis=0) + radius
         discs = np.column_stack([centres, np.full(len(centres), radius)])
         _, right, down = np.eye(3)[[2, 0, 1]]
-        lines = np.array([0.0, width]), np.array([0.0, height])
-        return Artwork(*lines, np.zeros((1, 1), dtype=bool), discs, (np.array([-radius, -radius, 0.0]), right, down))
+        x, y = np.array([0.0, width]), np.array([0.0, height])
+        return Artwork(x, y, np.zeros((1, 1), dtype=bool), discs, (np.array([-radius, -radius, 0.0]), right, down))

@@ -194,7 +194,8 @@ def _read(
     quads, numbers, _ = cv2.aruco.ArucoDetector(dictionary_named(board.dictionary), parameters).detectMarkers(small)
     scale = np.array(grey.shape[::-1]) / small.shape[::-1]
     markers, found = board.markers, []
-    for number, quad in zip([] if numbers is None else np.ravel(numbers).tolist(), quads, strict=True):
+    for read, quad in zip([] if numbers is None else np.ravel(numbers), quads, strict=True):
+        number = int(read)
         if number in markers:
             corners = (quad.reshape(4, 2).astype(np.float64) + 0.5) * scale - 0.5
             design = np.column_stack([markers[number], np.ones(4)])

@@ -175,6 +175,6 @@ def _outline(art: Artwork, scale: float, corner: np.ndarray) -> "Outline":
             codes += box
     circle = Outline.unit_circle()
     for x, y, radius in art.discs:
-        vertices += [(x + radius * a, y + radius * b) for a, b in circle.vertices]
-        codes += list(circle.codes)
+        vertices += (np.array([x, y]) + radius * np.asarray(circle.vertices)).tolist()
+        codes += np.asarray(circle.codes).tolist()
     return Outline(np.array(vertices) * scale + corner, codes)

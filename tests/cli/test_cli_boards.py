@@ -71,7 +71,7 @@ def test_a_page(tmp_path, capsys):
             "--spacing: want the gap between tags relative",
         ),
         (("--charuco", "6", "--square", "20mm"), 2, "--charuco: want numbers as COLUMNSxROWS"),
-        ((*GIVEN[:-1], "5X9"), 1, "--dictionary: want one of 4X4_50, .*, got '5X9'"),
+        ((*GIVEN[:-1], "5X9"), 1, "--dictionary: want one of 4X4_100, .*, got '5X9'"),
         (
             ("--circles", "7x5", "--spacing", "20mm", "--diameter", "2m"),
             1,
