@@ -77,12 +77,16 @@ from diffproj.paper.route import paper_route as paper_route
 from diffproj.paper.setup import PaperSetup as PaperSetup
 from diffproj.paper.setup import paper_setup as paper_setup
 from diffproj.targets import synthetic as synthetic
+from diffproj.targets.april_grid import AprilGrid as AprilGrid
+from diffproj.targets.charuco import CharucoBoard as CharucoBoard
 from diffproj.targets.chessboard import Chessboard as Chessboard
+from diffproj.targets.circle_grid import CircleGrid as CircleGrid
 from diffproj.targets.detection import BoardNotFoundError as BoardNotFoundError
 from diffproj.targets.detection import BoardNotFoundWarning as BoardNotFoundWarning
 from diffproj.targets.detection import detect as detect
 from diffproj.targets.examples import example_views as example_views
 from diffproj.targets.landmarks import Landmarks as Landmarks
+from diffproj.targets.printing import draw_target as draw_target
 from diffproj.targets.residuals import image_residuals as image_residuals
 from diffproj.targets.residuals import plane_residuals as plane_residuals
 from diffproj.targets.views import Views as Views

@@ -10,6 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from diffproj._core.warn import warn_caller
 from diffproj.calibration import start
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning
+from diffproj.calibration.circle_centres import with_true_centres
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.mismatch import CameraMismatchWarning, described
@@ -19,7 +20,9 @@ from diffproj.calibration.result import Calibration
 from diffproj.calibration.second_look import lower_fit
 from diffproj.calibration.solver import Solution, Status
 from diffproj.geometry.camera import Camera, as_camera
-from diffproj.targets.chessboard import Chessboard, origin_doubt
+from diffproj.targets.boards import origin_doubt
+from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
@@ -71,8 +74,8 @@ def locate(
         >>> print(f"{dp.locate(views[8:], board, camera).rms:.2f}")
         0.16
     """
-    found = located(views, target, camera, **options)
-    if isinstance(target, Chessboard) and target.turns > 1:
+    found = with_true_centres(lambda moved: located(moved, target, camera, **options), views, target)
+    if isinstance(target, Chessboard | CircleGrid) and target.turns > 1:
         warn_caller(f"locate: {origin_doubt(target)}")
     if bool(found.ambiguous.any()):
         warnings.warn(f"locate: {found.ambiguity}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)

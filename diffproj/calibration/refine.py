@@ -6,6 +6,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from diffproj._core.arguments import flag
 from diffproj.calibration import start
+from diffproj.calibration.circle_centres import with_true_centres
 from diffproj.calibration.data import Data
 from diffproj.calibration.implicit import differentiated
 from diffproj.calibration.options import CalibrationOptions, calibration_options
@@ -64,11 +65,15 @@ def refine(
         )
     differentiable = flag("differentiable", differentiable)
     chosen = calibration_options("refine", options)
-    data = Data(views, target, chosen.weights, chosen.pixel_sigma)
-    data.check_options(chosen.objective, chosen.bow)
-    camera = as_camera(camera)
-    shared, local, parameters = start.from_camera(camera, data, chosen.bow, chosen.skew)
-    found, prior = minimised(data, chosen, parameters, shared, local, shared)
-    if differentiable:
-        found = differentiated(found, data, prior)
-    return outcome("refine", data, found, camera.size or views.size, chosen.throw)
+    beginning = as_camera(camera)
+
+    def fit(views: Views) -> Calibration:
+        data = Data(views, target, chosen.weights, chosen.pixel_sigma)
+        data.check_options(chosen.objective, chosen.bow)
+        shared, local, parameters = start.from_camera(beginning, data, chosen.bow, chosen.skew)
+        found, prior = minimised(data, chosen, parameters, shared, local, shared)
+        if differentiable:
+            found = differentiated(found, data, prior)
+        return outcome("refine", data, found, beginning.size or views.size, chosen.throw)
+
+    return with_true_centres(fit, views, target)

@@ -14,14 +14,16 @@ from torch import Tensor
 
 from diffproj._core.arguments import checked_seed, whole_number
 from diffproj._core.shown import Shown
+from diffproj.calibration.circle_centres import with_true_centres
 from diffproj.calibration.data import Data
 from diffproj.calibration.distinct import alike
 from diffproj.calibration.held_out import errors_of, folds_of, repeated, without_views
 from diffproj.calibration.one_lens import calibrated
-from diffproj.calibration.options import CalibrationOptions, calibration_options
+from diffproj.calibration.options import CalibrationOptions, Options, calibration_options
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Status
 from diffproj.lens.models import LensModel
+from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views, as_views
 
@@ -117,6 +119,7 @@ def cross_validate(
         raise ValueError("bow: want False, for held-out views are located on a flat board")
     want = f"a whole number from 2 to the number of views, {len(views)}"
     folds = whole_number("folds", folds, want, least=2, most=len(views))
+    views = _with_true_centres(views, target, distortion, chosen, "cross_validate")
     fits, errors = without_views(views, target, distortion, folds_of(views, folds), chosen, who="cross_validate")
     held_out_px, held_out_world, lost = errors.over_views()
     in_sample_px, in_sample_world, _ = errors_of(fits, fits.views.pixels, fits.used).over_views()
@@ -169,6 +172,7 @@ def bootstrap(
     if "weights" in options:
         raise ValueError("weights: want none, for they count here how often a view was drawn")
     generator = torch.Generator().manual_seed(checked_seed(seed))
+    views = _with_true_centres(views, target, distortion, chosen, "bootstrap")
     group = _groups(Data(views, target, None))
     number = int(group.amax()) + 1
     if number < 2:
@@ -196,6 +200,13 @@ def _check_lens(distortion: str) -> None:
         raise ValueError(
             "distortion: want the name of a lens, got 'auto'; calibrate with it, and give the lens it took"
         )
+
+
+def _with_true_centres(views: Views, target: Target, distortion: LensModel, chosen: Options, who: str) -> Views:
+    """The views; of circles, with their middles moved to where all views together put the centres."""
+    if not isinstance(target, CircleGrid):
+        return views
+    return with_true_centres(lambda moved: calibrated(moved, target, distortion, chosen, who), views, target).views
 
 
 def _groups(data: Data) -> Tensor:

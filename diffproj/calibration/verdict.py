@@ -15,7 +15,7 @@ from diffproj.calibration.reach import folds_at_corners, lost_corners
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import mean_squares
-from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.boards import Board, faces_away
 from diffproj.targets.landmarks import Landmarks
 
 MAX_RELATIVE_STD = 0.1
@@ -186,13 +186,13 @@ def _relative_error(found: Fit) -> Tensor:
 
 
 def _mirrored(R: Tensor, t: Tensor, points: Tensor, used: Tensor, board: object) -> Tensor:
-    """Which views show the board mirrored `(P, V)`: against a `Chessboard`'s axes, or else against the majority."""
+    """Which views show the board mirrored `(P, V)`: against a board's axes, or else against the majority."""
     middle = R @ points.mean(0) + t
     away = (R[..., 2] * middle).sum(-1) > 0  # the board's z points away from the camera
     if isinstance(board, Landmarks):  # not printed on one face of anything
         return torch.zeros_like(used)
-    if isinstance(board, Chessboard):
-        expected = torch.full_like(away[:, :1], board.axes == "opencv")
+    if isinstance(board, Board):
+        expected = torch.full_like(away[:, :1], faces_away(board))
     else:
         expected = 2 * (away & used).sum(-1, keepdim=True) >= used.sum(-1, keepdim=True)
     return used & (away != expected)

@@ -1,4 +1,4 @@
-"""`diffproj calibrate`: from photographs of a chessboard to a camera file."""
+"""`diffproj calibrate`: from photographs of a board to a camera file."""
 
 import argparse
 import textwrap
@@ -13,16 +13,15 @@ from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawi
 from diffproj.cli.inputs import check_writable, writing
 from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import RESULTS, aligned, in_options, progress_bars, result, rounded
+from diffproj.cli.which_board import given_board
 from diffproj.files.save import save_camera
-from diffproj.targets.chessboard import Chessboard
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
     check_writable("--output", options.output)
     check_drawing(options.draw)
-    columns, rows = options.board
-    board = Chessboard(columns, rows, options.square.value)
+    board, side, _ = given_board(options)
     sources = photographs(options.photographs)
     check_no_photograph(options.draw, sources)
     with progress_bars() as bars:
@@ -37,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
             reject_outliers=options.reject_outliers,
             progress=lambda done, total: bars.update(task, completed=done, total=total),
         )
-    calibration = replace(calibration, unit=options.square.unit)
+    calibration = replace(calibration, unit=side.unit)
     if calibration.comparison is not None:
         result(f"Lenses compared\n{calibration.comparison.summary()}\n")
     RESULTS.print(_views_table(calibration))

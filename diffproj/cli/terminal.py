@@ -49,6 +49,8 @@ def in_options(text: str) -> str:
         .replace("bow=True", "--bow")
         .replace("skew=True", "--skew")
         .replace("'auto'", "auto")
+        .replace("give legacy=True", "give --legacy")
+        .replace("give legacy=False", "leave --legacy out")
     )
 
 

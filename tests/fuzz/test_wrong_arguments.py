@@ -279,6 +279,14 @@ def _lenses(t: Things) -> dict[str, Call]:
 def _targets(t: Things) -> dict[str, Call]:
     v, b = t.views, t.board
     return {
+        "AprilGrid": Call(dp.AprilGrid, {"columns": 3, "rows": 2, "tag": 10.0, "spacing": 0.3}),
+        "CharucoBoard": Call(
+            dp.CharucoBoard,
+            {"columns": 4, "rows": 3, "square": 10.0, "marker": 7.0, "dictionary": "4X4_50", "legacy": True},
+        ),
+        "CircleGrid": Call(
+            dp.CircleGrid, {"columns": 4, "rows": 3, "spacing": 10.0, "diameter": 5.0, "asymmetric": "rows"}
+        ),
         "Chessboard": Call(dp.Chessboard, {"columns": 4, "rows": 3, "square": 10.0, "axes": "paper"}),
         "Landmarks": Call(
             dp.Landmarks, {"points": b.points, "names": [str(n) for n in range(len(b))], "sigma": 0.1}, 3
@@ -290,7 +298,7 @@ def _targets(t: Things) -> dict[str, Call]:
         "Views.hiding": Call(v.hiding, {"mask": torch.arange(12) == 3}),
         "Views.stack": Call(dp.Views.stack, {"items": [v, v], "dim": 0}),
         "detect": Call(
-            dp.detect, {"photographs": t.photograph, "board": dp.Chessboard(6, 5), "progress": print_nothing}, 3
+            dp.detect, {"photographs": t.photograph, "target": dp.Chessboard(6, 5), "progress": print_nothing}, 3
         ),
         "example_views": Call(dp.example_views, {"side": "left"}, 1),
         "image_residuals": Call(dp.image_residuals, {"camera": t.cameras, "views": v, "target": b}),
@@ -490,6 +498,11 @@ def _uses(t: Things) -> dict[str, Call]:
         ),
         "CalibrationPrior": Call(dp.CalibrationPrior, {"calibration": t.calibration, "view": 1}),
         "CalibrationPrior()": Call(prior, {"camera": t.calibration.cameras[0]}),
+        "draw_target": Call(
+            dp.draw_target,
+            {"target": t.board, "path": folder / "board.svg", "paper": "A5", "dpi": 60, "unit": "mm"},
+            3,
+        ),
         "save_camera": Call(dp.save_camera, {"path": folder / "saved.json", "camera": c, "format": "json"}, 3),
         "load": Call(dp.load, {"path": path}, 3),
         "load_camera": Call(dp.load_camera, {"path": path, "format": "json"}, 3),
