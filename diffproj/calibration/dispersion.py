@@ -22,9 +22,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from diffproj.calibration.covariance import local_inverse
+from diffproj.calibration.covariance import local_inverse, reduced
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.losses import slope_and_bend
+from diffproj.calibration.shape import by_displacement
 from diffproj.calibration.task import Task
 
 FEW_VIEWS = 2.5
@@ -42,11 +43,11 @@ def dispersion(found: Fit) -> Tensor:
     """
     task, solution = found.task, found.solution
     shared, local = solution.shared.detach(), tuple(z.detach() for z in solution.local)
-    free = shared.shape[-1] if task.basis is None else task.basis.shape[-1]
-    if free == 0 or task.used.shape[1] < 2:
+    basis = _of_camera(task)
+    if basis is not None and basis.shape[-1] == 0 or task.used.shape[1] < 2:
         return torch.ones_like(shared[:, 0])
     with torch.inference_mode():
-        phi, spare, views = _between_over_within(task, shared, local, found.degrees_of_freedom())
+        phi, spare, views = _between_over_within(found, shared, local)
         excess = (phi - 1).clamp(min=0) * spare.square() / (spare.square() + BELIEF**2)
         excess = excess.pow(3) / (excess.square() + 2 / spare)  # 2 / spare: phi's own variance for independent corners
         factor = 1 + excess * (1 + FEW_VIEWS / (views - 1).clamp(min=1))
@@ -54,21 +55,32 @@ def dispersion(found: Fit) -> Tensor:
     return factor.clone()
 
 
+def _of_camera(task: Task) -> Tensor | None:
+    """The directions in which the shared parameters other than free points may move `(P, few, q)`; `None` for all."""
+    if task.basis is None:
+        return None
+    own = task.basis[:, : task.parameters.few]
+    return own[..., (own != 0).any(1).any(0)] if task.free else own
+
+
 def _between_over_within(
-    task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor
+    found: Fit, shared: Tensor, local: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Phi `(P,)`, its degrees of freedom, and how many views say something; `redundant (P,)` are those of the fit."""
-    rows, residual, pull_weight, variance = _weighted(task, shared, local, redundant)
-    s = shared.shape[-1]
-    if task.basis is not None:
-        rows = torch.cat([torch.einsum("psq,pvskn->pvqkn", task.basis, rows[:, :, :s]), rows[:, :, s:]], dim=2)
-        s = task.basis.shape[-1]
+    """Phi `(P,)`, its degrees of freedom, and how many views say something."""
+    task = found.task
+    redundant = found.degrees_of_freedom()
+    rows, residual, pull_weight, weight, level = _weighted(task, shared, local, redundant)
+    by_tau = rows[:, :, -3:]
+    s, basis = task.parameters.few, _of_camera(task)
+    if basis is not None:
+        rows = torch.cat([torch.einsum("psq,pvskn->pvqkn", basis, rows[:, :, :s]), rows[:, :, s:]], dim=2)
+        s = basis.shape[-1]
 
     def products(weight: Tensor, columns: Tensor) -> Tensor:
         return (rows * weight[:, :, None, None]).flatten(-2) @ columns.flatten(-2).mT
 
     N = products(pull_weight, torch.cat([rows, residual.unsqueeze(2)], dim=2))
-    K = products(variance, rows)
+    K = products(weight * level[:, None, None], rows)
     F = N[..., :s, s:-1] @ local_inverse(N[..., s:, s:-1])[0]  # E_v W_v^-1: eliminates the pose
     u = N[..., :s, -1] - (F @ N[..., s:, -1:]).squeeze(-1)
     S = N[..., :s, :s] - F @ N[..., s:, :s]
@@ -84,19 +96,29 @@ def _between_over_within(
     # they do. A prior's pull is among them, and what it determines costs no degree of freedom.
     data = (share[..., None, None] * S).sum(1)
     total, pull = data, (share.unsqueeze(-1) * u).sum(1)
-    if task.prior is not None:
-        Q, off = task.prior.precision, (task.prior.precision @ (shared - task.prior.mean).unsqueeze(-1)).squeeze(-1)
-        T = torch.eye(len(Q[0]), dtype=Q.dtype, device=Q.device) if task.basis is None else task.basis
-        total, pull = total + T.mT @ Q @ T, pull + (T.mT @ off.unsqueeze(-1)).squeeze(-1)
-    inverse = torch.linalg.pinv(total, hermitian=True)
-    u = u - (S @ (inverse @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
-    spent = (inverse * data.mT).sum((-2, -1))
+    if not task.moves_points:
+        if task.prior is not None:
+            Q, off = task.prior.precision, (task.prior.precision @ (shared - task.prior.mean).unsqueeze(-1)).squeeze(-1)
+            T = torch.eye(len(Q[0]), dtype=Q.dtype, device=Q.device) if task.basis is None else task.basis
+            total, pull = total + T.mT @ Q @ T, pull + (T.mT @ off.unsqueeze(-1)).squeeze(-1)
+        inverse = torch.linalg.pinv(total, hermitian=True)
+        u = u - (S @ (inverse @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
+        spent = (inverse * data.mT).sum((-2, -1))
 
     scale = K.diagonal(dim1=-2, dim2=-1).sum(1, keepdim=True).clamp(min=1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(K * scale.unsqueeze(-1) * scale.unsqueeze(-2))
     told = values > SINGULAR * values[..., -1:].clamp(min=1e-300)
     along = (vectors.mT @ (u * scale).unsqueeze(-1)).squeeze(-1)
     squares = torch.where(told, along.square() / torch.where(told, values, 1.0), 0.0).sum(-1)
+    if task.moves_points:
+        # Points follow what the views want, so that these pull less: by the part that the points' own fit takes.
+        by_point = by_displacement(by_tau, local[0]) * pull_weight[:, :, None, None]
+        cross = torch.einsum("pvrkn,pvjkn->pvrnj", rows, by_point).flatten(-2)
+        cross = cross[:, :, :s] - F @ cross[:, :, s:]
+        followed = level[:, None, None, None] * _followed(found, S, cross)
+        along = vectors.mT @ (followed * scale.unsqueeze(-1) * scale.unsqueeze(-2)) @ vectors
+        part = torch.where(told, along.diagonal(dim1=-2, dim2=-1) / torch.where(told, values, 1.0), 0.0)
+        spent = (share * part.sum(-1)).sum(-1)
     squares, told = (share * squares).sum(-1), share.unsqueeze(-1) * told
     spare = (told.sum((-2, -1)) - spent).clamp(min=1e-9)
     return squares / spare, spare, told.amax(-1).sum(-1)
@@ -104,12 +126,13 @@ def _between_over_within(
 
 def _weighted(
     task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """What the pulls are made of.
 
     Returns:
         Derivatives `(P, V, s + 6, 2, N)` and residuals `(P, V, 2, N)` on the image, in pixels; and for each corner
-        `(P, V, N)` its weight in the pull of its view, and the variance of its part of it.
+        `(P, V, N)` its weight in the pull of its view, and what the variance of its part of it is in the unit of the
+        last, the residuals' variance `(P,)`.
     """
     panel = replace(task, objective="image").problem.linearise(shared, local)
     rows, residual = panel[:, :, :-1], panel[:, :, -1]
@@ -125,4 +148,24 @@ def _weighted(
     pulls = torch.where(weight > 0, slope.square() / torch.where(weight > 0, weight, 1.0), 0.0)
     pulls = pulls if task.shares is None else pulls * task.shares.unsqueeze(-1)
     level = (pulls * residual.square().sum(2)).sum((-2, -1)) / redundant.clamp(min=1)
-    return rows, residual, slope, weight * level[:, None, None]
+    return rows, residual, slope, weight, level
+
+
+def _followed(found: Fit, S: Tensor, cross: Tensor) -> Tensor:
+    """How much of the information of each view on the camera `(P, V, q, q)` the fit of camera and points takes.
+
+    Args:
+        found: the fit.
+        S: of each view, the normal matrix of the camera `(P, V, q, q)`, its pose eliminated.
+        cross: the same of the camera and the displacements of all points `(P, V, q, 3 N)`.
+    """
+    task = found.task
+    if task.basis is not None:
+        cross = cross @ task.basis[:, task.parameters.few :, S.shape[-1] :].unsqueeze(1)
+    whole = reduced(found.solution.equations, task.basis, task.shares)[0].detach()
+    scale = whole.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt().unsqueeze(-1)
+    L, failed = torch.linalg.cholesky_ex(whole * scale * scale.mT)
+    L = torch.where((failed > 0)[:, None, None], torch.inf, L)
+    told = torch.cat([S, cross], dim=-1).flatten(1, 2) * scale.mT
+    white = torch.linalg.solve_triangular(L, told.mT, upper=False).mT.unflatten(1, S.shape[1:3])
+    return white @ white.mT

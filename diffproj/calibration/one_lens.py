@@ -1,9 +1,10 @@
-"""A calibration with one lens: a start in closed form, refined, looked at twice, and kept from folding."""
+"""A calibration with one lens: a start in closed form, refined, looked at twice, kept from folding, its target's points freed."""
 
 import torch
 
 from diffproj.calibration import start
 from diffproj.calibration.data import Data
+from diffproj.calibration.free_points import with_free_points
 from diffproj.calibration.options import Options
 from diffproj.calibration.outcome import minimised, outcome
 from diffproj.calibration.parametrisation import Parametrisation
@@ -39,9 +40,10 @@ def calibrated(
         )
         poorer, _ = minimised(data, early, parameters, shared, local, reference)
         shared, local = near = poorer.solution.shared, poorer.solution.local
-    found, _ = minimised(data, chosen, parameters, shared, local, reference)
+    found, prior = minimised(data, chosen, parameters, shared, local, reference)
     limits = {"max_iterations": chosen.max_iterations, "tolerance": chosen.tolerance}
     found = second_look(found, straight, reject=chosen.outlier_limit, **limits)
     if near is not None:
         found = restrained(found, *near, views.size, reject=chosen.outlier_limit, **limits)
+    found, _ = with_free_points(found, data, chosen, prior)
     return outcome(who, data, found, views.size, chosen.throw)

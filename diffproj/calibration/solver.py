@@ -93,6 +93,20 @@ class Problem(Protocol):
         ...
 
 
+@runtime_checkable
+class Bordered(Problem, Protocol):
+    """A problem with many more shared unknowns, behind the others, each of which few residuals depend on.
+
+    The panel has no rows for them.
+    """
+
+    def bordered(
+        self, panel: Tensor, local: LocalState, U: Tensor, E: Tensor, g: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """U, E and g with those unknowns, from the weighted panel that the others' blocks are of."""
+        ...
+
+
 class Prior(NamedTuple):
     """`1/2 (x - mean)^T precision (x - mean)`: mean `(P, s)`, precision `(P, s, s)`.
 
@@ -127,6 +141,9 @@ class Equations(NamedTuple):
         """The same equations for shared unknowns restricted to a basis `(P, s, q)`."""
         if basis is None:
             return self
+        if basis.shape[-1] == 0:
+            U, E, g = self.U[:, :0, :0], self.E[:, :, :0], self.g[:, :0]
+            return Equations(U, E, self.W, g, self.h, self.c)
         T = basis.mT
         return Equations(T @ self.U @ basis, T.unsqueeze(1) @ self.E, self.W, _times(T, self.g), self.h, self.c)
 
@@ -149,6 +166,18 @@ class Solution(NamedTuple):
     status: Int[Tensor, " p"]
     iterations: Int[Tensor, " p"]
     equations: Equations
+
+
+def equations_at(
+    problem: Problem,
+    shared: Float[Tensor, "p s"],
+    local: LocalState,
+    local_size: int,
+    weights: Float[Tensor, "p v n"] | None = None,
+    loss: Loss | None = None,
+) -> Equations:
+    """The normal equations at a point, for all unknowns whether they may move or not."""
+    return _Terms(problem, local_size, weights, loss, None).at(shared, local)[1]
 
 
 @np.errstate(all="ignore")  # infinite and NaN reductions are handled without warnings
@@ -187,7 +216,8 @@ def solve(
     Returns:
         The solution, with a `Status` for each problem.
     """
-    terms = _Terms(problem, local_size, weights, loss, prior)
+    every = basis is None or basis.shape[-1] > 0  # where no shared unknown moves, those of the panel are enough
+    terms = _Terms(problem, local_size, weights, loss, prior, every)
     cost, equations = terms.at(shared, local)
     control = _DampingControl(_array(cost))
     for iteration in range(1, max_iterations + 1):
@@ -312,9 +342,16 @@ class _Terms:
     """Evaluates the cost and the normal equations at a point."""
 
     def __init__(
-        self, problem: Problem, local_size: int, weights: Tensor | None, loss: Loss | None, prior: Prior | None
+        self,
+        problem: Problem,
+        local_size: int,
+        weights: Tensor | None,
+        loss: Loss | None,
+        prior: Prior | None,
+        every: bool = True,
     ) -> None:
         self.problem, self.local_size, self.weights, self.loss, self.prior = problem, local_size, weights, loss, prior
+        self.border = problem.bordered if every and isinstance(problem, Bordered) else None
 
     def at(self, shared: Tensor, local: LocalState) -> tuple[Tensor, Equations]:
         panel = self.problem.linearise(shared, local)
@@ -332,12 +369,14 @@ class _Terms:
         totals = gram[..., :s, :].sum(1)
         c = gram[..., -1, -1] / 2
         cost = c.sum(-1) if robust is None else robust
-        U, g = totals[..., :s], totals[..., -1]
+        U, E, g = totals[..., :s], gram[..., :s, s:-1], totals[..., -1]
+        if self.border is not None:
+            U, E, g = self.border(panel, local, U, E, g)
         if self.prior is not None:
             off = shared - self.prior.mean
             pull = _times(self.prior.precision, off)
             cost, U, g = cost + (off * pull).sum(-1) / 2, U + self.prior.precision, g + pull
-        return cost, Equations(U, gram[..., :s, s:-1], gram[..., s:-1, s:-1], g, gram[..., s:-1, -1], c)
+        return cost, Equations(U, E, gram[..., s:-1, s:-1], g, gram[..., s:-1, -1], c)
 
 
 def _with_diagonal(matrix: Tensor, addition: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """`Task`: what is minimised, for P cameras side by side; and the solver run over it, in blocks of cameras."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from diffproj.calibration.options import Progress
 from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.reprojection import Reprojection
 from diffproj.calibration.result import Objective
+from diffproj.calibration.shape import Restraint, restraint_of
 from diffproj.calibration.solver import Equations, Prior, Solution, solve
 from diffproj.lens.models import LensModel
 
@@ -30,7 +32,7 @@ class Task:
         points: the board's points `(N, 3)`.
         pixels: `(P, V, N, 2)`.
         used: which corners count `(P, V, N)`.
-        lens, bow, skew: the model.
+        lens, bow, skew, free: the model; `free` where the places of the target's points are unknowns.
         objective: residuals on the image or on the board.
         weights: of the corners `(P, V, N)`, or `None` for 1.
         shares: how much each view counts in what all views share `(P, V)`, or `None` for 1: see `distinct.py`. A pose
@@ -38,6 +40,7 @@ class Task:
         loss: a robust loss, or `None` for least squares.
         prior: on the shared parameters.
         basis: of the shared parameters' free directions `(P, s, q)`, or `None` for all.
+        printed: precision of each displacement of free points `(P, 3 N)`, in the unit of the weights; `None` for 0.
     """
 
     points: Tensor
@@ -46,17 +49,19 @@ class Task:
     lens: LensModel
     bow: bool = False
     skew: bool = False
+    free: bool = False
     objective: Objective = "image"
     weights: Tensor | None = None
     shares: Tensor | None = None
     loss: Loss | None = None
     prior: Prior | None = None
     basis: Tensor | None = None
+    printed: Tensor | None = None
 
     @property
     def parameters(self) -> Parametrisation:
         """Which they are, and in which order."""
-        return Parametrisation(self.lens, self.bow, self.skew)
+        return Parametrisation(self.lens, self.bow, self.skew, self.points.shape[-2] if self.free else 0)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -67,7 +72,33 @@ class Task:
     def problem(self) -> Reprojection:
         """Residuals and Jacobians."""
         kind = BoardError if self.objective == "plane" else Reprojection
-        return kind(self.points, self.pixels, self.used, self.lens, self.bow, self.skew)
+        return kind(self.points, self.pixels, self.used, self.lens, self.bow, self.skew, self.free)
+
+    @property
+    def moves_points(self) -> bool:
+        """Whether points are free, and not all shared parameters held."""
+        return self.free and (self.basis is None or self.basis.shape[-1] > 0)
+
+    @cached_property
+    def restraint(self) -> Restraint | None:
+        """What fixes the frame of free points and how well they were printed; `None` where none are free."""
+        if not self.moves_points:
+            return None
+        counts = self.pixels.new_ones(self.used.shape) if self.weights is None else self.weights
+        counts = counts if self.shares is None else counts * self.shares.unsqueeze(-1)
+        return restraint_of(self.points, self.pixels, self.used, counts, self.printed)
+
+    @property
+    def whole_prior(self) -> Prior | None:
+        """The prior together with what restrains free points."""
+        if self.restraint is None:
+            return self.prior
+        P, s = len(self.used), len(self.names)
+        few = s - self.restraint.printed.shape[-1]
+        precision = torch.nn.functional.pad(self.restraint.precision, (few, 0, few, 0))
+        if self.prior is None:
+            return Prior(precision.new_zeros(P, s), precision)
+        return Prior(self.prior.mean, self.prior.precision + precision)
 
     def holding(self, where: list[int]) -> "Task":
         """The same with some of the shared parameters held, by their positions."""
@@ -80,7 +111,7 @@ class Task:
     def part(self, where: slice | Tensor) -> "Task":
         """The task of some of the cameras."""
         cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}
-        optional = ("weights", "shares", "basis")
+        optional = ("weights", "shares", "basis", "printed")
         cut |= {name: None if (whole := getattr(self, name)) is None else whole[where] for name in optional}
         prior = None if self.prior is None else self.prior.part(where)
         return replace(self, **cut, prior=prior)
@@ -134,7 +165,7 @@ def _solved(task: Task, shared: Tensor, local: tuple[Tensor, ...], **options: An
         local_size=POSE,
         weights=weights,
         loss=task.loss,
-        prior=task.prior,
+        prior=task.whole_prior,
         basis=task.basis,
         negligible=size * _scale(task, unit) * unit**2,
         **options,
