@@ -1,11 +1,14 @@
 """`locate`: where a known camera stood, from the corners of a target in each view."""
 
 import warnings
+from dataclasses import replace
 from typing import Unpack
 
 import torch
 from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
 
+from diffproj._core.arguments import flag
 from diffproj._core.warn import warn_caller
 from diffproj.calibration import closed_form, start
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning
@@ -15,13 +18,16 @@ from diffproj.calibration.mismatch import CameraMismatchWarning, described
 from diffproj.calibration.options import LocateOptions, locate_options
 from diffproj.calibration.outcome import outcome
 from diffproj.calibration.result import Calibration
-from diffproj.calibration.solver import Solution, Status, select
+from diffproj.calibration.parametrisation import POSE, Parametrisation
+from diffproj.calibration.solver import Equations, Solution, Status, equations_at, select
 from diffproj.calibration.task import Task
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.targets.chessboard import Chessboard, origin_doubt
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
+SAME = 1e-9
+"""Part of the target's size by which the points of two may differ and still be one target's."""
 REMEDY = (
     "see alternatives and likelihood_ratio. A target that is larger in the image, more tilted, or with more corners "
     "tells them apart; a calibration in place of a camera brings the noise along, which few corners do not tell"
@@ -30,7 +36,12 @@ REMEDY = (
 
 
 def locate(
-    views: Views, target: Target, camera: Camera | PinholeCamera | Calibration, **options: Unpack[LocateOptions]
+    views: Views,
+    target: Target,
+    camera: Camera | PinholeCamera | Calibration,
+    *,
+    same_target: bool = True,
+    **options: Unpack[LocateOptions],
 ) -> Calibration:
     """Find the pose of each view with intrinsics and lens held, from at least 4 corners a view.
 
@@ -41,13 +52,16 @@ def locate(
     says so.
     With a calibration in the place of a camera a `CameraMismatchWarning` names the views whose corners are not where it
     sees them, as photographs of another camera, zoom or focus: see `mismatch`.
-    The board is taken to be flat, also where a calibration found a bow.
+    A calibration that fitted the target's shape brings that along, too, for the same target.
 
     Args:
         views: corners `(*B, V, N, 2)`.
         target: anything with `.points (N, 3)` on z = 0.
         camera: batch shape broadcasting to `*B`; its own pose does not matter. A calibration brings its uncertainty
             along, and the noise of its corners, which few corners do not tell.
+        same_target: whether the views show the very target whose shape the calibration fitted, if it did and `target`
+            has the same points: its corners then are where the calibration has them, as surely as it knows. Say False
+            for another print of it.
         options: `weights`, `loss`, `max_iterations`, `tolerance`, `progress` and `throw`: see `LocateOptions`.
 
     Returns:
@@ -68,7 +82,8 @@ def locate(
         >>> print(f"{dp.locate(views[8:], board, camera).rms:.2f}")
         0.18
     """
-    found = located(views, target, camera, **options)
+    same_target = flag("same_target", same_target)
+    found = located(views, target, camera, camera if same_target else None, **options)
     if isinstance(target, Chessboard) and target.turns > 1:
         warn_caller(f"locate: {origin_doubt(target)}")
     if bool(found.ambiguous.any()):
@@ -79,9 +94,13 @@ def locate(
 
 
 def located(
-    views: Views, target: Target, camera: Camera | PinholeCamera | Calibration, **options: Unpack[LocateOptions]
+    views: Views,
+    target: Target,
+    camera: Camera | PinholeCamera | Calibration,
+    shaped: object = None,
+    **options: Unpack[LocateOptions],
 ) -> Calibration:
-    """The same without a warning."""
+    """The same without a warning; `shaped` may be a calibration that fitted the shape of this target."""
     if isinstance(views, Camera | PinholeCamera | Calibration):
         raise TypeError("locate: want (views, target, camera) in this order, got the camera first")
     chosen = locate_options(options)
@@ -93,6 +112,9 @@ def located(
     camera = as_camera(camera)
     skew = calibration is not None and calibration.skew
     shared, (R, t), parameters = start.from_camera(camera, data, bow=False, skew=skew, with_poses=False)
+    if isinstance(shaped, Calibration):
+        shared, parameters = _with_shape(shared, parameters, data, shaped)
+    model = {"bow": parameters.bow, "skew": parameters.skew, "free": parameters.points > 0}
     # Each view is a problem of its own, with a step and an end of its own, from each of its two starts.
     V = len(views)
     single = Task(
@@ -100,7 +122,7 @@ def located(
         data.pixels.flatten(0, 1).unsqueeze(1),
         data.used.flatten(0, 1).unsqueeze(1),
         parameters.lens,
-        skew=parameters.skew,
+        **model,
         weights=None if data.weights is None else data.weights.flatten(0, 1).unsqueeze(1),
         loss=loss,
         basis=shared.new_zeros(len(shared) * V, shared.shape[-1], 0),
@@ -122,24 +144,48 @@ def located(
         one.cost.isfinite(), one.cost, torch.inf
     )
     best = select(better.numpy(force=True), other, one)
-    task = data.task(parameters.lens, skew=parameters.skew, loss=loss, basis=shared.new_zeros(*shared.shape, 0))
+    task = data.task(parameters.lens, **model, loss=loss, basis=shared.new_zeros(*shared.shape, 0))
     seen = data.used.any(-1)
+    poses = tuple(z.squeeze(1).unflatten(0, seen.shape) for z in best.local)
     status = torch.where(seen, best.status.reshape(seen.shape), Status.CONVERGED)
-    equations = best.equations
+    equations = _joined(best.equations, seen)
+    if parameters.points:
+        with torch.no_grad():
+            equations = equations_at(task.problem, shared, poses, POSE, task.weights, loss)
     joined = Solution(
         shared,
-        tuple(z.squeeze(1).unflatten(0, seen.shape) for z in best.local),
+        poses,
         torch.where(seen, best.cost.reshape(seen.shape), 0.0).sum(-1),
         status.amax(-1),
         best.iterations.reshape(seen.shape).amax(-1),
-        equations._replace(
-            U=equations.U.unflatten(0, seen.shape).sum(1),
-            E=equations.E.squeeze(1).unflatten(0, seen.shape),
-            W=equations.W.squeeze(1).unflatten(0, seen.shape),
-            g=equations.g.unflatten(0, seen.shape).sum(1),
-            h=equations.h.squeeze(1).unflatten(0, seen.shape),
-            c=equations.c.reshape(seen.shape),
-        ),
+        equations,
     )
     found = Fit(task, joined, torch.zeros_like(data.used))
     return outcome("locate", data, found, camera.size or views.size, chosen.throw, calibration)
+
+
+def _joined(equations: Equations, seen: Tensor) -> Equations:
+    """The equations of cameras with views `(P, V)`, from those of their views one by one."""
+    return Equations(
+        U=equations.U.unflatten(0, seen.shape).sum(1),
+        E=equations.E.squeeze(1).unflatten(0, seen.shape),
+        W=equations.W.squeeze(1).unflatten(0, seen.shape),
+        g=equations.g.unflatten(0, seen.shape).sum(1),
+        h=equations.h.squeeze(1).unflatten(0, seen.shape),
+        c=equations.c.reshape(seen.shape),
+    )
+
+
+def _with_shape(
+    shared: Tensor, parameters: Parametrisation, data: Data, known: Calibration
+) -> tuple[Tensor, Parametrisation]:
+    """Shared parameters with the shape of the target that a calibration found, where it is that target's."""
+    same = known.nominal.shape == data.given_points.shape and bool(
+        (known.nominal.to(data.points) - data.given_points.detach()).abs().amax() <= SAME * data.points.abs().amax()
+    )
+    if known.shape == "flat" or not same:
+        return shared, parameters
+    parts = known.bow if known.displacements is None else known.displacements.flatten(-2)
+    parts = parts.detach().to(shared).expand(*data.batch, -1).reshape(len(shared), -1)  # type: ignore[union-attr]
+    points = len(data.points) if known.shape == "free" else 0
+    return torch.cat([shared, parts], dim=-1), replace(parameters, bow=known.shape == "bow", points=points)

@@ -101,7 +101,7 @@ def outcome(
         camera,
         posed,
         data.views.to(torch.float64),
-        data.given_points.detach(),
+        data.given_points if task.free and solution.shared.requires_grad else data.given_points.detach(),
         shaped(task.used),
         shaped(found.rejected),
         shaped(status),

@@ -53,6 +53,11 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     mirrored = ~no_pose & _mirrored(R, t, task.points, used, board)
     misfits = ~no_pose & used & (_relative_error(found) > MAX_RELATIVE_RESIDUAL)
     unknown = known.undetermined.clone()
+    if task.restraint is not None:  # points that hardly any view shows stay where they are, and say nothing of others
+        unknown[:, task.parameters.few :] &= ~task.restraint.unknown
+        size = (task.points - task.points.mean(0)).square().sum(-1).mean().sqrt()
+        unsure = known.shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, task.parameters.few :]
+        unknown[:, task.parameters.few :] |= unsure.isfinite() & (unsure > MAX_RELATIVE_STD * size)
     std = known.shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, :4]
     unknown[:, :4] |= ~(std <= MAX_RELATIVE_STD * solution.shared[:, :1].abs())
     none = ~used.any(-1)
@@ -112,7 +117,11 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
         elif bool(alone[p]) and not (int(used[p].sum()) == 1 and bool(unknown[p].any())):
             causes[p] = ONE_VIEW if int(used[p].sum()) == 1 else f"the views show the board alike, and {ONE_VIEW}"
         elif not bool(redundant[p]) or bool(unknown[p].any()):
-            lacking = [name for name, lost in zip(task.names, unknown[p].tolist(), strict=True) if lost]
+            few = task.parameters.few_names
+            lacking = [name for name, lost in zip(few, unknown[p].tolist(), strict=False) if lost]
+            if task.free:
+                causes[p] = _shapeless(lacking, bool(unknown[p, len(few) :].any()))
+                continue
             seen = task.part(slice(p, p + 1))
             free = task.basis is None or bool(task.basis[p, 2:4].any())
             causes[p] = _undetermined(lacking, R[p, used[p]], _foreshortening(seen)[0, used[p]], free)
@@ -198,6 +207,16 @@ def _foreshortening(task: Task) -> Tensor:
     H = homographies(task.points, task.pixels, task.used)
     half = (task.points[:, :2] - task.points[:, :2].mean(0)).abs().amax(0)
     return (H[..., 2, :2].abs() * half).sum(-1) / H[..., 2, 2].abs()
+
+
+def _shapeless(lacking: list[str], points: bool) -> str:
+    """What is to be said where the points of the target are free."""
+    lacking = [*lacking, *(["the places of the target's points"] if points else [])]
+    what = f"the views do not determine {', '.join(lacking)}" if lacking else "there are fewer corners than parameters"
+    return (
+        f"{what}, as long as its shape is free: add views, tilted by 20 to 50 degrees about both axes; or say how well "
+        "the target was printed, such as priors={'points': 0.1}; or take shape='flat'"
+    )
 
 
 def _joined_names(names: tuple[str, ...], chosen: Tensor) -> str:

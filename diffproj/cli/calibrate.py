@@ -8,6 +8,7 @@ from typing import get_args
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import add_orientation, board_size, camera_file, some_path
 from diffproj.cli.units import square_side
+from diffproj.calibration.shape import Shape
 from diffproj.lens.names import LensModel
 
 DESCRIPTION = """\
@@ -62,10 +63,13 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "(required)",
     )
     board.add_argument(
-        "--bow",
-        action="store_true",
-        help="the board may be bent a little: fit how far its middle stands off its edges, too",
+        "--shape",
+        choices=get_args(Shape),
+        default="flat",
+        help="of the print: flat, as it was designed; bow, bent a little: fit how far its middle stands off its edges, "
+        "too; free: fit where each corner is, too, which takes six views and more (default: flat)",
     )
+    board.add_argument("--bow", action="store_const", const="bow", dest="shape", help="the same as --shape bow")
     lens = command.add_argument_group("the camera")
     lens.add_argument(
         "--distortion",
