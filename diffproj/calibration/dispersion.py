@@ -15,6 +15,13 @@ the variances of the parameters are too small if not. What it exceeds 1 by is ta
 of chance, and shrunk where it does not; and it counts more where few views tell it, for it is an average over all
 directions of the parameters, of which one may be far worse: on random subsets of real sets of views, errors then are
 what they are said to be.
+
+Where the points of the target are free they follow what the views want, and these pull less. What is compared then is
+how far each view moves the focal lengths and the principal point, to first order, with how far it would if corners
+erred independently: with w_v the derivative of such a parameter by the residuals r_v of a view, and M_v what the fit of
+everything leaves of independent errors there,
+
+    phi = mean over the parameters of  sum (w_v^T r_v)^2 / (s^2 sum w_v^T M_v w_v)
 """
 
 from dataclasses import replace
@@ -25,11 +32,14 @@ from torch import Tensor
 from diffproj.calibration.covariance import local_inverse, reduced
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.losses import slope_and_bend
+from diffproj.calibration.parametrisation import INTRINSICS
 from diffproj.calibration.shape import by_displacement
 from diffproj.calibration.task import Task
 
 FEW_VIEWS = 2.5
 """The excess counts `1 + FEW_VIEWS / (views - 1)` fold."""
+FEW_VIEWS_OF_A_SHAPE = 6.0
+"""The same where the target's points are free: what these take from few views is not seen in their residuals."""
 BELIEF = 4.0
 """Degrees of freedom below which phi counts little: what one or two of them say is mostly chance."""
 SINGULAR = 1e-9
@@ -43,44 +53,37 @@ def dispersion(found: Fit) -> Tensor:
     """
     task, solution = found.task, found.solution
     shared, local = solution.shared.detach(), tuple(z.detach() for z in solution.local)
-    basis = _of_camera(task)
-    if basis is not None and basis.shape[-1] == 0 or task.used.shape[1] < 2:
+    free = shared.shape[-1] if task.basis is None else task.basis.shape[-1]
+    if free == 0 or task.used.shape[1] < 2:
         return torch.ones_like(shared[:, 0])
+    few_views = FEW_VIEWS if not task.free else FEW_VIEWS_OF_A_SHAPE
     with torch.inference_mode():
-        phi, spare, views = _between_over_within(found, shared, local)
+        if task.free:
+            phi, spare, views = _moved_intrinsics(found, shared, local)
+        else:
+            phi, spare, views = _between_over_within(task, shared, local, found.degrees_of_freedom())
         excess = (phi - 1).clamp(min=0) * spare.square() / (spare.square() + BELIEF**2)
         excess = excess.pow(3) / (excess.square() + 2 / spare)  # 2 / spare: phi's own variance for independent corners
-        factor = 1 + excess * (1 + FEW_VIEWS / (views - 1).clamp(min=1))
+        factor = 1 + excess * (1 + few_views / (views - 1).clamp(min=1))
         factor = torch.where((spare >= 1) & factor.isfinite(), factor, 1.0)
     return factor.clone()
 
 
-def _of_camera(task: Task) -> Tensor | None:
-    """The directions in which the shared parameters other than free points may move `(P, few, q)`; `None` for all."""
-    if task.basis is None:
-        return None
-    own = task.basis[:, : task.parameters.few]
-    return own[..., (own != 0).any(1).any(0)] if task.free else own
-
-
 def _between_over_within(
-    found: Fit, shared: Tensor, local: tuple[Tensor, ...]
+    task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Phi `(P,)`, its degrees of freedom, and how many views say something."""
-    task = found.task
-    redundant = found.degrees_of_freedom()
-    rows, residual, pull_weight, weight, level = _weighted(task, shared, local, redundant)
-    by_tau = rows[:, :, -3:]
-    s, basis = task.parameters.few, _of_camera(task)
-    if basis is not None:
-        rows = torch.cat([torch.einsum("psq,pvskn->pvqkn", basis, rows[:, :, :s]), rows[:, :, s:]], dim=2)
-        s = basis.shape[-1]
+    """Phi `(P,)`, its degrees of freedom, and how many views say something; `redundant (P,)` are those of the fit."""
+    rows, residual, pull_weight, variance = _weighted(task, shared, local, redundant)
+    s = shared.shape[-1]
+    if task.basis is not None:
+        rows = torch.cat([torch.einsum("psq,pvskn->pvqkn", task.basis, rows[:, :, :s]), rows[:, :, s:]], dim=2)
+        s = task.basis.shape[-1]
 
     def products(weight: Tensor, columns: Tensor) -> Tensor:
         return (rows * weight[:, :, None, None]).flatten(-2) @ columns.flatten(-2).mT
 
     N = products(pull_weight, torch.cat([rows, residual.unsqueeze(2)], dim=2))
-    K = products(weight * level[:, None, None], rows)
+    K = products(variance, rows)
     F = N[..., :s, s:-1] @ local_inverse(N[..., s:, s:-1])[0]  # E_v W_v^-1: eliminates the pose
     u = N[..., :s, -1] - (F @ N[..., s:, -1:]).squeeze(-1)
     S = N[..., :s, :s] - F @ N[..., s:, :s]
@@ -96,43 +99,78 @@ def _between_over_within(
     # they do. A prior's pull is among them, and what it determines costs no degree of freedom.
     data = (share[..., None, None] * S).sum(1)
     total, pull = data, (share.unsqueeze(-1) * u).sum(1)
-    if not task.moves_points:
-        if task.prior is not None:
-            Q, off = task.prior.precision, (task.prior.precision @ (shared - task.prior.mean).unsqueeze(-1)).squeeze(-1)
-            T = torch.eye(len(Q[0]), dtype=Q.dtype, device=Q.device) if task.basis is None else task.basis
-            total, pull = total + T.mT @ Q @ T, pull + (T.mT @ off.unsqueeze(-1)).squeeze(-1)
-        inverse = torch.linalg.pinv(total, hermitian=True)
-        u = u - (S @ (inverse @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
-        spent = (inverse * data.mT).sum((-2, -1))
+    if task.prior is not None:
+        Q, off = task.prior.precision, (task.prior.precision @ (shared - task.prior.mean).unsqueeze(-1)).squeeze(-1)
+        T = torch.eye(len(Q[0]), dtype=Q.dtype, device=Q.device) if task.basis is None else task.basis
+        total, pull = total + T.mT @ Q @ T, pull + (T.mT @ off.unsqueeze(-1)).squeeze(-1)
+    inverse = torch.linalg.pinv(total, hermitian=True)
+    u = u - (S @ (inverse @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
+    spent = (inverse * data.mT).sum((-2, -1))
 
     scale = K.diagonal(dim1=-2, dim2=-1).sum(1, keepdim=True).clamp(min=1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(K * scale.unsqueeze(-1) * scale.unsqueeze(-2))
     told = values > SINGULAR * values[..., -1:].clamp(min=1e-300)
     along = (vectors.mT @ (u * scale).unsqueeze(-1)).squeeze(-1)
     squares = torch.where(told, along.square() / torch.where(told, values, 1.0), 0.0).sum(-1)
-    if task.moves_points:
-        # Points follow what the views want, so that these pull less: by the part that the points' own fit takes.
-        by_point = by_displacement(by_tau, local[0]) * pull_weight[:, :, None, None]
-        cross = torch.einsum("pvrkn,pvjkn->pvrnj", rows, by_point).flatten(-2)
-        cross = cross[:, :, :s] - F @ cross[:, :, s:]
-        followed = level[:, None, None, None] * _followed(found, S, cross)
-        along = vectors.mT @ (followed * scale.unsqueeze(-1) * scale.unsqueeze(-2)) @ vectors
-        part = torch.where(told, along.diagonal(dim1=-2, dim2=-1) / torch.where(told, values, 1.0), 0.0)
-        spent = (share * part.sum(-1)).sum(-1)
     squares, told = (share * squares).sum(-1), share.unsqueeze(-1) * told
     spare = (told.sum((-2, -1)) - spent).clamp(min=1e-9)
     return squares / spare, spare, told.amax(-1).sum(-1)
 
 
+def _moved_intrinsics(found: Fit, shared: Tensor, local: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """Phi `(P,)` where points are free, its degrees of freedom, and how many views say something."""
+    task, few = found.task, found.task.parameters.few
+    share = torch.ones_like(local[1][..., 0]) if task.shares is None else task.shares
+    rows, residual, slope, variance = _weighted(task, shared, local, found.degrees_of_freedom())
+    level = (variance / torch.where(slope > 0, slope, 1.0)).amax((1, 2)) if task.loss is None else None
+    weight = slope if task.weights is None else task.weights
+    if task.loss is not None:
+        weight = torch.ones_like(slope) if task.weights is None else task.weights
+        level = (variance / torch.where(weight > 0, weight, 1.0)).amax((1, 2))
+    assert level is not None
+    root = weight.sqrt()[:, :, None]
+    residual = residual * torch.where(weight > 0, slope / torch.where(weight > 0, weight, 1.0), 0.0).unsqueeze(2) * root
+    rows = rows * root.unsqueeze(3)
+    by_point = by_displacement(rows[:, :, -3:], local[0])
+    # How a parameter follows each residual: a row of the inverse of the normal matrix, times the derivatives.
+    S = reduced(found.solution.equations, task.basis, task.shares)[0].detach()
+    basis = task.basis
+    columns = torch.eye(shared.shape[-1], dtype=S.dtype, device=S.device)[:, : len(INTRINSICS)].expand(len(S), -1, -1)
+    columns = columns if basis is None else basis.mT @ columns
+    inverse = torch.linalg.pinv(S, hermitian=True)
+    follow = inverse @ columns
+    follow = follow if basis is None else basis @ follow  # (P, s, 4)
+    moves = follow[:, few:].unflatten(1, (-1, 3))
+    w = torch.einsum("psi,pvskn->pvikn", follow[:, :few], rows[:, :, :few])
+    w = w + torch.einsum("pnji,pvjkn->pvikn", moves, by_point)
+    pose = rows[:, :, few:].flatten(-2)
+    inverse_W = local_inverse(pose @ pose.mT)[0]
+    flat = w.flatten(-2)
+    flat = flat - flat @ pose.mT @ inverse_W @ pose
+    w = flat.unflatten(-1, w.shape[-2:])
+    pull = (flat @ residual.flatten(-2).unsqueeze(-1)).squeeze(-1)
+    told = torch.einsum("pvikn,pvskn->pvis", w, rows[:, :, :few])
+    told = torch.cat([told, torch.einsum("pvikn,pvjkn->pvinj", w, by_point).flatten(-2)], dim=-1)
+    told = told if basis is None else told @ basis.unsqueeze(1)
+    expected = flat.square().sum(-1) - ((told @ inverse.unsqueeze(1)) * told).sum(-1)
+    squares = (share.unsqueeze(-1) * pull.square()).sum(1)
+    expected = level.unsqueeze(-1) * (share.unsqueeze(-1) * expected.clamp(min=0)).sum(1)
+    free = (follow[:, : len(INTRINSICS)].diagonal(dim1=-2, dim2=-1) > 0) & (expected > 0)
+    ratio = torch.where(free, squares / torch.where(free, expected, 1.0), 0.0)
+    views = task.used.any(-1).sum(-1)
+    phi = ratio.sum(-1) / free.sum(-1).clamp(min=1)
+    counted = (share * task.used.any(-1)).sum(-1)
+    return phi, torch.where(free.any(-1), 2 * (counted - 1), 0.0), views
+
+
 def _weighted(
     task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """What the pulls are made of.
 
     Returns:
         Derivatives `(P, V, s + 6, 2, N)` and residuals `(P, V, 2, N)` on the image, in pixels; and for each corner
-        `(P, V, N)` its weight in the pull of its view, and what the variance of its part of it is in the unit of the
-        last, the residuals' variance `(P,)`.
+        `(P, V, N)` its weight in the pull of its view, and the variance of its part of it.
     """
     panel = replace(task, objective="image").problem.linearise(shared, local)
     rows, residual = panel[:, :, :-1], panel[:, :, -1]
@@ -148,24 +186,4 @@ def _weighted(
     pulls = torch.where(weight > 0, slope.square() / torch.where(weight > 0, weight, 1.0), 0.0)
     pulls = pulls if task.shares is None else pulls * task.shares.unsqueeze(-1)
     level = (pulls * residual.square().sum(2)).sum((-2, -1)) / redundant.clamp(min=1)
-    return rows, residual, slope, weight, level
-
-
-def _followed(found: Fit, S: Tensor, cross: Tensor) -> Tensor:
-    """How much of the information of each view on the camera `(P, V, q, q)` the fit of camera and points takes.
-
-    Args:
-        found: the fit.
-        S: of each view, the normal matrix of the camera `(P, V, q, q)`, its pose eliminated.
-        cross: the same of the camera and the displacements of all points `(P, V, q, 3 N)`.
-    """
-    task = found.task
-    if task.basis is not None:
-        cross = cross @ task.basis[:, task.parameters.few :, S.shape[-1] :].unsqueeze(1)
-    whole = reduced(found.solution.equations, task.basis, task.shares)[0].detach()
-    scale = whole.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt().unsqueeze(-1)
-    L, failed = torch.linalg.cholesky_ex(whole * scale * scale.mT)
-    L = torch.where((failed > 0)[:, None, None], torch.inf, L)
-    told = torch.cat([S, cross], dim=-1).flatten(1, 2) * scale.mT
-    white = torch.linalg.solve_triangular(L, told.mT, upper=False).mT.unflatten(1, S.shape[1:3])
-    return white @ white.mT
+    return rows, residual, slope, weight * level[:, None, None]
