@@ -62,7 +62,7 @@ def with_free_points(flat: Fit, data: Data, options: Options, prior: Prior | Non
 
 def _padded(prior: Prior, count: int) -> Prior:
     """The prior with so many more parameters, of which it knows nothing."""
-    mean, precision, known = prior
+    mean, precision, known, _ = prior
     wide = (0, count, 0, count)
     known = None if known is None else torch.nn.functional.pad(known, wide)
     return Prior(torch.nn.functional.pad(mean, (0, count)), torch.nn.functional.pad(precision, wide), known)

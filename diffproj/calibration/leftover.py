@@ -176,7 +176,7 @@ class _Scores:
         S, g = U - (F @ E.mT).sum(1), g - (F @ h).sum(1)
         prior = self.task.whole_prior
         if prior is not None:
-            precision = prior.precision
+            precision = prior.whole
             if self.task.basis is not None:
                 precision = self.task.basis.mT @ precision @ self.task.basis
             S = S + torch.nn.functional.pad(precision, (0, k - first, 0, k - first))

@@ -108,7 +108,7 @@ def _drawn_to_zero(task: Task, precision: Tensor) -> Prior:
     more = torch.diag_embed(precision)
     if task.prior is None:
         return Prior(torch.zeros_like(precision), more, torch.zeros_like(more))
-    mean, given, _ = task.prior
+    mean, given, *_ = task.prior
     own = given.diagonal(dim1=-2, dim2=-1)
     total = own + precision
     return Prior(torch.where(total > 0, own * mean / total, 0.0), given + more, given)

@@ -36,14 +36,21 @@ class Restraint(NamedTuple):
     """What holds the displacements `(P, 3 N)` besides the residuals, as precisions in the unit of the weights.
 
     Attributes:
-        frame: of the frame, and of points that too few views show `(P, 3 N, 3 N)`: no measurement.
+        root: of the frame `(P, 3 N, 7)`, whose precision is `root root^T`: no measurement.
+        alone: of points that too few views show `(P, 3 N)`: none either.
         printed: of how well the target was printed `(P, 3 N)`.
         unknown: which displacements nothing tells `(P, 3 N)`.
     """
 
-    frame: Tensor
+    root: Tensor
+    alone: Tensor
     printed: Tensor
     unknown: Tensor
+
+    @property
+    def frame(self) -> Tensor:
+        """What is no measurement `(P, 3 N, 3 N)`."""
+        return self.root @ self.root.mT + torch.diag_embed(self.alone)
 
     @property
     def precision(self) -> Tensor:
@@ -101,8 +108,7 @@ def restraint_of(
     kappa = (scale * mean * shown).sum(-1).clamp(min=1e-300)[:, None, None]
     G = similarities(points, held)
     alone = held.repeat_interleave(3, dim=-1)
-    frame = kappa * (G @ G.mT + torch.diag_embed(alone.to(points)))
-    return Restraint(frame, printed, alone & (printed == 0))
+    return Restraint(kappa.sqrt() * G, kappa.squeeze(-1) * alone, printed, alone & (printed == 0))
 
 
 def by_displacement(

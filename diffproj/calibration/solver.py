@@ -112,16 +112,25 @@ class Prior(NamedTuple):
 
     `known (P, s, s)` is the part of the precision that stands for a measurement; all of it if left out. The rest only
     keeps the minimum where it makes sense: the solver makes no difference, the covariance does.
+
+    `root (P, s, k)` adds `root root^T` to the precision: of a stiff term that is 0 at the minimum, a sum of squares is
+    so to rounding, and a quadratic form is not.
     """
 
     mean: Tensor
     precision: Tensor
     known: Tensor | None = None
+    root: Tensor | None = None
+
+    @property
+    def whole(self) -> Tensor:
+        """All of the precision `(P, s, s)`."""
+        return self.precision if self.root is None else self.precision + self.root @ self.root.mT
 
     def part(self, where: slice | Tensor) -> "Prior":
         """That of some of the problems."""
-        known = None if self.known is None else self.known[where]
-        return Prior(self.mean[where], self.precision[where], known)
+        known, root = (None if part is None else part[where] for part in (self.known, self.root))
+        return Prior(self.mean[where], self.precision[where], known, root)
 
 
 class Equations(NamedTuple):
@@ -375,7 +384,10 @@ class _Terms:
         if self.prior is not None:
             off = shared - self.prior.mean
             pull = _times(self.prior.precision, off)
-            cost, U, g = cost + (off * pull).sum(-1) / 2, U + self.prior.precision, g + pull
+            cost, U, g = cost + (off * pull).sum(-1) / 2, U + self.prior.whole, g + pull
+            if self.prior.root is not None:
+                along = _times(self.prior.root.mT, off)
+                cost, g = cost + along.square().sum(-1) / 2, g + _times(self.prior.root, along)
         return cost, Equations(U, E, gram[..., s:-1, s:-1], g, gram[..., s:-1, -1], c)
 
 

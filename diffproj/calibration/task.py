@@ -95,10 +95,11 @@ class Task:
             return self.prior
         P, s = len(self.used), len(self.names)
         few = s - self.restraint.printed.shape[-1]
-        precision = torch.nn.functional.pad(self.restraint.precision, (few, 0, few, 0))
+        held = torch.nn.functional.pad(self.restraint.alone + self.restraint.printed, (few, 0))
+        root = torch.nn.functional.pad(self.restraint.root, (0, 0, few, 0))
         if self.prior is None:
-            return Prior(precision.new_zeros(P, s), precision)
-        return Prior(self.prior.mean, self.prior.precision + precision)
+            return Prior(held.new_zeros(P, s), torch.diag_embed(held), root=root)
+        return Prior(self.prior.mean, self.prior.precision + torch.diag_embed(held), root=root)
 
     def holding(self, where: list[int]) -> "Task":
         """The same with some of the shared parameters held, by their positions."""

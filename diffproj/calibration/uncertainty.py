@@ -127,7 +127,7 @@ def _equations(found: Fit, rows: Tensor, weight: Tensor, more: Tensor | None = N
     U = H[..., :s, :s]
     U = (U if found.task.shares is None else U * found.task.shares[..., None, None]).sum(1)
     prior = found.task.whole_prior
-    U = U if prior is None else U + prior.precision
+    U = U if prior is None else U + prior.whole
     return Equations(U, H[..., :s, s:], H[..., s:, s:], *found.solution.equations[3:])
 
 
