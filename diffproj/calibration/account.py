@@ -140,7 +140,7 @@ class Account(Shown):
         if self.has_covariance:
             spread = self.covariance_of_kept_poses.shared.diagonal()[:4].sqrt()
             unsure = float(spread.amax() / self.shared[0])
-        return advice.verdict(
+        text = advice.verdict(
             advice.Evidence(
                 self.cameras,
                 used,
@@ -153,6 +153,10 @@ class Account(Shown):
                 self.remarks[0],
             )
         )
+        if self.displacements is None:
+            return text
+        off = float(self.displacements.square().sum(-1).mean().sqrt())
+        return f"{text} As printed, the target's points lie {off:.2g} world units (RMS) off their nominal places."
 
     def summary(self) -> str:
         """One camera as a text for people: parameters with deviations, RMS of each view, how it ended, the verdict.

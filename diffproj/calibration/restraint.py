@@ -127,6 +127,6 @@ def _put(found: Fit, which: Tensor, other: Fit, taken: Tensor) -> Fit:
     nothing = shared.new_zeros(*shared.shape, shared.shape[-1])
     prior = task.prior or Prior(torch.zeros_like(shared), nothing, nothing)
     parts = [prior.mean, prior.precision, prior.precision if prior.known is None else prior.known]
-    new = Prior(*(a.index_put((which,), b[taken]) for a, b in zip(parts, other.task.prior, strict=True)))  # type: ignore
+    new = Prior(*(a.index_put((which,), b[taken]) for a, b in zip(parts, other.task.prior[:3], strict=True)))  # type: ignore
     solution = replaced(found.solution, which, other.solution, taken)
     return Fit(replace(task, used=used, prior=new), solution, rejected)
