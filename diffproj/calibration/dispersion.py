@@ -122,22 +122,19 @@ def _moved_intrinsics(found: Fit, shared: Tensor, local: tuple[Tensor, ...]) -> 
     task, few = found.task, found.task.parameters.few
     share = torch.ones_like(local[1][..., 0]) if task.shares is None else task.shares
     rows, residual, slope, variance = _weighted(task, shared, local, found.degrees_of_freedom())
-    level = (variance / torch.where(slope > 0, slope, 1.0)).amax((1, 2)) if task.loss is None else None
-    weight = slope if task.weights is None else task.weights
-    if task.loss is not None:
-        weight = torch.ones_like(slope) if task.weights is None else task.weights
-        level = (variance / torch.where(weight > 0, weight, 1.0)).amax((1, 2))
-    assert level is not None
+    weight = torch.ones_like(slope) if task.weights is None else task.weights
+    inverse_weight = torch.where(weight > 0, 1 / torch.where(weight > 0, weight, 1.0), 0.0)
+    level = (variance * inverse_weight).amax((1, 2))
     root = weight.sqrt()[:, :, None]
-    residual = residual * torch.where(weight > 0, slope / torch.where(weight > 0, weight, 1.0), 0.0).unsqueeze(2) * root
-    rows = rows * root.unsqueeze(3)
+    residual, rows = residual * (slope * inverse_weight).unsqueeze(2) * root, rows * root.unsqueeze(3)
     by_point = by_displacement(rows[:, :, -3:], local[0])
     # How a parameter follows each residual: a row of the inverse of the normal matrix, times the derivatives.
     S = reduced(found.solution.equations, task.basis, task.shares)[0].detach()
     basis = task.basis
     columns = torch.eye(shared.shape[-1], dtype=S.dtype, device=S.device)[:, : len(INTRINSICS)].expand(len(S), -1, -1)
     columns = columns if basis is None else basis.mT @ columns
-    inverse = torch.linalg.pinv(S, hermitian=True)
+    scale = S.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt().unsqueeze(-1)
+    inverse = torch.linalg.pinv((S * scale * scale.mT).nan_to_num(0.0, 0.0, 0.0), hermitian=True) * scale * scale.mT
     follow = inverse @ columns
     follow = follow if basis is None else basis @ follow  # (P, s, 4)
     moves = follow[:, few:].unflatten(1, (-1, 3))

@@ -31,6 +31,9 @@ AXES = ("x", "y", "z")
 FEWEST_VIEWS = 2
 """Views that show a point, below which it stays where the target has it."""
 
+HELD = 1e8
+"""How many times as firmly as a view of it would a point that stays there is held."""
+
 
 class Restraint(NamedTuple):
     """What holds the displacements `(P, 3 N)` besides the residuals, as precisions in the unit of the weights.
@@ -107,8 +110,8 @@ def restraint_of(
     mean = total[:, :, 0, 0] / used.sum(-1).clamp(min=1)
     kappa = (scale * mean * shown).sum(-1).clamp(min=1e-300)[:, None, None]
     G = similarities(points, held)
-    alone = held.repeat_interleave(3, dim=-1)
-    return Restraint(kappa.sqrt() * G, kappa.squeeze(-1) * alone, printed, alone & (printed == 0))
+    alone = held.repeat_interleave(3, dim=-1) & (printed == 0)
+    return Restraint(kappa.sqrt() * G, HELD * kappa.squeeze(-1) * alone, printed, alone)
 
 
 def by_displacement(
