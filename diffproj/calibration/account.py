@@ -207,10 +207,10 @@ class Account(Shown):
 
     def _shape(self) -> str:
         """How far a target of free points is off its nominal places."""
-        assert self.displacements is not None
-        spread = self.points_deviation if self.has_covariance else torch.full_like(self.displacements, torch.nan)
-        told = spread.isfinite().all(-1) if self.has_covariance else torch.ones_like(self.displacements[..., 0]) > 0
-        off = self.displacements[told].square().mean(0).sqrt().tolist()
+        moves = torch.zeros_like(self.nominal) if self.displacements is None else self.displacements
+        spread = self.points_deviation if self.has_covariance else torch.full_like(moves, torch.nan)
+        told = spread.isfinite().all(-1) if self.has_covariance else torch.ones_like(moves[..., 0]) > 0
+        off = moves[told].square().mean(0).sqrt().tolist()
         texts = [f"{value:10.4f}" for value in off]
         if self.has_covariance:
             sure = spread[told].square().mean(0).sqrt().tolist()

@@ -111,7 +111,7 @@ def printing_precision(priors: Priors | None, batch: Sequence[int], points: Tens
         if not axes:
             continue
         if isinstance(value, tuple):
-            raise ValueError(
+            raise ValueError(  # noqa: TRY004
                 f"priors: want a standard deviation about the target's own points for {name!r}, got a tuple; where "
                 "they are known better, give them as the target"
             )

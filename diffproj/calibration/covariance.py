@@ -322,9 +322,7 @@ def covariance(
     return Covariance(tuple(names), shared, unknown, unknown_views, dispersion, follow, mixed, (alone + alone.mT) / 2)
 
 
-def reduced(
-    equations: Equations, basis: Tensor | None, shares: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def reduced(equations: Equations, basis: Tensor | None, shares: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The normal matrix S of the free shared parameters `(P, q, q)` with all poses eliminated.
 
     With it F `(P, V, q, 6)`, the inverses of the poses' blocks, and which of these are singular.

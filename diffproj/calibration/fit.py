@@ -91,18 +91,16 @@ class Fit:
 
         Of a coordinate that both tell, the part that the prior does: the trace of its precision over all precision.
         """
-        S = covariances.reduced(self.solution.equations, self.task.basis, self.task.shares)[0]
-        told = self.restraint_along_basis(self.task.restraint.precision)
+        few, basis, restraint = self.task.parameters.few, self.task.basis, self.task.restraint
+        S = covariances.reduced(self.solution.equations, basis, self.task.shares)[0]
+        if restraint is None:
+            return torch.zeros_like(S[:, 0, 0])
+        told = torch.nn.functional.pad(restraint.precision, (few, 0, few, 0))
+        told = told if basis is None else basis.mT @ told @ basis
         scale = S.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt().unsqueeze(-1)
         L, failed = torch.linalg.cholesky_ex(S * scale * scale.mT)
         part = torch.cholesky_solve(told * scale * scale.mT, L).diagonal(dim1=-2, dim2=-1).sum(-1)
         return torch.where(failed == 0, part, 0.0)
-
-    def restraint_along_basis(self, of_points: Tensor) -> Tensor:
-        """A matrix of the free points' displacements `(P, 3 N, 3 N)` for all free shared parameters `(P, q, q)`."""
-        few = self.task.parameters.few
-        whole = torch.nn.functional.pad(of_points, (few, 0, few, 0))
-        return whole if self.task.basis is None else self.task.basis.mT @ whole @ self.task.basis
 
     def plain_covariance(self) -> Covariance:
         """The covariance for least squares, whatever the loss and the objective: what verdicts go by."""
@@ -116,7 +114,7 @@ class Fit:
             **self.frame(),
         )
 
-    def frame(self) -> dict[str, Tensor]:
+    def frame(self) -> dict[str, Any]:
         """What `covariance` is to know of free points: what fixes their frame, and which of them nothing tells."""
         if self.task.restraint is None:
             return {}

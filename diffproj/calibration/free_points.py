@@ -45,6 +45,7 @@ def with_free_points(flat: Fit, data: Data, options: Options, prior: Prior | Non
     iterations, noise = flat.solution.iterations, torch.ones_like(shared[:, 0])
     if printed is not None and data.weights is None:
         noise = flat.residual_variance().nan_to_num(1.0)
+    found = flat
     for _ in range(MAX_ROUNDS):
         if printed is not None:
             task = replace(task, printed=printed * noise.unsqueeze(-1))

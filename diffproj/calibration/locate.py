@@ -2,7 +2,7 @@
 
 import warnings
 from dataclasses import replace
-from typing import Unpack
+from typing import Any, Unpack
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -17,8 +17,8 @@ from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.mismatch import CameraMismatchWarning, described
 from diffproj.calibration.options import LocateOptions, locate_options
 from diffproj.calibration.outcome import outcome
-from diffproj.calibration.result import Calibration
 from diffproj.calibration.parametrisation import POSE, Parametrisation
+from diffproj.calibration.result import Calibration
 from diffproj.calibration.solver import Equations, Solution, Status, equations_at, select
 from diffproj.calibration.task import Task
 from diffproj.geometry.camera import Camera, as_camera
@@ -114,7 +114,7 @@ def located(
     shared, (R, t), parameters = start.from_camera(camera, data, bow=False, skew=skew, with_poses=False)
     if isinstance(shaped, Calibration):
         shared, parameters = _with_shape(shared, parameters, data, shaped)
-    model = {"bow": parameters.bow, "skew": parameters.skew, "free": parameters.points > 0}
+    model: dict[str, Any] = {"bow": parameters.bow, "skew": parameters.skew, "free": parameters.points > 0}
     # Each view is a problem of its own, with a step and an end of its own, from each of its two starts.
     V = len(views)
     single = Task(

@@ -1,4 +1,4 @@
-"""A calibration with one lens: a start in closed form, refined, looked at twice, kept from folding, its target's points freed."""
+"""A calibration with one lens: a start in closed form, refined, looked at twice, kept from folding, points freed."""
 
 import torch
 

@@ -51,13 +51,13 @@ class CalibrationOptions(LocateOptions, TypedDict, total=False):
             the distance on the target in world units, through `back_project`. It lowers that on the corners it is
             given; on others it was no better in trials on real views. Take it where the loss that matters is in world
             units.
-        shape: of the target. `"flat"`, the default, has its points where the target says, all on one plane. `"bow"` fits
-            the board's bow too, a paraboloid of two parameters. `"free"` fits the place of every point, in the plane
-            and out of it: `Calibration.points` then is the target as it was printed, with its covariance. Its origin,
-            axes and size as a whole stay the target's, in the sense of least squares. That takes more views (six and
-            more), or a word on how well the target was printed: `priors={"points": 0.1}` has a standard deviation of
-            0.1 world units for each coordinate. `fixed=["points_z"]` keeps the points in the plane. Not with the plane
-            objective, for only a flat target has one plane.
+        shape: of the target. `"flat"`, the default, has its points where the target says, all on one plane. `"bow"`
+            fits the board's bow too, a paraboloid of two parameters. `"free"` fits the place of every point, in the
+            plane and out of it: `Calibration.points` then is the target as it was printed, with its covariance. Its
+            origin, axes and size as a whole stay the target's, in the sense of least squares. That takes more views
+            (six and more), or a word on how well the target was printed: `priors={"points": 0.1}` has a standard
+            deviation of 0.1 world units for each coordinate. `fixed=["points_z"]` keeps the points in the plane. Not
+            with the plane objective, for only a flat target has one plane.
         bow: `True` is `shape="bow"`, as it was called before.
         skew: fit the skew of K too, `K[0, 1]`, for sensors whose rows and columns are not at right angles. False if
             left out: it stays what it is, 0 in `calibrate`.

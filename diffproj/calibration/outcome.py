@@ -33,7 +33,7 @@ def minimised(
     local: tuple[Tensor, ...],
     reference: Tensor,
 ) -> tuple[Fit, Prior | None]:
-    """Where the solver ends from that start, and the prior with its graph; of a flat target where points are to be free.
+    """Where the solver ends from that start, and the prior with its graph; of a flat target if points are to be free.
 
     Skew that is not to be fitted is held. `reference (P, s)` is what fixed parameters keep and priors without a mean
     are about; NaN where nothing is known.

@@ -5,8 +5,8 @@ The views of a camera share
     f_x f_y c_x c_y | coefficients of the lens | skew | bow_x bow_y, or x_0 y_0 z_0 x_1 ...
 
 in pixels, without unit, in pixels, and in world units. The skew is `K[0, 1]`; it and the target's shape, its bow or the
-displacement of each of its points, are there only where they are fitted, or where K has skew that is held. Each view has a pose of its own, `(R, t)`, which moves by six numbers, in
-radians about the camera's axes and in world units:
+displacement of each of its points, are there only where they are fitted, or where K has skew that is held. Each view
+has a pose of its own, `(R, t)`, which moves by six numbers, in radians about the camera's axes and in world units:
 
     omega (3) | tau (3)        R <- exp(omega) R, t <- t + tau
 

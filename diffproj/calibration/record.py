@@ -44,7 +44,13 @@ class Recorded:
             True
         """
         lists: dict[str, Tensor | None] = {name: getattr(self, name) for name in TENSORS}
-        lists |= {"points": self.nominal, "R": self.cameras.R, "t": self.cameras.t, "pixels": self.views.pixels, "visible": self.views.visible}
+        lists |= {
+            "points": self.nominal,
+            "R": self.cameras.R,
+            "t": self.cameras.t,
+            "pixels": self.views.pixels,
+            "visible": self.views.visible,
+        }
         others = self.other_poses if self.has_alternatives else None
         return {
             "objective": self.objective,

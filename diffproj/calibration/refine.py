@@ -34,7 +34,7 @@ def refine(
             that broadcasts to `*B`, poses are found from the corners; with another that broadcasts to `(*B, V)`, its
             poses are the start, and its intrinsics are those of the first view. Where its image is turned, the camera
             that is turned itself is fitted, which sees the same (`Camera.upright`).
-        differentiable: carry gradients through the minimum: those of cameras and the target's shape with respect to the views'
+        differentiable: carry gradients through the minimum: those of cameras and the target's shape by the views'
             pixels, the target's points, the weights and tensors among the priors are those of the minimiser (implicit
             function theorem, exact Hessian). To first order.
         options: as in `calibrate`: see `CalibrationOptions`.

@@ -10,7 +10,9 @@ derivatives of the residual `projected - seen` in pixels, and the residual itsel
 
     by tau: J        by omega: q x J        by bow: (third column of R) . J  times  1 - xi^2 or 1 - eta^2
 
-Free points have no rows, for the residuals of one point depend on its own displacement alone: see `shape.py`. The order of the parameters is that of `parametrisation.py`; `bow.py` says what xi and eta are.
+Free points have no rows, for the residuals of one point depend on its own displacement alone: see `shape.py`.
+
+The order of the parameters is that of `parametrisation.py`; `bow.py` says what xi and eta are.
 """
 
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""The shape of a target whose points are free: their block of the normal equations, what fixes the frame, and the prior.
+"""The shape of a target whose points are free: their block of the normal equations, their frame, and their prior.
 
 A printed board is never quite the grid that it is taken for. With `shape="free"` each point n of the target has a
 displacement `d_n (3,)` from its nominal place, in the target's frame, that all views share. With B the derivatives of a
@@ -114,9 +114,7 @@ def restraint_of(
     return Restraint(kappa.sqrt() * G, HELD * kappa.squeeze(-1) * alone, printed, alone)
 
 
-def by_displacement(
-    by_place: Float[Tensor, "p v 3 k n"], R: Float[Tensor, "p v 3 3"]
-) -> Float[Tensor, "p v 3 k n"]:
+def by_displacement(by_place: Float[Tensor, "p v 3 k n"], R: Float[Tensor, "p v 3 3"]) -> Float[Tensor, "p v 3 k n"]:
     """Derivatives of residuals by the displacements, from those by the corners' places in the camera's frame."""
     turned = R.mT @ by_place.flatten(-2)
     return turned.unflatten(-1, by_place.shape[-2:])
@@ -132,7 +130,9 @@ def bordered(
     """Normal equations with the displacements of N points behind the s other shared unknowns.
 
     Args:
-        U, E, g: the blocks of the other unknowns: see `solver.py`.
+        U: of the other unknowns `(P, s, s)`; see `solver.py`.
+        E: `(P, V, s, l)`.
+        g: `(P, s)`.
         panel: weighted rows of the shared unknowns, the local ones and the residual, r = s + l + 1.
         by_point: weighted derivatives by the displacements, in the place of a point's own residuals.
 

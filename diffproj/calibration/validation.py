@@ -146,8 +146,8 @@ def bootstrap(
         options: as `calibrate` takes them, except `weights`, which count here how often a view was drawn.
 
     Returns:
-        The standard deviations by parameter name, as in `Covariance.deviations` but for free points. Draws that did not converge are left
-        out.
+        The standard deviations by parameter name, as in `Covariance.deviations` but for free points. Draws that did
+        not converge are left out.
 
     Raises:
         TypeError: views are no `dp.Views`, draws or seed no whole numbers, or an option is unknown or of another type.

@@ -226,7 +226,9 @@ def _too_few_for_a_shape(task: Task) -> Tensor:
 def _shapeless(lacking: list[str], points: bool, views: int) -> str:
     """What is to be said where the points of the target are free."""
     lacking = [*lacking, *(["the places of the target's points"] if points else [])]
-    what = f"{views} views do not determine {', '.join(lacking)}" if lacking else "there are fewer corners than parameters"
+    what = (
+        f"{views} views do not determine {', '.join(lacking)}" if lacking else "there are fewer corners than parameters"
+    )
     return (
         f"{what} together with its shape: take {FEWEST_FOR_A_SHAPE} and more that differ, tilted by 20 to 50 degrees "
         "about both axes; or say how well the target was printed, such as priors={'points': 0.1}; or take shape='flat'"

@@ -5,10 +5,10 @@ import functools
 from pathlib import Path
 from typing import get_args
 
+from diffproj.calibration.shape import Shape
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import add_orientation, board_size, camera_file, some_path
 from diffproj.cli.units import square_side
-from diffproj.calibration.shape import Shape
 from diffproj.lens.names import LensModel
 
 DESCRIPTION = """\

@@ -81,7 +81,9 @@ def _views_table(calibration: Calibration) -> Table:
 def _parameters_table(calibration: Calibration) -> Table:
     names = calibration.parameters.few_names
     known = calibration.covariance.deviations
-    pairs = [rounded(value, float(known[name])) for name, value in zip(names, calibration.shared.tolist(), strict=False)]
+    pairs = [
+        rounded(value, float(known[name])) for name, value in zip(names, calibration.shared.tolist(), strict=False)
+    ]
     table = Table(title="Camera", title_justify="left")
     table.add_column("parameter")
     table.add_column("value", no_wrap=True)

@@ -294,6 +294,7 @@ def _calibration(t: Things) -> dict[str, Call]:
     }
     more = {
         "objective": "image",
+        "shape": "flat",
         "bow": False,
         "skew": False,
         "fixed": ("principal_point",),
@@ -307,7 +308,7 @@ def _calibration(t: Things) -> dict[str, Call]:
     return {
         "calibrate": Call(dp.calibrate, {**on, "distortion": "none", **options, **more}, 6),
         "refine": Call(dp.refine, {**on, "camera": rough, "differentiable": True, **options, **more}, 6),
-        "locate": Call(dp.locate, {**on, "camera": k, **options}, 4),
+        "locate": Call(dp.locate, {**on, "camera": k, "same_target": True, **options}, 4),
         "cross_validate": Call(dp.cross_validate, {**on, "distortion": "none", "folds": 2, **held}, 1),
         "bootstrap": Call(dp.bootstrap, {**on, "distortion": "none", "draws": 3, "seed": 0, "fixed": held["fixed"]}, 1),
         "Covariance.between": Call(k.covariance.between, {"view": 0, "other": 1}),
@@ -316,7 +317,14 @@ def _calibration(t: Things) -> dict[str, Call]:
         "Covariance.following": Call(k.covariance.following, {"known": k.covariance}),
         "run_experiment": Call(
             dp.run_experiment,
-            {"fit": t.views[:3], "test": t.views[3:], "board": t.board, "distortion": "none", "strict": False},
+            {
+                "fit": t.views[:3],
+                "test": t.views[3:],
+                "board": t.board,
+                "distortion": "none",
+                "strict": False,
+                "shape": "flat",
+            },
             1,
         ),
     }
@@ -347,6 +355,9 @@ def _measurement(t: Things) -> dict[str, Call]:
         ),
         "figures.accuracy": Call(dp.figures.accuracy, {"found": t.accuracy, "unit": "mm"}, 0.1),
         "figures.corners": Call(dp.figures.corners, {"calibration": k}, 0.1),
+        "figures.target_shape": Call(
+            dp.figures.target_shape, {"calibration": dp.calibrate(t.views, t.board, "none", shape="bow")}, 0.1
+        ),
         "figures.fig7": Call(dp.figures.fig7, {"experiment": t.experiment, "magnification": 2.0}, 0.1),
     }
 
