@@ -267,6 +267,7 @@ def covariance(
     dispersion: Tensor | None = None,
     shares: Tensor | None = None,
     frame: Tensor | None = None,
+    printed: Tensor | None = None,
     unseen: Tensor | None = None,
 ) -> Covariance:
     """The covariance of P calibrations, from their normal equations.
@@ -281,6 +282,7 @@ def covariance(
         dispersion: factor on the covariance of the scores `(P,)`; 1 if left out.
         shares: how much each view counts `(P, V)`; 1 if left out. U holds them, the blocks of the views do not.
         frame: that part of U which is no measurement but a choice, of the frame of free points `(P, s, s)`.
+        printed: that part of U which says how well the target was printed, in the unit of the weights `(P, s, s)`.
         unseen: shared parameters that nothing tells `(P, s)`, held by the frame.
     """
     dispersion = torch.ones_like(equations.U[:, 0, 0]) if dispersion is None else dispersion
@@ -291,6 +293,7 @@ def covariance(
         T = basis.mT
         size = (T @ equations.U @ basis).diagonal(dim1=-2, dim2=-1)
         precision, frame = (None if part is None else T @ part @ basis for part in (precision, frame))
+        printed = None if printed is None else T @ printed @ basis
         if scores is not None:
             scores = Scores(T.unsqueeze(1) @ scores.U @ basis.unsqueeze(1), T.unsqueeze(1) @ scores.E, scores.W)
     share = torch.ones_like(F[..., :1, :1]) if shares is None else shares[..., None, None]
@@ -298,7 +301,9 @@ def covariance(
     prior = torch.zeros_like(S) if precision is None else precision
     if scores is None:
         v = variance[:, None, None] * phi
-        middle = v * (S - prior if frame is None else S - prior - frame) + prior
+        middle = v * (S - prior) + prior
+        if frame is not None and printed is not None:
+            middle = middle - v * (frame + printed) + variance[:, None, None] * printed
         mixed = torch.zeros_like(F.mT)
         alone = v.unsqueeze(1) * inverse_W
     else:

@@ -120,7 +120,9 @@ class Fit:
             return {}
         few = self.task.parameters.few
         unknown = torch.nn.functional.pad(self.task.restraint.unknown, (few, 0))
-        return {"frame": torch.nn.functional.pad(self.task.restraint.frame, (few, 0, few, 0)), "unseen": unknown}
+        parts = {"frame": self.task.restraint.frame, "printed": torch.diag_embed(self.task.restraint.printed)}
+        wide = {name: torch.nn.functional.pad(part, (few, 0, few, 0)) for name, part in parts.items()}
+        return {**wide, "unseen": unknown}
 
     def measured_precision(self) -> Tensor | None:
         """That part of the prior's precision which stands for a measurement `(P, s, s)`; the rest only restrains."""

@@ -184,6 +184,7 @@ def test_errors_of_camera_and_points_are_what_their_covariance_says(case: str) -
     assert float(found.covariance.dispersion.mean()) < 1.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [False, True])
 def test_a_prior_of_the_print_counts_as_much_as_it_should(known: bool) -> None:
     """Prints of which each is off by 0.1 mm, four views each: too few for the points alone."""
@@ -259,7 +260,7 @@ def test_points_that_hardly_any_view_shows_stay_where_they_should_be() -> None:
     assert found.points_deviation[[2, 4]].isfinite().all()
     assert "2 points are not told by the views" in found.summary()
     known = dp.calibrate(dp.Views(views.pixels, visible, size=views.size), BOARD, shape="free", priors={"points": 0.1})
-    assert (known.points_deviation[3] - 0.1).abs().amax() < 0.05  # what the prior says, times the views' contradiction
+    assert (known.points_deviation[3] - 0.1).abs().amax() < 1e-3  # what the prior says
 
 
 # ------------------------------------------------------------------------------------------------- the bundled cameras
@@ -276,6 +277,7 @@ def test_held_out_errors_of_the_bundled_cameras(side: str, rms: float, px: float
     assert found.fits.points.shape == (5, 54, 3)  # each of its own views alone
 
 
+@pytest.mark.slow
 def test_held_out_views_have_no_part_in_the_shape() -> None:
     """The shape of a fold is to the bit that of a calibration without its views."""
     views = dp.example_views("left")
@@ -337,6 +339,7 @@ def test_measured_with_camera_and_pose_alone() -> None:
     assert abs(float(lengths[1].value[0]) - between) < 3 * float(lengths[1].deviation[0])
 
 
+@pytest.mark.slow
 def test_length_on_a_printed_board_is_as_sure_as_it_says() -> None:
     """Between points of the plane, by 60 cameras that calibrated on 60 prints, against the truth."""
     cameras, many = scene(10), 60
@@ -391,12 +394,14 @@ def test_told_in_words_and_drawn() -> None:
         dp.figures.target_shape(flat)
 
 
+@pytest.mark.slow
 def test_the_lens_may_be_chosen_along() -> None:
     found = dp.calibrate(dp.example_views("left"), BOARD, "auto", shape="free")
     assert found.comparison is not None
     assert found.shape == "free"
 
 
+@pytest.mark.slow
 def test_outliers_are_found_against_the_shape() -> None:
     views = dp.example_views("left")
     pixels = views.pixels.clone()
