@@ -15,7 +15,6 @@ from diffproj.calibration.bow import bowed
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.parametrisation import POSE, moved
-from diffproj.calibration.shape import restraint_of
 from diffproj.calibration.solver import Prior
 from diffproj.calibration.task import Task
 from diffproj.targets.residuals import projected_minus_seen, put_back_minus_known
@@ -108,8 +107,7 @@ def _block_diagonal(blocks: Tensor) -> Tensor:
 
 def _restraining(task: Task, points: Tensor, found: Fit) -> Tensor:
     """The gradient `(P, 3 N)` of what restrains free points, whose frame follows the target's points `(N, 3)`."""
-    counts = task.pixels.new_ones(task.used.shape)
-    held = restraint_of(points, task.pixels, task.used, counts, task.printed)
+    held = task.restraint_at(points)
     moves = found.displacements().flatten(1)
     return (held.frame @ moves.unsqueeze(-1)).squeeze(-1) + held.printed * moves
 

@@ -82,11 +82,13 @@ class Task:
     @cached_property
     def restraint(self) -> Restraint | None:
         """What fixes the frame of free points and how well they were printed; `None` where none are free."""
-        if not self.moves_points:
-            return None
+        return self.restraint_at(self.points) if self.moves_points else None
+
+    def restraint_at(self, points: Tensor) -> Restraint:
+        """The same for other points of the target `(N, 3)`, differentiable by them."""
         counts = self.pixels.new_ones(self.used.shape) if self.weights is None else self.weights
         counts = counts if self.shares is None else counts * self.shares.unsqueeze(-1)
-        return restraint_of(self.points, self.pixels, self.used, counts, self.printed)
+        return restraint_of(points, self.pixels, self.used, counts, self.printed)
 
     @property
     def whole_prior(self) -> Prior | None:
