@@ -1,6 +1,7 @@
 """Figures, drawn with matplotlib without a display.
 
-The paper's Fig. 7, accuracy over the image, what a calibration saw, and what was measured in a photograph.
+The paper's Fig. 7, accuracy over the image, what a calibration saw, the shape of its target, and what was measured in
+a photograph.
 """
 
 import io
@@ -21,6 +22,7 @@ from diffproj._core.arguments import instance, number
 from diffproj.calibration.result import Calibration, as_calibration
 from diffproj.measurement.accuracy_map import AccuracyMap
 from diffproj.paper.experiment import Experiment
+from diffproj.shape_figure import target_shape as target_shape
 
 EXACT, APPROXIMATED, ERROR = "#8a8f98", "#0b6bcb", "#d6336c"
 HATCH = (1.0, 1.0, 1.0, 0.45)

@@ -28,8 +28,8 @@ def calibrate(
         views: corners `(*B, V, N, 2)` seen in photographs of known size. Views may miss any corners; one with fewer
             than 4 takes no part. Views that show the board alike count as one, and at least two must differ, unless
             `fixed` or `priors` hold the principal point and the lens.
-        target: a board such as `Chessboard`, `Landmarks`, or anything with `.points (N, 3)`; its unit is the world's. Of
-            a `CircleGrid`, `Calibration.views` holds where the circles' centres are seen, not their images' middles.
+        target: a board such as `Chessboard`, `Landmarks`, or anything with `.points (N, 3)`; its unit is the world's.
+            Of a `CircleGrid`, `Calibration.views` holds where the centres are seen, not their images' middles.
         distortion: which lens to fit: `"none"`, `"brown4"`, `"brown5"`, `"brown8"`, `"brown12"`, `"brown14"` or
             `"fisheye"`. Or `"auto"`, for one camera: all of them but the longest are fitted side by side and compared
             by their errors on corners held out; the simplest that is no worse than the best, as far as the views can

@@ -92,7 +92,7 @@ def cross_validate(
 
     The pose of a held-out view is estimated from every second corner and evaluated on the others, then with the roles
     exchanged, so that no corner is evaluated with a pose that it contributed to. (A view with fewer than 4 such corners
-    is not evaluated.)
+    is not evaluated.) A target's shape is that of the views of the fit alone.
 
     Args:
         views: corners `(V, N, 2)` of one camera; view i is left out of fit i mod k.
@@ -103,7 +103,7 @@ def cross_validate(
 
     Raises:
         TypeError: views are no `dp.Views`, folds no whole number, or an option is unknown or of another type.
-        ValueError: fewer views than folds, fewer than 2 folds, more than one camera, or `bow`.
+        ValueError: fewer views than folds, fewer than 2 folds, or more than one camera.
         CalibrationError: a refit did not converge.
 
     Example:
@@ -115,8 +115,6 @@ def cross_validate(
     _check_views(views)
     _check_lens(distortion)
     chosen = calibration_options("cross_validate", options)
-    if chosen.bow:
-        raise ValueError("bow: want False, for held-out views are located on a flat board")
     want = f"a whole number from 2 to the number of views, {len(views)}"
     folds = whole_number("folds", folds, want, least=2, most=len(views))
     views = _with_true_centres(views, target, distortion, chosen, "cross_validate")
@@ -151,8 +149,8 @@ def bootstrap(
         options: as `calibrate` takes them, except `weights`, which count here how often a view was drawn.
 
     Returns:
-        The standard deviations by parameter name, as in `Covariance.deviations`. Draws that did not converge are left
-        out.
+        The standard deviations by parameter name, as in `Covariance.deviations` but for free points. Draws that did
+        not converge are left out.
 
     Raises:
         TypeError: views are no `dp.Views`, draws or seed no whole numbers, or an option is unknown or of another type.
@@ -187,7 +185,8 @@ def bootstrap(
     kept = found.converged
     if int(kept.sum()) < max(2, draws // 2):
         raise CalibrationError(f"bootstrap: {int(kept.sum())} of {draws} draws determine the camera; add views", found)
-    return dict(zip(found.parameters.names, found.shared[kept].std(0).unbind(), strict=True))
+    names, spread = found.parameters.few_names, found.shared[kept].std(0)
+    return dict(zip(names, spread[: len(names)].unbind(), strict=True))
 
 
 def _check_views(views: Views) -> None:

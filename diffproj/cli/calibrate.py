@@ -5,6 +5,7 @@ import functools
 from pathlib import Path
 from typing import get_args
 
+from diffproj.calibration.shape import Shape
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import add_orientation, camera_file, some_path
 from diffproj.cli.which_board import add_kinds, add_measures, check_board
@@ -54,10 +55,13 @@ def add_options(command: argparse.ArgumentParser) -> None:
     add_kinds(board.add_mutually_exclusive_group(required=True))
     add_measures(board)
     board.add_argument(
-        "--bow",
-        action="store_true",
-        help="the board may be bent a little: fit how far its middle stands off its edges, too",
+        "--shape",
+        choices=get_args(Shape),
+        default="flat",
+        help="of the print: flat, as it was designed; bow, bent a little: fit how far its middle stands off its edges, "
+        "too; free: fit where each corner is, too, which takes six views and more (default: flat)",
     )
+    board.add_argument("--bow", action="store_const", const="bow", dest="shape", help="the same as --shape bow")
     lens = command.add_argument_group("the camera")
     lens.add_argument(
         "--distortion",

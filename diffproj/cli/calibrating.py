@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> int:
             views,
             board,
             options.distortion,
-            bow=options.bow,
+            shape=options.shape,
             skew=options.skew,
             reject_outliers=options.reject_outliers,
             progress=lambda done, total: bars.update(task, completed=done, total=total),
@@ -78,15 +78,22 @@ def _views_table(calibration: Calibration) -> Table:
 
 
 def _parameters_table(calibration: Calibration) -> Table:
-    values = calibration.shared.tolist()
+    names = calibration.parameters.few_names
     known = calibration.covariance.deviations
-    pairs = [rounded(value, float(deviation)) for value, deviation in zip(values, known.values(), strict=True)]
+    pairs = [
+        rounded(value, float(known[name])) for name, value in zip(names, calibration.shared.tolist(), strict=False)
+    ]
     table = Table(title="Camera", title_justify="left")
     table.add_column("parameter")
     table.add_column("value", no_wrap=True)
     table.add_column("standard deviation", no_wrap=True)
-    for name, *pair in zip(known, *(aligned(column) for column in zip(*pairs, strict=True)), strict=True):
+    for name, *pair in zip(names, *(aligned(column) for column in zip(*pairs, strict=True)), strict=True):
         table.add_row(_title(name, calibration.unit), *pair)
+    if calibration.displacements is not None:
+        off, sure = (part.square().mean(0).sqrt() for part in (calibration.displacements, calibration.points_deviation))
+        for axis, *pair in zip("xyz", off.tolist(), sure.tolist(), strict=True):
+            title = f"board's corners off the grid along {axis} (RMS), {calibration.unit or 'unit of --square'}"
+            table.add_row(title, *rounded(*pair))
     return table
 
 

@@ -333,6 +333,7 @@ def _calibration(t: Things) -> dict[str, Call]:
     }
     more = {
         "objective": "image",
+        "shape": "flat",
         "bow": False,
         "skew": False,
         "fixed": ("principal_point",),
@@ -346,7 +347,7 @@ def _calibration(t: Things) -> dict[str, Call]:
     return {
         "calibrate": Call(dp.calibrate, {**on, "distortion": "none", **options, **more}, 6),
         "refine": Call(dp.refine, {**on, "camera": rough, "differentiable": True, **options, **more}, 6),
-        "locate": Call(dp.locate, {**on, "camera": k, **options, "reject_outliers": 5.0}, 4),
+        "locate": Call(dp.locate, {**on, "camera": k, **options, "reject_outliers": 5.0, "same_target": True}, 4),
         "locate landmarks": Call(
             dp.locate,
             {
@@ -367,7 +368,14 @@ def _calibration(t: Things) -> dict[str, Call]:
         **_evidence(),
         "run_experiment": Call(
             dp.run_experiment,
-            {"fit": t.views[:3], "test": t.views[3:], "board": t.board, "distortion": "none", "strict": False},
+            {
+                "fit": t.views[:3],
+                "test": t.views[3:],
+                "board": t.board,
+                "distortion": "none",
+                "strict": False,
+                "shape": "flat",
+            },
             1,
         ),
     }
@@ -458,6 +466,9 @@ def _measurement(t: Things) -> dict[str, Call]:
         ),
         "figures.accuracy": Call(dp.figures.accuracy, {"found": t.accuracy, "unit": "mm"}, 0.1),
         "figures.corners": Call(dp.figures.corners, {"calibration": k}, 0.1),
+        "figures.target_shape": Call(
+            dp.figures.target_shape, {"calibration": dp.calibrate(t.views, t.board, "none", shape="bow")}, 0.1
+        ),
         "figures.fig7": Call(dp.figures.fig7, {"experiment": t.experiment, "magnification": 2.0}, 0.1),
     }
 
