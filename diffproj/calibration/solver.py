@@ -93,6 +93,22 @@ class Problem(Protocol):
         ...
 
 
+@runtime_checkable
+class Summed(Protocol):
+    """A problem that adds up its normal equations itself, where most of the panel would be zeros.
+
+    Its residuals' weights are its own.
+    """
+
+    def equations(self, shared: Tensor, local: LocalState, loss: Loss | None) -> "tuple[Tensor, Equations]":
+        """The cost `(P,)` and the undamped normal equations, without a prior; not finite where a residual is not."""
+        ...
+
+    def retract(self, local: LocalState, step: Tensor) -> LocalState:
+        """Move the local blocks by tangent vectors `(P, V, l)`."""
+        ...
+
+
 class Prior(NamedTuple):
     """`1/2 (x - mean)^T precision (x - mean)`: mean `(P, s)`, precision `(P, s, s)`.
 
@@ -153,7 +169,7 @@ class Solution(NamedTuple):
 
 @np.errstate(all="ignore")  # infinite and NaN reductions are handled without warnings
 def solve(
-    problem: Problem,
+    problem: Problem | Summed,
     shared: Float[Tensor, "p s"],
     local: LocalState,
     *,
@@ -312,12 +328,23 @@ class _Terms:
     """Evaluates the cost and the normal equations at a point."""
 
     def __init__(
-        self, problem: Problem, local_size: int, weights: Tensor | None, loss: Loss | None, prior: Prior | None
+        self, problem: Problem | Summed, local_size: int, weights: Tensor | None, loss: Loss | None, prior: Prior | None
     ) -> None:
         self.problem, self.local_size, self.weights, self.loss, self.prior = problem, local_size, weights, loss, prior
 
     def at(self, shared: Tensor, local: LocalState) -> tuple[Tensor, Equations]:
-        panel = self.problem.linearise(shared, local)
+        if isinstance(self.problem, Problem):
+            cost, equations = self._products(self.problem.linearise(shared, local))
+        else:
+            cost, equations = self.problem.equations(shared, local, self.loss)
+        if self.prior is not None:
+            off = shared - self.prior.mean
+            pull = _times(self.prior.precision, off)
+            cost = cost + (off * pull).sum(-1) / 2
+            equations = equations._replace(U=equations.U + self.prior.precision, g=equations.g + pull)
+        return cost, equations
+
+    def _products(self, panel: Tensor) -> tuple[Tensor, Equations]:
         robust = None
         if self.weights is not None or self.loss is not None:
             squared = panel[..., -1, :, :].square().sum(-2)
@@ -331,13 +358,10 @@ class _Terms:
         s = rows.shape[-2] - self.local_size - 1
         totals = gram[..., :s, :].sum(1)
         c = gram[..., -1, -1] / 2
-        cost = c.sum(-1) if robust is None else robust
-        U, g = totals[..., :s], totals[..., -1]
-        if self.prior is not None:
-            off = shared - self.prior.mean
-            pull = _times(self.prior.precision, off)
-            cost, U, g = cost + (off * pull).sum(-1) / 2, U + self.prior.precision, g + pull
-        return cost, Equations(U, gram[..., :s, s:-1], gram[..., s:-1, s:-1], g, gram[..., s:-1, -1], c)
+        equations = Equations(
+            totals[..., :s], gram[..., :s, s:-1], gram[..., s:-1, s:-1], totals[..., -1], gram[..., s:-1, -1], c
+        )
+        return c.sum(-1) if robust is None else robust, equations
 
 
 def _with_diagonal(matrix: Tensor, addition: Tensor) -> Tensor:

@@ -1,0 +1,157 @@
+"""What a rig's fit comes to: how it ended, the cameras at their places, and each camera as a calibration."""
+
+from collections.abc import Mapping
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.result import Calibration
+from diffproj.calibration.rig_alone import Alone
+from diffproj.calibration.rig_fit import RigFit
+from diffproj.calibration.rig_result import RigCalibration
+from diffproj.calibration.rig_uncertainty import CameraNoise, camera_noise, of_camera, plain_covariance, rig_covariance
+from diffproj.calibration.solver import Status
+from diffproj.calibration.verdict import MAX_RELATIVE_STD
+from diffproj.geometry.camera import Camera
+
+WORSE_TOGETHER = 1.5
+"""RMS of a camera in the rig over that on its own from which on a remark says so."""
+STANDS_OUT = 6.0
+"""RMS of a view over that of its camera's views, their median, from which on a remark says so."""
+
+
+def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
+    """The calibrated rig."""
+    views, names = found.views, found.views.names
+    noise = camera_noise(found)
+    joint = _Late(found, noise)
+    R, t = found.problem.cameras(found.shared)
+    cameras, calibrations = {}, {}
+    status, cause = _verdict(found, noise)
+    for c, name in enumerate(names):
+        data, kind = views.data[name], found.parameters.kinds[c]
+        own = found.shared[0, found.parameters.intrinsics(c)]
+        where = views.where[name]
+        R_v = R[c] @ found.local[0][0, where]
+        t_v = (R[c] @ found.local[1][0, where].unsqueeze(-1)).squeeze(-1) + t[c]
+        posed = kind.unpack(own, (R_v, data.in_world(R_v, t_v)))
+        size = data.views.size
+        one = kind.unpack(own, (R[c], t[c]))
+        cameras[name] = Camera.unchecked(one.K, one.R, one.t, one.distortion, size)
+        calibrations[name] = Calibration(
+            cameras[name].without_pose(),
+            Camera.unchecked(posed.K, posed.R, posed.t, posed.distortion, size),
+            data.views.to(torch.float64),
+            data.given_points.detach(),
+            found.used[name],
+            found.rejected[name],
+            torch.tensor(int(status), device=own.device),
+            torch.tensor(found.iterations, device=own.device),
+            causes=(cause,),
+            pixel_sigma=noise.pixel_variance[c].sqrt(),
+            skew=kind.skew,
+            degrees_of_freedom=noise.freedom[c],
+            _covariance=partial(_of_camera, found, joint, c),
+        )
+    lost = [name for name, one in calibrations.items() if not bool(one.rms.isfinite())]
+    if lost and status == Status.CONVERGED:
+        status, cause = Status.DEGENERATE, (
+            f"corners of {', '.join(map(repr, lost))} lie beyond the fold of the lens: fit another lens, distortion="
+        )
+    R_m, t_m = found.local[0][0], found.local[1][0]
+    return RigCalibration(
+        cameras,
+        calibrations,
+        views.moments,
+        {name: views.where[name] for name in names},
+        R_m,
+        t_m - R_m @ views.middle,
+        status,
+        found.iterations,
+        cause,
+        _covariance=joint,
+        _remarks=partial(_remarks, found, alone, status),
+    )
+
+
+class _Late:
+    """The joint covariance, computed once, when it is asked for."""
+
+    def __init__(self, found: RigFit, noise: CameraNoise) -> None:
+        self.found, self.noise = found, noise
+        self.known: Covariance | None = None
+
+    def __call__(self) -> Covariance:
+        if self.known is None:
+            self.known = rig_covariance(self.found, self.noise)
+        return self.known
+
+
+def _of_camera(found: RigFit, joint: _Late, camera: int) -> Covariance:
+    return of_camera(found, joint(), camera)
+
+
+def _verdict(found: RigFit, noise: CameraNoise) -> tuple[Status, str]:
+    status = Status(found.status)
+    if status == Status.DIVERGED:
+        return status, ""
+    if not float(noise.freedom.sum()) > 0:
+        return Status.DEGENERATE, "there are fewer corners than unknowns: add moments"
+    known = plain_covariance(found, noise)
+    unknown = known.undetermined[0].clone()
+    deviation = known.shared[0].diagonal().sqrt()
+    for c in range(len(found.views.names)):
+        own = found.parameters.intrinsics(c)
+        f = found.shared[0, own.start].abs()
+        unknown[own.start : own.start + 4] |= ~(deviation[own.start : own.start + 4] <= MAX_RELATIVE_STD * f)
+    if bool(unknown.any()):
+        lacking = [name for name, lost in zip(found.parameters.names, unknown.tolist(), strict=True) if lost]
+        return Status.DEGENERATE, (
+            f"the views do not determine {', '.join(lacking[:6])}{', ...' * (len(lacking) > 6)}: add moments that these "
+            "cameras share with others, and views with the target tilted by 20 to 50 degrees about both axes"
+        )
+    return status, ""
+
+
+def _remarks(found: RigFit, alone: Mapping[str, Alone], status: Status) -> tuple[str, ...]:
+    """What is to be known of the rig."""
+    if status != Status.CONVERGED:
+        return ()
+    views, names, said = found.views, found.views.names, []
+    for name in names:
+        moments = [views.moments[int(views.where[name][v])] for v in found.apart[name].nonzero().flatten().tolist()]
+        if moments:
+            said.append(
+                f"{name} contradicts the other cameras at {', '.join(moments)} and was left out there: was the target "
+                "turned, or the photograph of another moment?"
+            )
+    residuals = found.by_camera
+    for name in names:
+        used = found.used[name]
+        squares, count = residuals[name].square().sum((-2, -1)), used.sum(-1)
+        if alone[name].remark():
+            said.append(f"{name}, on its own: {alone[name].remark()}")
+        rms = float((squares.sum() / count.sum().clamp(min=1)).sqrt())
+        if rms > WORSE_TOGETHER * alone[name].rms and rms > 1e-6:
+            said.append(
+                f"{name} fits by {rms:.2f} px in the rig and by {alone[name].rms:.2f} px on its own: did the cameras "
+                "move against each other, or are photographs of a moment not simultaneous?"
+            )
+        each = (squares / count.clamp(min=1)).sqrt()
+        out = (count > 0) & (each > STANDS_OUT * each[count > 0].median().clamp(min=1e-6)) if bool(count.any()) else count > 0
+        if bool(out.any()):
+            moments = [views.moments[int(views.where[name][v])] for v in out.nonzero().flatten().tolist()]
+            said.append(
+                f"{name} fits badly at {', '.join(moments)} ({float(each.max()):.2f} px): leave that out, or give "
+                "reject_outliers=True"
+            )
+    seen = {name: set(views.where[name][found.used[name].any(-1)].tolist()) for name in names}
+    for name in names:
+        common = seen[name] & set().union(*(seen[other] for other in names if other != name))
+        if len(common) == 1:
+            said.append(f"one moment alone connects {name} with the other cameras: nothing checks its place")
+    return tuple(said)
+
+
