@@ -68,9 +68,7 @@ def believed(found: Contradiction) -> Tensor:
     return torch.where((spare >= 1) & factor.isfinite(), factor, 1.0)
 
 
-def _between_over_within(
-    task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor
-) -> Contradiction:
+def _between_over_within(task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor) -> Contradiction:
     """How much the views contradict each other; `redundant (P,)` are the degrees of freedom of the fit."""
     rows, residual, pull_weight, variance = _weighted(task, shared, local, redundant)
     s = shared.shape[-1]

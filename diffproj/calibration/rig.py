@@ -11,7 +11,7 @@ from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import CalibrationError
 from diffproj.calibration.rig_alone import alone, checked_cameras, lenses
 from diffproj.calibration.rig_fit import rig_fit
-from diffproj.calibration.rig_options import RigOptions, free_directions, held, held_places, rig_options
+from diffproj.calibration.rig_options import RigOptions, held, held_places, rig_options
 from diffproj.calibration.rig_outcome import rig_outcome
 from diffproj.calibration.rig_problem import RigParameters
 from diffproj.calibration.rig_result import RigCalibration
@@ -89,14 +89,13 @@ def rig_calibrated(
     own = alone(views, target, lens, known, names, chosen, who)
     seen = {name: one.seen for name, one in own.items()}
     start = rig_start(views, seen, held_places(parameters, positions, known), who)
-    basis = free_directions(parameters, positions, start.t)
     found = rig_fit(
         views,
         parameters,
         {name: one.shared for name, one in seen.items()},
         start,
         {name: one.used for name, one in seen.items()},
-        basis,
+        positions,
         chosen,
     )
     rig = rig_outcome(found, own)

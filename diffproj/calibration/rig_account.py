@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -30,10 +31,26 @@ class RigAccount(Shown):
         moments: tuple[str, ...]
         status: Status
         cause: str
-        names: tuple[str, ...]
-        rms: float
-        remarks: tuple[str, ...]
-        has_covariance: bool
+
+        @property
+        def names(self) -> tuple[str, ...]:
+            """See `RigCalibration`."""
+            ...
+
+        @property
+        def rms(self) -> float:
+            """See `RigCalibration`."""
+            ...
+
+        @cached_property
+        def remarks(self) -> tuple[str, ...]:
+            """See `RigCalibration`."""
+            ...
+
+        @property
+        def has_covariance(self) -> bool:
+            """See `RigCalibration`."""
+            ...
 
         def baseline(self, one: str, other: str) -> tuple[float, float]:
             """See `RigCalibration`."""
@@ -53,7 +70,8 @@ class RigAccount(Shown):
 
         Rotations are rotation vectors in degrees, world to camera; translations and baselines in world units.
         """
-        lines = [f"rig of {len(self.names)} cameras at {len(self.moments)} moments; the frame is that of {self.names[0]}"]
+        counts = f"{len(self.names)} cameras at {len(self.moments)} moments"
+        lines = [f"rig of {counts}; its frame is that of {self.names[0]}"]
         for name in self.names:
             one = self.calibrations[name]
             seen = int(one.used.any(-1).sum())
@@ -82,7 +100,7 @@ class RigAccount(Shown):
         length, deviation = self.baseline(self.names[0], name)
         return [
             f"  rotation {', '.join(f'{x:.4f}' for x in turn)} ± {', '.join(f'{x:.4f}' for x in degrees)} degrees",
-            f"  translation {', '.join(_rounded(x, d) for x, d in zip(camera.t.tolist(), deviations[3:], strict=True))}",
+            f"  translation {', '.join(map(_rounded, camera.t.tolist(), deviations[3:]))}",
             f"  baseline {_rounded(length, deviation)} from {self.names[0]}",
         ]
 
@@ -102,11 +120,16 @@ class RigAccount(Shown):
             if name == self.names[0]:
                 continue
             camera = self.cameras[name]
-            found |= dict(zip((f"{name}.rotation_{axis}_deg" for axis in "xyz"), rotation_vector_deg(camera), strict=True))
+            found |= dict(
+                zip((f"{name}.rotation_{axis}_deg" for axis in "xyz"), rotation_vector_deg(camera), strict=True)
+            )
             found |= dict(zip((f"{name}.t_{axis}" for axis in "xyz"), camera.t.tolist(), strict=True))
             if self.has_covariance:
                 spread = self.place_covariance(name).diagonal().clamp(min=0).sqrt().tolist()
-                found |= {f"{name}.omega_{axis}_deviation_deg": math.degrees(d) for axis, d in zip("xyz", spread[:3], strict=True)}
+                found |= {
+                    f"{name}.omega_{axis}_deviation_deg": math.degrees(d)
+                    for axis, d in zip("xyz", spread[:3], strict=True)
+                }
                 found |= {f"{name}.t_{axis}_deviation": d for axis, d in zip("xyz", spread[3:], strict=True)}
                 length, deviation = self.baseline(self.names[0], name)
                 found |= {f"{name}.baseline": length, f"{name}.baseline_deviation": deviation}

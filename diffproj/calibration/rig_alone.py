@@ -22,6 +22,7 @@ from diffproj.lens.models import LensModel, model_named, model_of
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
+
 def checked_cameras(cameras: object, names: tuple[str, ...]) -> dict[str, Camera]:
     """The cameras that are known beforehand, by name, each one camera.
 
@@ -54,7 +55,9 @@ def lenses(distortion: LensModel | Mapping[str, LensModel], names: tuple[str, ..
     Raises:
         ValueError: no such lens, or none for a camera.
     """
-    chosen = dict(distortion) if isinstance(distortion, Mapping) else dict.fromkeys(names, distortion)
+    chosen: dict[str, LensModel] = (
+        dict(distortion) if isinstance(distortion, Mapping) else dict.fromkeys(names, distortion)
+    )
     lacking = [name for name in names if name not in chosen]
     if lacking or set(chosen) - set(names):
         raise ValueError(f"distortion: want a lens for each of {', '.join(names)}, got one for {', '.join(chosen)}")
@@ -122,7 +125,7 @@ def alone(
             if not str(error).startswith("fixed:"):
                 raise
             raise ValueError(
-                f"fixed: want cameras={{{cameras[0]!r}: ...}} along with it, for of its {', '.join(held)} nothing is known"
+                f"fixed: want cameras={{{cameras[0]!r}: ...}} with it, for of its {', '.join(held)} nothing is known"
             ) from None
     return {name: found[name] for name in views.names}
 
@@ -167,8 +170,10 @@ def _calibrated(
     def filled(part: Tensor) -> Tensor:
         return torch.cat([part, part.new_zeros(most - len(part), *part.shape[1:])])
 
-    pixels, visible = (torch.stack([filled(part[0]) for part in parts]) for parts in (
-        [data.pixels for data in own], [data.views.visible.unsqueeze(0) for data in own]))
+    pixels, visible = (
+        torch.stack([filled(part[0]) for part in parts])
+        for parts in ([data.pixels for data in own], [data.views.visible.unsqueeze(0) for data in own])
+    )
     weights = None
     if any(data.weights is not None for data in own):
         ones = [data.weights if data.weights is not None else torch.ones_like(data.pixels[..., 0]) for data in own]
@@ -197,7 +202,7 @@ def _refuse(views: RigViews, name: str, target: Target, lens: LensModel, options
     weights = None if data.weights is None else data.weights[0]
     found = calibrated(data.views, target, lens, options.but(weights=weights), who)
     raise CalibrationError(
-        f"{who}: camera {name!r} on its own: {found.message}; or give its intrinsics, cameras={{{name!r}: camera}} with "
+        f"{who}: camera {name!r} on its own: {found.message}; or give its intrinsics, cameras={{{name!r}: ...}} with "
         f"fixed=({name + '.intrinsics'!r},)",
         found,
     )

@@ -1,6 +1,6 @@
 """From a rig's start to its minimum: solve, look again at views that were set apart, reject outliers, solve again."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,6 +10,8 @@ from diffproj.calibration.fit import MAX_REJECTION_ROUNDS, normal_tensors
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.options import Options
 from diffproj.calibration.parametrisation import POSE
+from diffproj.calibration.restraint import DENOMINATOR
+from diffproj.calibration.rig_options import free_directions
 from diffproj.calibration.rig_problem import RigParameters, RigProblem
 from diffproj.calibration.rig_start import RigStart
 from diffproj.calibration.rig_views import RigViews
@@ -37,6 +39,7 @@ class RigFit:
         status, iterations: of the solver.
         basis: of the free directions of the shared unknowns `(1, s, q)`, or `None` for all.
         loss: a robust loss, or `None`.
+        restrained: cameras whose terms below the line are held, for without that their lens folds.
     """
 
     views: RigViews
@@ -51,6 +54,7 @@ class RigFit:
     iterations: int
     basis: Tensor | None
     loss: Loss | None
+    restrained: tuple[str, ...] = ()
 
     @property
     def parameters(self) -> RigParameters:
@@ -74,7 +78,7 @@ def rig_fit(
     intrinsics: Mapping[str, Tensor],
     start: RigStart,
     inliers: Mapping[str, Tensor],
-    basis: Tensor | None,
+    positions: Sequence[int],
     options: Options,
 ) -> RigFit:
     """The minimum.
@@ -85,9 +89,44 @@ def rig_fit(
         intrinsics: of each camera to start from.
         start: the cameras and the target in the rig.
         inliers: corners that no camera on its own rejected `(V_c, N)`.
-        basis: of the free directions of the shared unknowns `(1, s, q)`; all if left out.
+        positions: of the shared unknowns that are held.
         options: checked.
     """
+    found = _fitted(views, parameters, intrinsics, start, inliers, positions, options)
+    below = _folding(found)
+    if below:  # two terms of a rational lens that nearly cancel: on its own, the camera's was kept from that
+        positions = sorted({*positions, *(position for one in below.values() for position in one)})
+        found = _fitted(views, parameters, intrinsics, start, inliers, positions, options)
+    return replace(found, restrained=tuple(below))
+
+
+def _folding(found: RigFit) -> dict[str, list[int]]:
+    """Where the free terms below the line stand, of the cameras whose lens folds at its corners."""
+    R, t = found.problem.cameras(found.shared)
+    free = torch.ones_like(found.shared[0]) if found.basis is None else found.basis[0].abs().sum(-1)
+    below = {}
+    for c, (name, kind) in enumerate(zip(found.views.names, found.parameters.kinds, strict=True)):
+        own, where = found.parameters.intrinsics(c), found.views.where[name]
+        terms = [own.start + kind.names.index(term) for term in DENOMINATOR if term in kind.names]
+        if not any(bool(free[i] > 0) for i in terms):
+            continue
+        R_v, t_v = R[c] @ found.local[0][0, where], found.local[1][0, where] @ R[c].T + t[c]
+        _, valid = kind.unpack(found.shared[0, own], (R_v, t_v)).project(found.views.points)
+        if bool((found.used[name] & ~valid).any()):
+            below[name] = terms
+    return below
+
+
+def _fitted(
+    views: RigViews,
+    parameters: RigParameters,
+    intrinsics: Mapping[str, Tensor],
+    start: RigStart,
+    inliers: Mapping[str, Tensor],
+    positions: Sequence[int],
+    options: Options,
+) -> RigFit:
+    basis = free_directions(parameters, positions, start.t)
     shared = start.t.new_zeros(1, parameters.size)
     for c, name in enumerate(views.names):
         shared[0, parameters.intrinsics(c)] = intrinsics[name]

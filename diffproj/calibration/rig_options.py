@@ -78,7 +78,9 @@ def held(parameters: RigParameters, fixed: Sequence[str]) -> tuple[dict[str, tup
             if owner not in (None, camera):
                 continue
             if what == ("rig" if owner is None else "pose"):
-                positions |= set(range(parameters.pose(number).start, parameters.pose(number).stop)) if number else set()
+                positions |= (
+                    set(range(parameters.pose(number).start, parameters.pose(number).stop)) if number else set()
+                )
                 found = True
                 continue
             own = range(kind.size) if what == "intrinsics" else _positions(kind, what)
@@ -90,7 +92,9 @@ def held(parameters: RigParameters, fixed: Sequence[str]) -> tuple[dict[str, tup
             raise ValueError(
                 f"fixed: want names from {offered}, or one camera's, as {parameters.cameras[-1]}.pose, got {entry!r}"
             )
-    return {camera: tuple(own) for camera, own in names.items()}, sorted(positions)
+    kinds = dict(zip(parameters.cameras, parameters.kinds, strict=True))
+    ordered = {camera: tuple(name for name in kinds[camera].names if name in own) for camera, own in names.items()}
+    return ordered, sorted(positions)
 
 
 def held_places(

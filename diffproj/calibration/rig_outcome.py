@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from functools import partial
 
 import torch
-from torch import Tensor
 
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.result import Calibration
@@ -16,6 +15,8 @@ from diffproj.calibration.solver import Status
 from diffproj.calibration.verdict import MAX_RELATIVE_STD
 from diffproj.geometry.camera import Camera
 
+FAR_WORSE, FAR_OFF = 10.0, 0.002
+"""RMS of a camera over that on its own, and over the image's extent, beyond both of which there is no rig."""
 WORSE_TOGETHER = 1.5
 """RMS of a camera in the rig over that on its own from which on a remark says so."""
 STANDS_OUT = 6.0
@@ -29,7 +30,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
     joint = _Late(found, noise)
     R, t = found.problem.cameras(found.shared)
     cameras, calibrations = {}, {}
-    status, cause = _verdict(found, noise)
+    status, cause = _verdict(found, noise, alone)
     for c, name in enumerate(names):
         data, kind = views.data[name], found.parameters.kinds[c]
         own = found.shared[0, found.parameters.intrinsics(c)]
@@ -57,8 +58,12 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
         )
     lost = [name for name, one in calibrations.items() if not bool(one.rms.isfinite())]
     if lost and status == Status.CONVERGED:
-        status, cause = Status.DEGENERATE, (
-            f"corners of {', '.join(map(repr, lost))} lie beyond the fold of the lens: fit another lens, distortion="
+        status, cause = (
+            Status.DEGENERATE,
+            (
+                f"corners of {', '.join(map(repr, lost))} lie beyond the fold of the lens: fit one with fewer "
+                "coefficients, or 'fisheye'"
+            ),
         )
     R_m, t_m = found.local[0][0], found.local[1][0]
     return RigCalibration(
@@ -93,10 +98,21 @@ def _of_camera(found: RigFit, joint: _Late, camera: int) -> Covariance:
     return of_camera(found, joint(), camera)
 
 
-def _verdict(found: RigFit, noise: CameraNoise) -> tuple[Status, str]:
+def _verdict(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone]) -> tuple[Status, str]:
     status = Status(found.status)
     if status == Status.DIVERGED:
         return status, ""
+    worse = []
+    for name, residual in found.by_camera.items():
+        rms = float((residual.square().sum() / found.used[name].sum().clamp(min=1)).sqrt())
+        extent = float(found.views.data[name].pixels.amax())
+        if not rms <= max(FAR_WORSE * alone[name].rms, FAR_OFF * extent):
+            worse.append(f"{name} by {rms:.1f} px, on its own by {alone[name].rms:.2f}")
+    if worse:
+        return Status.DEGENERATE, (
+            f"no rig explains what the cameras see ({'; '.join(worse)}): do the moments fit together (moments=), did "
+            "the cameras stand still, and are the corners numbered from the same end?"
+        )
     if not float(noise.freedom.sum()) > 0:
         return Status.DEGENERATE, "there are fewer corners than unknowns: add moments"
     known = plain_covariance(found, noise)
@@ -109,8 +125,8 @@ def _verdict(found: RigFit, noise: CameraNoise) -> tuple[Status, str]:
     if bool(unknown.any()):
         lacking = [name for name, lost in zip(found.parameters.names, unknown.tolist(), strict=True) if lost]
         return Status.DEGENERATE, (
-            f"the views do not determine {', '.join(lacking[:6])}{', ...' * (len(lacking) > 6)}: add moments that these "
-            "cameras share with others, and views with the target tilted by 20 to 50 degrees about both axes"
+            f"the views do not determine {', '.join(lacking[:6])}{', ...' * (len(lacking) > 6)}: add moments that "
+            "these cameras share with others, and views with the target tilted by 20 to 50 degrees about both axes"
         )
     return status, ""
 
@@ -124,9 +140,11 @@ def _remarks(found: RigFit, alone: Mapping[str, Alone], status: Status) -> tuple
         moments = [views.moments[int(views.where[name][v])] for v in found.apart[name].nonzero().flatten().tolist()]
         if moments:
             said.append(
-                f"{name} contradicts the other cameras at {', '.join(moments)} and was left out there: was the target "
-                "turned, or the photograph of another moment?"
+                f"at {', '.join(moments)} {name} contradicts the other cameras and was left out: was the target "
+                "turned, or one of the photographs of another moment?"
             )
+    for name in found.restrained:
+        said.append(f"k4, k5 and k6 of {name} are held as on its own, for without that its lens folds inside the image")
     residuals = found.by_camera
     for name in names:
         used = found.used[name]
@@ -140,7 +158,11 @@ def _remarks(found: RigFit, alone: Mapping[str, Alone], status: Status) -> tuple
                 "move against each other, or are photographs of a moment not simultaneous?"
             )
         each = (squares / count.clamp(min=1)).sqrt()
-        out = (count > 0) & (each > STANDS_OUT * each[count > 0].median().clamp(min=1e-6)) if bool(count.any()) else count > 0
+        out = (
+            (count > 0) & (each > STANDS_OUT * each[count > 0].median().clamp(min=1e-6))
+            if bool(count.any())
+            else count > 0
+        )
         if bool(out.any()):
             moments = [views.moments[int(views.where[name][v])] for v in out.nonzero().flatten().tolist()]
             said.append(
@@ -153,5 +175,3 @@ def _remarks(found: RigFit, alone: Mapping[str, Alone], status: Status) -> tuple
         if len(common) == 1:
             said.append(f"one moment alone connects {name} with the other cameras: nothing checks its place")
     return tuple(said)
-
-

@@ -238,7 +238,9 @@ class RigProblem:
         """The derivative of each view's pose by the camera's and the moment's `(n, 6, 12)`."""
         R, _ = self.cameras(shared)
         half = torch.stack([self._pose(shared[0], c)[:3] for c in range(len(self.base))]) / 2
-        turns = (torch.eye(3, dtype=R.dtype, device=R.device) + cross_matrix(half)) / (1 + half.square().sum(-1))[:, None, None]
+        turns = (torch.eye(3, dtype=R.dtype, device=R.device) + cross_matrix(half)) / (1 + half.square().sum(-1))[
+            :, None, None
+        ]
         R_c, J = R[group.camera], turns[group.camera]
         arm = (R_c @ local[1][0, group.moment].unsqueeze(-1)).squeeze(-1)
         D = R.new_zeros(len(arm), POSE, 2 * POSE)

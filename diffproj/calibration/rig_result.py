@@ -16,7 +16,7 @@ from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.rig_account import RigAccount
 from diffproj.calibration.rig_problem import cross_matrix
-from diffproj.calibration.rig_triangulation import Triangulation, triangulated
+from diffproj.calibration.rig_triangulation import Rig, Triangulation, triangulated
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
 
@@ -46,7 +46,7 @@ class RigCalibration(RigAccount, Copied):
             whatever else takes a calibration take these.
         moments: the names of the M moments.
         where: which moment each view of a camera is of `(V,)`, by name.
-        target_R, target_t: the target in the rig at each moment, `X_rig = R X_target + t`, `(M, 3, 3)` and `(M, 3)`.
+        R_target, t_target: the target in the rig at each moment, `X_rig = R X_target + t`, `(M, 3, 3)` and `(M, 3)`.
             Where no camera saw it, they are only place holders.
         status: how it ended.
         iterations: how many steps the solver tried.
@@ -57,8 +57,8 @@ class RigCalibration(RigAccount, Copied):
     calibrations: dict[str, Calibration]
     moments: tuple[str, ...]
     where: dict[str, Int[Tensor, " _"]]
-    target_R: Float[Tensor, "m 3 3"]
-    target_t: Float[Tensor, "m 3"]
+    R_target: Float[Tensor, "m 3 3"]
+    t_target: Float[Tensor, "m 3"]
     status: Status
     iterations: int
     cause: str = ""
@@ -191,7 +191,9 @@ class RigCalibration(RigAccount, Copied):
             >>> print(f"{side:.0f} mm")
             25 mm
         """
-        return triangulated(self, pixels_by_camera, pixel_sigma)
+        columns = {name: self.parameters_of(name) for name in self.names}
+        rig = Rig(self.cameras, self.calibrations, self.covariance, columns)
+        return triangulated(rig, pixels_by_camera, pixel_sigma)
 
     def parameters_of(self, name: str) -> list[int]:
         """Where a camera's intrinsics stand among the covariance's names, then its pose, where it has one."""
@@ -206,7 +208,7 @@ class RigCalibration(RigAccount, Copied):
     def _places(self, names: tuple[str, ...]) -> Tensor:
         """What takes the shared unknowns to the poses of cameras `(6 n, s)`."""
         s = len(self.covariance.names)
-        J = self.target_t.new_zeros(POSE * len(names), s)
+        J = self.t_target.new_zeros(POSE * len(names), s)
         for number, name in enumerate(names):
             if name != self.names[0]:
                 rows = range(POSE * number, POSE * (number + 1))

@@ -10,7 +10,7 @@ so that points share the rig's errors, and each has those of its own pixels besi
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,15 +21,24 @@ from diffproj._core.copying import Copied
 from diffproj._core.numerics import check_tensor
 from diffproj._core.shown import Shown
 from diffproj._core.shown import number as shown
+from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.result import Calibration
 from diffproj.calibration.rig_problem import cross_matrix
+from diffproj.geometry.camera import Camera
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.slopes import by_direction
 
-if TYPE_CHECKING:
-    from diffproj.calibration.rig_result import RigCalibration
-
 STEPS = 12
 """Gauss-Newton steps from the point nearest to all rays; noise of pixels takes three or four."""
+
+
+class Rig(NamedTuple):
+    """What this asks of a calibrated rig: `columns` is where a camera's own stand in the covariance, by name."""
+
+    cameras: dict[str, Camera]
+    calibrations: dict[str, Calibration]
+    covariance: Covariance
+    columns: dict[str, list[int]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -84,7 +93,7 @@ class Triangulation(Shown, Copied):
         return self.to_dict()
 
 
-def triangulated(rig: "RigCalibration", pixels_by_camera: Any, pixel_sigma: Any) -> Triangulation:
+def triangulated(rig: Rig, pixels_by_camera: Any, pixel_sigma: Any) -> Triangulation:
     """What `RigCalibration.triangulate` promises."""
     pixels, sigma = _checked(rig, pixels_by_camera, pixel_sigma)
     seen = {name: uv.isfinite().all(-1) for name, uv in pixels.items()}
@@ -106,7 +115,7 @@ def triangulated(rig: "RigCalibration", pixels_by_camera: Any, pixel_sigma: Any)
     root = _root(rig)
     by_rig = X.new_zeros(len(X), 3, root.shape[-1])
     for name in pixels:
-        own = rig.parameters_of(name)
+        own = rig.columns[name]
         G = _by_parameters(rig, name, X)
         weighted = J[name].mT @ G / sigma[name] ** 2
         by_rig = by_rig - inverse @ torch.where(seen[name][:, None, None], weighted, 0.0) @ root[own]
@@ -118,16 +127,14 @@ def triangulated(rig: "RigCalibration", pixels_by_camera: Any, pixel_sigma: Any)
     return Triangulation(points, valid, covariance, left, by_rig, inverse)
 
 
-def _checked(
-    rig: "RigCalibration", pixels_by_camera: Any, pixel_sigma: Any
-) -> tuple[dict[str, Tensor], dict[str, float]]:
+def _checked(rig: Rig, pixels_by_camera: Any, pixel_sigma: Any) -> tuple[dict[str, Tensor], dict[str, float]]:
     if not isinstance(pixels_by_camera, Mapping):
         raise TypeError(
             f"pixels_by_camera: want a mapping from names of cameras to pixels (N, 2), got {called(pixels_by_camera)}"
         )
     for name in pixels_by_camera:
         if name not in rig.cameras:
-            raise ValueError(f"pixels_by_camera: want names of cameras, {', '.join(rig.names)}, got {called(name)}")
+            raise ValueError(f"pixels_by_camera: want names of cameras, {', '.join(rig.cameras)}, got {called(name)}")
     if len(pixels_by_camera) < 2:
         raise ValueError(f"pixels_by_camera: want those of at least two cameras, got {len(pixels_by_camera)}")
     pixels = {}
@@ -135,7 +142,7 @@ def _checked(
         uv = check_tensor(f"pixels_by_camera[{name!r}]", value, "N", 2)
         if uv.ndim != 2 or uv.is_meta:
             raise ValueError(f"pixels_by_camera[{name!r}]: want shape (N, 2) with values, got {tuple(uv.shape)}")
-        pixels[name] = uv.detach().to(rig.target_t)
+        pixels[name] = uv.detach().to(rig.cameras[name].t)
     counts = {name: len(uv) for name, uv in pixels.items()}
     if len(set(counts.values())) > 1:
         raise ValueError(f"pixels_by_camera: want the same points in each, NaN where one is not seen, got {counts}")
@@ -151,9 +158,11 @@ def _checked(
     return pixels, sigma
 
 
-def _nearest(rig: "RigCalibration", pixels: dict[str, Tensor], seen: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+def _nearest(rig: Rig, pixels: dict[str, Tensor], seen: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
     """The points nearest to all their rays `(N, 3)`, and where at least two rays say so."""
-    A, b, count = 0.0, 0.0, 0
+    like = next(iter(pixels.values()))
+    A, b = like.new_zeros(len(like), 3, 3), like.new_zeros(len(like), 3)
+    count = torch.zeros(len(like), dtype=torch.long, device=like.device)
     for name, uv in pixels.items():
         origin, direction, valid = rig.cameras[name].rays(torch.where(seen[name].unsqueeze(-1), uv, 0.0))
         valid = valid & seen[name]
@@ -168,7 +177,7 @@ def _nearest(rig: "RigCalibration", pixels: dict[str, Tensor], seen: dict[str, T
 
 
 def _normal(
-    rig: "RigCalibration",
+    rig: Rig,
     X: Tensor,
     pixels: dict[str, Tensor],
     seen: dict[str, Tensor],
@@ -189,13 +198,13 @@ def _normal(
     return A, b, (slopes, residuals, projected)
 
 
-def _by_camera_point(rig: "RigCalibration", name: str, X: Tensor) -> Tensor:
+def _by_camera_point(rig: Rig, name: str, X: Tensor) -> Tensor:
     """Derivatives of pixels by the point in the camera's frame `(N, 2, 3)`."""
     camera = rig.cameras[name]
     return camera.K[:2, :2] @ by_direction(camera.distortion, _directions(rig, name, X))
 
 
-def _directions(rig: "RigCalibration", name: str, X: Tensor) -> Tensor:
+def _directions(rig: Rig, name: str, X: Tensor) -> Tensor:
     camera = rig.cameras[name]
     direction = X @ camera.R.mT + camera.t
     _, valid = camera.project(X)
@@ -203,7 +212,7 @@ def _directions(rig: "RigCalibration", name: str, X: Tensor) -> Tensor:
     return torch.where(valid.unsqueeze(-1), direction, ahead)
 
 
-def _by_parameters(rig: "RigCalibration", name: str, X: Tensor) -> Tensor:
+def _by_parameters(rig: Rig, name: str, X: Tensor) -> Tensor:
     """Derivatives of pixels by a camera's intrinsics and its place in the rig `(N, 2, own)`."""
     camera, F = rig.cameras[name], rig.cameras[name].K[:2, :2].expand(len(X), 2, 2)
     direction = _directions(rig, name, X)
@@ -214,14 +223,14 @@ def _by_parameters(rig: "RigCalibration", name: str, X: Tensor) -> Tensor:
         columns.append(F @ camera.distortion.by_coefficients(direction))
     if rig.calibrations[name].skew:
         columns.append(torch.nn.functional.pad(xy[..., 1:, None], (0, 0, 0, 1)))
-    if name != rig.names[0]:
+    if name != next(iter(rig.cameras)):
         by_point = F @ by_direction(camera.distortion, direction)
         arm = direction - camera.t  # R X, which turns
         columns += [-by_point @ cross_matrix(arm), by_point]
     return torch.cat(columns, dim=-1)
 
 
-def _root(rig: "RigCalibration") -> Tensor:
+def _root(rig: Rig) -> Tensor:
     """A root of the covariance of the rig `(s, s)`."""
     sigma = rig.covariance.shared
     scale = torch.where(sigma.diagonal().isfinite(), sigma.diagonal(), 0.0).clamp(min=0).sqrt()

@@ -51,7 +51,9 @@ def camera_noise(found: RigFit) -> CameraNoise:
     of_poses = POSE * (count / count.sum(0).clamp(min=1)).sum(-1)
     free = torch.ones_like(found.shared[0]) if found.basis is None else found.basis[0].abs().sum(-1)
     parameters = found.parameters
-    own = torch.stack([free[parameters.columns(c)[: None if c else parameters.kinds[0].size]].sum() for c in range(len(names))])
+    own = torch.stack(
+        [free[parameters.columns(c)[: None if c else parameters.kinds[0].size]].sum() for c in range(len(names))]
+    )
     spare = 2 * count.sum(-1) - of_poses - own
     lost = torch.full_like(spare, torch.nan)
     rows = []
@@ -147,7 +149,9 @@ def of_camera(found: RigFit, joint: Covariance, camera: int) -> Covariance:
         follow = follow.clone()
         follow[:, :, place] -= A
     order = [*range(own.start, own.stop), *(i for i in range(s) if not own.start <= i < own.stop)]
-    names = tuple(joint.names[i].removeprefix(f"{name}.") if own.start <= i < own.stop else joint.names[i] for i in order)
+    names = tuple(
+        joint.names[i].removeprefix(f"{name}.") if own.start <= i < own.stop else joint.names[i] for i in order
+    )
     rows = torch.tensor(order, device=B.device)
     unknown = joint.undetermined_views[where]
     middle = views.middle

@@ -82,7 +82,9 @@ def rig_views(
         if views.batch_shape:
             raise ValueError(f"{label}: want those of one camera, got batch shape {tuple(views.batch_shape)}")
         if views.device != views_by_camera[names[0]].device:
-            raise ValueError(f"{label}: want device {views_by_camera[names[0]].device} as the first, got {views.device}")
+            raise ValueError(
+                f"{label}: want device {views_by_camera[names[0]].device} as the first, got {views.device}"
+            )
         try:
             data[name] = Data(views, target, (weights or {}).get(name))
         except (TypeError, ValueError) as error:
