@@ -23,6 +23,8 @@ from diffproj.calibration.rig import calibrate_rig as calibrate_rig
 from diffproj.calibration.rig_result import Baseline as Baseline
 from diffproj.calibration.rig_result import RigCalibration as RigCalibration
 from diffproj.calibration.rig_triangulation import Triangulation as Triangulation
+from diffproj.calibration.rig_validation import RigCrossValidation as RigCrossValidation
+from diffproj.calibration.rig_validation import cross_validate_rig as cross_validate_rig
 from diffproj.calibration.solver import Status as Status
 from diffproj.calibration.validation import CrossValidation as CrossValidation
 from diffproj.calibration.validation import bootstrap as bootstrap

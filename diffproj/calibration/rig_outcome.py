@@ -17,6 +17,8 @@ from diffproj.geometry.camera import Camera
 
 FAR_WORSE, FAR_OFF = 10.0, 0.002
 """RMS of a camera over that on its own, and over the image's extent, beyond both of which there is no rig."""
+UNLIKE = 2.0
+"""Ratio of the noise of two cameras, in units of their weights, from which on a remark says so."""
 WORSE_TOGETHER = 1.5
 """RMS of a camera in the rig over that on its own from which on a remark says so."""
 STANDS_OUT = 6.0
@@ -77,7 +79,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
         found.iterations,
         cause,
         _covariance=joint,
-        _remarks=partial(_remarks, found, alone, status),
+        _remarks=partial(_remarks, found, noise, alone, status),
     )
 
 
@@ -131,7 +133,7 @@ def _verdict(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone]) -> t
     return status, ""
 
 
-def _remarks(found: RigFit, alone: Mapping[str, Alone], status: Status) -> tuple[str, ...]:
+def _remarks(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone], status: Status) -> tuple[str, ...]:
     """What is to be known of the rig."""
     if status != Status.CONVERGED:
         return ()
@@ -145,6 +147,7 @@ def _remarks(found: RigFit, alone: Mapping[str, Alone], status: Status) -> tuple
             )
     for name in found.restrained:
         said.append(f"k4, k5 and k6 of {name} are held as on its own, for without that its lens folds inside the image")
+    said += _unlike(found, noise)
     residuals = found.by_camera
     for name in names:
         used = found.used[name]
@@ -175,3 +178,15 @@ def _remarks(found: RigFit, alone: Mapping[str, Alone], status: Status) -> tuple
         if len(common) == 1:
             said.append(f"one moment alone connects {name} with the other cameras: nothing checks its place")
     return tuple(said)
+
+
+def _unlike(found: RigFit, noise: CameraNoise) -> list[str]:
+    """A remark on cameras whose corners scatter unlike each other, if there are some."""
+    level = noise.variance.clamp(min=0).sqrt()
+    if not bool((level > 1e-6).all()) or float(level.amax() / level.amin()) < UNLIKE:
+        return []
+    names = found.views.names
+    sigma = dict(zip(names, noise.pixel_variance.sqrt().tolist(), strict=True))
+    weights = ", ".join(f"{name!r}: {1 / s**2:.3g}" for name, s in sigma.items())
+    told = ", ".join(f"{s:.2f} px" for s in sigma.values())
+    return [f"the corners of {', '.join(names)} scatter by {told}: weights={{{weights}}} let each count by its noise"]

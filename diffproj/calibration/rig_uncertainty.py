@@ -9,6 +9,7 @@ camera's share. With s_c the noise of camera c, and all views of a moment one gr
 phi the dispersion (`dispersion.py`): how much the moments contradict each other.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -89,7 +90,7 @@ def plain_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
 
 
 def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
-    """The joint covariance, without batch axes; poses are the target's in the rig, about its middle."""
+    """The joint covariance, without batch axes; poses are the target's in the rig."""
     problem, state = found.problem, (found.shared, found.local, None)
     _, H = problem.totals(*state, scale=noise.bend)
     _, M = problem.totals(*state, scale=(noise.variance * noise.inflation).nan_to_num(0.0), by_moment=True)
@@ -98,7 +99,8 @@ def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
     found_one = covariance(
         H, found.parameters.names, torch.ones_like(phi), basis=found.basis, scores=scores, dispersion=phi
     )
-    return reshaped(found_one, ())
+    middle = found.views.middle
+    return replace(reshaped(found_one, ()), middle=middle, _arm=found.local[0][0] @ middle)
 
 
 def _dispersion(found: RigFit, H: Equations, M: Equations) -> Tensor:
