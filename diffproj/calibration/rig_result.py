@@ -16,6 +16,7 @@ from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.rig_account import RigAccount
 from diffproj.calibration.rig_problem import cross_matrix
+from diffproj.calibration.rig_record import RigRecorded
 from diffproj.calibration.rig_triangulation import Rig, Triangulation, triangulated
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
@@ -34,7 +35,7 @@ class Baseline(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RigCalibration(RigAccount, Copied):
+class RigCalibration(RigAccount, Copied, RigRecorded):
     """Cameras at their places in a rig, with the views that they were found from.
 
     The rig's frame is that of its first camera: `X_cam = R X_rig + t`, with R the identity and t zero for the first.

@@ -29,7 +29,9 @@ def corners(true: Scene, points: torch.Tensor, noise: float = 0.0, seed: int = 0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("cameras", "moments", "chain"), [(2, 20, False), (4, 20, False), (4, 24, True), (8, 20, False)])
+@pytest.mark.parametrize(
+    ("cameras", "moments", "chain"), [(2, 20, False), (4, 20, False), (4, 24, True), (8, 20, False)]
+)
 def test_places_scatter_as_their_covariance_says(cameras: int, moments: int, chain: bool) -> None:
     trials = 40 if cameras < 8 else 12
     squares, units, focal, points = [], [], [], []
