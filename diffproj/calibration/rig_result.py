@@ -197,7 +197,13 @@ class RigCalibration(RigAccount, Copied, RigRecorded):
         return triangulated(rig, pixels_by_camera, pixel_sigma)
 
     def parameters_of(self, name: str) -> list[int]:
-        """Where a camera's intrinsics stand among the covariance's names, then its pose, where it has one."""
+        """Where a camera's intrinsics stand among the covariance's names, then its pose, where it has one.
+
+        Raises:
+            TypeError: the name is no string.
+            ValueError: there is no such camera, or the covariance is not known.
+        """
+        name = self._named("name", name)
         return [i for i, one in enumerate(self.covariance.names) if one.rpartition(".")[0] == name]
 
     @property

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj._core.arguments import called, number
+from diffproj._core.arguments import called, number, position
 from diffproj._core.copying import Copied
 from diffproj._core.numerics import check_tensor
 from diffproj._core.shown import Shown
@@ -65,13 +65,25 @@ class Triangulation(Shown, Copied):
         return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
     def between(self, i: int, j: int) -> Float[Tensor, "3 3"]:
-        """The cross-covariance of two points, `(3, 3)`; they share the rig's errors."""
+        """The cross-covariance of two points, `(3, 3)`; they share the rig's errors.
+
+        Raises:
+            TypeError: a number of a point is no whole number.
+            ValueError: there is no such point.
+        """
+        i, j = (position(name, value, len(self.points), "points") for name, value in (("i", i), ("j", j)))
         if i == j:
             return self.covariance[i]
         return self._by_rig[i] @ self._by_rig[j].mT
 
     def length(self, i: int, j: int) -> tuple[float, float]:
-        """The distance between two points and its standard deviation, in world units."""
+        """The distance between two points and its standard deviation, in world units.
+
+        Raises:
+            TypeError: a number of a point is no whole number.
+            ValueError: there is no such point.
+        """
+        i, j = (position(name, value, len(self.points), "points") for name, value in (("i", i), ("j", j)))
         apart = self.points[j] - self.points[i]
         length = apart.norm()
         along = apart / length.clamp(min=torch.finfo(length.dtype).tiny)

@@ -77,6 +77,7 @@ def cross_validate_rig(
     distortion: LensModel | Mapping[str, LensModel] = "brown5",
     folds: int = 5,
     moments: Moments | None = None,
+    cameras: Any = None,
     **options: Unpack[RigOptions],
 ) -> RigCrossValidation:
     """Refit a rig without each of k folds of its moments, and evaluate on the fold that was held out.
@@ -91,6 +92,7 @@ def cross_validate_rig(
         distortion: the lens, or one by camera.
         folds: k.
         moments: of each view, by camera, as for `calibrate_rig`.
+        cameras: known beforehand, as for `calibrate_rig`.
         options: as `calibrate_rig` takes them.
 
     Raises:
@@ -116,7 +118,7 @@ def cross_validate_rig(
     for fold in range(folds):
         out = {name: where % folds == fold for name, where in whole.where.items()}
         kept = {name: views.hiding(_every_corner(views, out[name])) for name, views in views_by_camera.items()}
-        fit = rig_calibrated(kept, target, distortion, labels, None, chosen, who)
+        fit = rig_calibrated(kept, target, distortion, labels, cameras, chosen, who)
         fits.append(fit)
         errors = _Errors()
         for one in fit.calibrations.values():

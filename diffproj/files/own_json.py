@@ -4,9 +4,9 @@
      "camera": {"dtype", "size", "K", "R", "t", "lens": {"model", "coefficients"}},
      "calibration": {"rms", "R", "t", "points", "pixels", "visible", "used", ..., "covariance", "other_poses"}}
 
-`calibration` is there only where a whole calibration was saved. A rig is of the format "diffproj rig", with `cameras` by
-name, each at its place, and all else in `rig`. Numbers are written so that they come back exactly; `null` stands for one
-that is not finite. Where a list would have thousands of numbers, they stand packed in it, as
+`calibration` is there only where a whole calibration was saved. A rig is of the format "diffproj rig", with `cameras`
+by name, each at its place, and all else in `rig`. Numbers are written so that they come back exactly; `null` stands for
+one that is not finite. Where a list would have thousands of numbers, they stand packed in it, as
 
     {"shape": [1000, 54, 2], "float64": "..."}          or "bool": base64 of little-endian numbers, row by row
 
