@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import called
+from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.constraints import held_at
 from diffproj.calibration.locate import located
 from diffproj.calibration.one_lens import calibrated
@@ -74,12 +75,14 @@ class Alone(NamedTuple):
         seen: they, and the target in each view.
         rms: RMS reprojection error in pixels.
         remark: what is to be known of it, in one text; computed when called.
+        others: the other pose of each of its views, from the target's own frame; computed when called.
     """
 
     parameters: Parametrisation
     seen: Seen
     rms: float
     remark: Callable[[], str]
+    others: Callable[[], OtherPoses]
 
 
 def alone(
@@ -157,7 +160,7 @@ def _located(
     if fixed:  # what is held stays as it was given
         shared = held_at(shared.unsqueeze(0), shared.unsqueeze(0), found.parameters, fixed)[0]
     seen = Seen(shared, R, data.about_middle(R, t), found.used)
-    return Alone(found.parameters, seen, float(found.rms), lambda: "")
+    return Alone(found.parameters, seen, float(found.rms), str, partial(_others, found))
 
 
 def _calibrated(
@@ -192,7 +195,13 @@ def _calibrated(
             own[i].about_middle(R, t),
             found.used[i, :count],
         )
-        alone[name] = Alone(found.parameters, seen, float(found.rms[i]), partial(_remark, found, i))
+        alone[name] = Alone(
+            found.parameters,
+            seen,
+            float(found.rms[i]),
+            partial(_remark, found, i),
+            partial(_others, found, (i, slice(count))),
+        )
     return alone
 
 
@@ -206,6 +215,11 @@ def _refuse(views: RigViews, name: str, target: Target, lens: LensModel, options
         f"fixed=({name + '.intrinsics'!r},)",
         found,
     )
+
+
+def _others(found: Calibration, which: tuple[int | slice, ...] = ()) -> OtherPoses:
+    others = found.other_poses
+    return OtherPoses(others.R[which], others.t[which], others.ratio[which])
 
 
 def _remark(found: Calibration, number: int) -> str:

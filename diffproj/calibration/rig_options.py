@@ -30,8 +30,8 @@ class RigOptions(TypedDict, total=False):
         max_iterations: of the solver, 300 if left out.
         tolerance: the solver stops when the predicted reduction falls below this part of the cost; 3e-14 if left out.
         progress: called as `progress(done, total)` after each step of the joint fit.
-        throw: raise where the rig did not converge, as it does if left out; if False, look at `status`. Where there is no
-            rig to look at, as with cameras that nothing connects, it is raised all the same.
+        throw: raise where the rig did not converge, as it does if left out; if False, look at `status`. Where there is
+            no rig to look at, as with cameras that nothing connects, it is raised all the same.
     """
 
     fixed: Sequence[str]

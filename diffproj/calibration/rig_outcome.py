@@ -4,7 +4,9 @@ from collections.abc import Mapping
 from functools import partial
 
 import torch
+from torch import Tensor
 
+from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.rig_alone import Alone
@@ -57,6 +59,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
             skew=kind.skew,
             degrees_of_freedom=noise.freedom[c],
             _covariance=partial(_of_camera, found, joint, c),
+            _others=partial(_others, found, alone[name], name, posed.R, posed.t),
         )
     lost = [name for name, one in calibrations.items() if not bool(one.rms.isfinite())]
     if lost and status == Status.CONVERGED:
@@ -98,6 +101,20 @@ class _Late:
 
 def _of_camera(found: RigFit, joint: _Late, camera: int) -> Covariance:
     return of_camera(found, joint(), camera)
+
+
+def _others(found: RigFit, alone: Alone, name: str, R: Tensor, t: Tensor) -> OtherPoses:
+    """The other pose of each view `(V_c,)`: none where another camera saw the target at that moment, too."""
+    views, seen = found.views, torch.zeros(len(found.views.moments), dtype=torch.long, device=R.device)
+    for other in views.names:
+        seen[views.where[other]] += found.used[other].any(-1).long()
+    others = alone.others()
+    doubtful = found.used[name].any(-1) & (seen[views.where[name]] == 1)
+    return OtherPoses(
+        torch.where(doubtful[:, None, None], others.R, R.detach()),
+        torch.where(doubtful[:, None], others.t, t.detach()),
+        torch.where(doubtful, others.ratio, torch.inf),
+    )
 
 
 def _verdict(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone]) -> tuple[Status, str]:

@@ -1,5 +1,8 @@
 """Rigs: the minimum is OpenCV's for a pair, and that from the truth for many; moments may be missing or wrong."""
 
+import copy
+import pickle
+
 import cv2
 import numpy as np
 import pytest
@@ -214,6 +217,31 @@ def test_moments_by_name_and_number(pair: dict[str, dp.Views]) -> None:
     rig = dp.calibrate_rig(few, BOARD, moments=numbers)
     assert rig.moments == ("0", "2", "5", "7", "9", "6")
     assert rig.where["right"].tolist() == [1, 2, 5, 3, 4]
+
+
+def test_the_other_pose_of_a_view_is_known_where_one_camera_alone_saw_it() -> None:
+    true = scene(2, 12, missing=0.4, seed=4)
+    rig = dp.calibrate_rig(true.views, true.board)
+    for name in rig.names:
+        one, other = rig[name], rig[next(o for o in rig.names if o != name)]
+        both = torch.isin(rig.where[name], rig.where["cam1" if name == "cam0" else "cam0"])
+        assert bool(one.likelihood_ratio[both].isinf().all())
+        alone = dp.calibrate(true.views[name], true.board)
+        assert torch.allclose(one.likelihood_ratio[~both].log(), alone.likelihood_ratio[~both].log(), atol=1e-3)
+        assert one.covariance.names[:9] == other.covariance.names[:9]
+
+
+def test_it_shows_and_copies_itself(pair: dict[str, dp.Views]) -> None:
+    rig = dp.calibrate_rig(pair, BOARD, "brown4")
+    assert repr(rig) == "RigCalibration(2 cameras, 13 moments, baseline 83.2, RMS 0.1938 px, converged)"
+    assert "<table>" in rig._repr_html_()
+    text = rig.summary()
+    assert "baseline 83.1" in text
+    assert "right: RMS" in text
+    for other in (copy.deepcopy(rig), pickle.loads(pickle.dumps(rig))):  # noqa: S301
+        assert other.to_dict() == rig.to_dict()
+    with pytest.raises(ValueError, match="left"):
+        rig["middle"]
 
 
 # ----------------------------------------------------------------------------------------------------- refusals

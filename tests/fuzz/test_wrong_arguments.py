@@ -348,7 +348,7 @@ def _calibration(t: Things) -> dict[str, Call]:
                 "fixed": ("intrinsics",),
                 "throw": False,
             },
-            0.5,
+            0.2,
         ),
         "RigCalibration.baseline": Call(t.rig.baseline, {"one": "one", "other": "two"}),
         "RigCalibration.place_covariance": Call(t.rig.place_covariance, {"name": "two"}),
