@@ -41,7 +41,10 @@ from diffproj.geometry.back_projection import ground_resolution as ground_resolu
 from diffproj.geometry.camera import Camera as Camera
 from diffproj.geometry.euler import euler_from_rotation as euler_from_rotation
 from diffproj.geometry.euler import rotation_from_euler as rotation_from_euler
+from diffproj.geometry.geodesy import degrees_from_metres as degrees_from_metres
+from diffproj.geometry.geodesy import metres_from_degrees as metres_from_degrees
 from diffproj.geometry.plane import Plane as Plane
+from diffproj.geometry.rectification import geotransform as geotransform
 from diffproj.geometry.rectification import plane_axes as plane_axes
 from diffproj.geometry.rectification import rectify as rectify
 from diffproj.geometry.rectification import render as render
@@ -51,6 +54,9 @@ from diffproj.lens.models import register_lens as register_lens
 from diffproj.lens.protocol import Lens as Lens
 from diffproj.measurement.accuracy_map import AccuracyMap as AccuracyMap
 from diffproj.measurement.choices import PixelNoiseWarning as PixelNoiseWarning
+from diffproj.measurement.fuse import CameraDisagreementWarning as CameraDisagreementWarning
+from diffproj.measurement.fuse import FusedMeasurement as FusedMeasurement
+from diffproj.measurement.fuse import fuse as fuse
 from diffproj.measurement.measure import measure as measure
 from diffproj.measurement.measurement import Measurement as Measurement
 from diffproj.measurement.quantity import Quantity as Quantity

@@ -22,8 +22,10 @@ from diffproj._core.arguments import Kind, tensor_of
 from diffproj._core.torch_private import in_forward_mode, in_functional_transform
 
 BLOCK_POINTS = 2**16
-"""Points handled at once when no derivative is asked: large enough to hide the cost of dispatch, small enough that
-the intermediate results stay in the processor's cache."""
+"""Points handled at once on a CPU when no derivative is asked: large enough to hide the cost of dispatch, small enough
+that the intermediate results stay in the processor's cache."""
+BLOCK_POINTS_ELSEWHERE = 2**23
+"""The same on a GPU: large enough that its kernels take longer than their launch, small enough for its memory."""
 
 
 # ----------------------------------------------------------------------------------------------- argument checks
@@ -210,12 +212,17 @@ def wants_derivative(*tensors: Tensor) -> bool:
     )
 
 
+def block_points(device: torch.device) -> int:
+    """How many points are handled at once where no derivative is asked."""
+    return BLOCK_POINTS if device.type == "cpu" else BLOCK_POINTS_ELSEWHERE
+
+
 def in_blocks(
     function: Callable[[Tensor], tuple[Tensor, ...]], points: Tensor, *parameters: Tensor
 ) -> tuple[Tensor, ...]:
     """Apply `function` along the points' axis, in blocks when no derivative is asked.
 
-    Fresh memory dominates long inputs: ten intermediate results of 10^7 points do not fit the cache, those of one
+    Fresh memory dominates long inputs: ten intermediate results of 10^7 points do not fit a CPU's cache, those of one
     block do. `function` must treat points independently of each other.
 
     Args:
@@ -227,7 +234,7 @@ def in_blocks(
         What `function(points)` returns.
     """
     batch = max(1, points.shape[:-2].numel())
-    length = max(1, BLOCK_POINTS // batch)
+    length = max(1, block_points(points.device) // batch)
     if wants_derivative(points, *parameters) or points.shape[-2] <= length:  # a graph is not to depend on the length
         return function(points)
     axis = points.ndim - 2

@@ -16,8 +16,9 @@ EPILOG = """\
 formats:
   The one that is read is told by the content of the file. The one that is
   written goes with the suffix: .json for diffproj's own, .yaml, .yml and .xml
-  for OpenCV's, .npz for numpy's, .txt for COLMAP's (cameras.txt, or with poses
-  images.txt). --to names another: ros, kalibr, nerfstudio, or opencv for .json.
+  for OpenCV's, .npz for numpy's, .txt and .bin for COLMAP's (cameras.txt, or
+  with poses images.txt). --to names another: ros, kalibr, nerfstudio, or
+  opencv for .json.
   Only read are kitti, nuscenes, open3d, mrcal, matlab, metashape, settings.
 
 examples:

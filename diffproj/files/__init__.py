@@ -11,7 +11,7 @@ or not at all.
 | `"json"` | `.json` | any batch of cameras; whole calibrations and rigs | yes |
 | `"opencv"` | YAML, XML, JSON of OpenCV; plain YAML, JSON | K, lens, size; R and T of a pair | a camera, a pair |
 | `"ros"` | `ost.yaml`, `ost.txt`, `.ini`, `camera_info` | raw camera by K and D; rectified one by P | one camera |
-| `"colmap"` | `cameras`, `images`: `.txt`, `.bin` | lens and size; poses in `images` | `.txt` |
+| `"colmap"` | `cameras`, `images`: `.txt`, `.bin` | lens and size; poses in `images` | `.txt`, `.bin` |
 | `"nerfstudio"` | `transforms.json`, also of instant-ngp | a camera for each frame | yes |
 | `"kalibr"` | `camchain.yaml`, EuRoC's `sensor.yaml` | a chain of cameras | yes |
 | `"numpy"` | `.npz`, `.npy` | arrays of K, lens, size, R and t | `.npz`, one camera |

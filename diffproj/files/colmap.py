@@ -4,11 +4,10 @@ The first pixel's centre is at 0.5: `c_here = c_colmap - 0.5`. Poses are world t
 models those that equal OpenCV's are read; THIN_PRISM_FISHEYE is not OpenCV's prism, FOV and others are other lenses.
 
 Of `cameras` the names are the ids, and the cameras have no pose; of `images`, the file names of the images. Saved as
-`images.txt`, a camera brings its `cameras.txt` and an empty `points3D.txt` along, which make a model that COLMAP reads.
+`images`, cameras bring their `cameras` and an empty `points3D` along, which make a model that COLMAP reads.
 """
 
 import re
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,8 @@ import numpy as np
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
 from diffproj.calibration.result import Calibration
+from diffproj.files import colmap_records
+from diffproj.files.colmap_records import MODELS, NOTICE, CameraRecord, ImageRecord
 from diffproj.files.document import Document
 from diffproj.files.found import Found, one_or_more
 from diffproj.files.lenses import brown, coefficients, first_brown, fisheye, is_fisheye
@@ -23,23 +24,7 @@ from diffproj.files.numbers import camera_of, focal_lengths, from_quaternion, im
 from diffproj.files.writing import cameras_of, has_pose
 from diffproj.geometry.camera import Camera
 
-MODELS = (
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
-)
-"""By their numbers in binary files, with their numbers of parameters."""
-
 OURS = frozenset(name for name, _ in MODELS) - {"FOV", "THIN_PRISM_FISHEYE"}
-NOTICE = "# Written by diffproj."
 _CAMERA = re.compile(r"\d+\s+[A-Z][A-Z0-9_]+(\s+[-+.\w]+)+\s*")
 _IMAGE = re.compile(r"\d+(\s+[-+.\deE]+){7}\s+\d+\s+\S.*")
 
@@ -67,51 +52,66 @@ def read(document: Document) -> Found:
     if beside is None:
         raise ValueError(f"want {name} beside it, which holds K and the lenses, got none")
     cameras, posed = _cameras(beside), {}
-    for image, pose, id_ in _images_text(document) if document.text is not None else _images_binary(document.data):
-        if id_ not in cameras:
-            raise ValueError(f"{image}: want a camera of {name}, got the id {id_}")
-        if image in posed:
-            raise ValueError(f"{image}: want each image once, got it twice")
-        intrinsic = cameras[id_]
-        posed[image] = camera_of(intrinsic.K.numpy(), intrinsic.distortion, intrinsic.size, pose)
+    for record in _images(document):
+        if record.camera not in cameras:
+            raise ValueError(f"{record.name}: want a camera of {name}, got the id {record.camera}")
+        if record.name in posed:
+            raise ValueError(f"{record.name}: want each image once, got it twice")
+        intrinsic = cameras[record.camera]
+        posed[record.name] = camera_of(intrinsic.K.numpy(), intrinsic.distortion, intrinsic.size, _pose(record))
     return one_or_more(posed, "want at least one image, got none")
 
 
-def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
-    """Cameras as `cameras.txt`, or with their poses as `images.txt`.
+def write(path: Path, item: Camera | Calibration) -> dict[Path, str] | dict[Path, bytes]:
+    """Cameras as `cameras`, or with their poses as `images`, in text or, with the suffix `.bin`, in bytes.
 
     Raises:
-        ValueError: a pose to `cameras.txt`, a lens that COLMAP does not have, no size, or files of another model that
-            would be lost.
+        ValueError: a pose to `cameras`, a lens that COLMAP does not have, no size, or files of another model that would
+            be lost.
     """
-    if path.suffix.lower() != ".txt":
-        raise ValueError("want cameras.txt or images.txt to write; COLMAP's model_converter makes .bin of them")
+    suffix = path.suffix.lower()
+    if suffix not in (".txt", ".bin"):
+        raise ValueError(f"want the suffix .txt or .bin of COLMAP's files, got {path.suffix or 'none'}")
     cameras, posed = cameras_of(item, "COLMAP"), "images" in path.stem
     if not posed and any(map(has_pose, cameras)):
         raise ValueError(
-            "want cameras without a pose, which cameras.txt does not hold; save images.txt, or without_pose()"
+            f"want cameras without a pose, which cameras{suffix} does not hold; save images{suffix}, or without_pose()"
         )
-    lines = [_line(camera) for camera in cameras]
-    known = list(dict.fromkeys(lines)) if posed else lines
-    numbered = [f"{i} {line}" for i, line in enumerate(known, 1)]
-    listed = [
-        "# Camera list with one line of data per camera:",
-        NOTICE,
-        "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
-    ]
-    text = "\n".join([*listed, *numbered]) + "\n"
+    found = [_record(camera) for camera in cameras]
+    listed = [one for i, one in enumerate(found) if not posed or one not in found[:i]]
+    numbered = [one._replace(id_=str(i)) for i, one in enumerate(listed, 1)]
+    images = []
+    for i, (camera, record) in enumerate(zip(cameras, found, strict=True)):
+        q = rotation_matrix_to_quaternion(camera.R)
+        pose = [*(q / q.norm()).tolist(), *camera.t.tolist()]
+        images.append(ImageRecord(f"{i:06d}.png", pose, str(listed.index(record) + 1)))
+    return (
+        _text_files(path, numbered, images, posed) if suffix == ".txt" else _binary_files(path, numbered, images, posed)
+    )
+
+
+def _text_files(path: Path, cameras: list[CameraRecord], images: list[ImageRecord], posed: bool) -> dict[Path, str]:
+    """`cameras.txt`, or `images.txt` with the two files beside it that make a model."""
+    text = colmap_records.cameras_to_text(cameras)
     if not posed:
         return {path: text}
     files = {path.with_name("cameras.txt"): text, path.with_name("points3D.txt"): f"# 3D point list\n{NOTICE}\n"}
     for file in files:
         if file.exists() and NOTICE not in file.read_text(encoding="utf-8", errors="replace")[:200]:
             raise ValueError(f"want a folder without the {file.name} of another model, got one; choose another folder")
-    images = ["# Image list with two lines of data per image:", NOTICE]
-    for i, (camera, line) in enumerate(zip(cameras, lines, strict=True)):
-        q = rotation_matrix_to_quaternion(camera.R)
-        parts = [*(q / q.norm()).tolist(), *camera.t.tolist()]
-        images += [f"{i + 1} {' '.join(map(repr, parts))} {known.index(line) + 1} {i:06d}.png", ""]
-    return {**files, path: "\n".join(images) + "\n"}
+    return {**files, path: colmap_records.images_to_text(images)}
+
+
+def _binary_files(path: Path, cameras: list[CameraRecord], images: list[ImageRecord], posed: bool) -> dict[Path, bytes]:
+    """The same in bytes, which have no place for a notice: nothing that is beside it is written over."""
+    data = colmap_records.cameras_to_bytes(cameras)
+    if not posed:
+        return {path: data}
+    files = {path.with_name("cameras.bin"): data, path.with_name("points3D.bin"): bytes(8)}
+    for file, content in files.items():
+        if file.exists() and file.read_bytes() != content:
+            raise ValueError(f"want a folder without the {file.name} of another model, got one; choose another folder")
+    return {**files, path: colmap_records.images_to_bytes(images)}
 
 
 def camera_from(model: str, width: Any, height: Any, parameters: list[float]) -> Camera:
@@ -146,8 +146,8 @@ def camera_from(model: str, width: Any, height: Any, parameters: list[float]) ->
     return camera_of(K, lens, size)
 
 
-def _line(camera: Camera) -> str:
-    """Model, size and parameters."""
+def _record(camera: Camera) -> CameraRecord:
+    """Model, size and parameters, without an id."""
     if camera.size is None:
         raise ValueError("size: want the size of the image, which COLMAP needs; Camera(..., size=(width, height))")
     (f_x, _, c_x), (_, f_y, c_y), _ = camera.K.tolist()
@@ -162,7 +162,7 @@ def _line(camera: Camera) -> str:
         model, parameters = "FULL_OPENCV", [*parameters, *first_brown(camera, 8, "COLMAP")]
     else:
         model, parameters = "OPENCV", [*parameters, *first_brown(camera, 4, "COLMAP")]
-    return f"{model} {camera.size[0]} {camera.size[1]} {' '.join(map(repr, parameters))}"
+    return CameraRecord("", model, *camera.size, parameters)
 
 
 def _is_images(document: Document) -> bool:
@@ -175,116 +175,24 @@ def _is_images(document: Document) -> bool:
 
 
 def _cameras(document: Document) -> dict[str, Camera]:
-    rows = _cameras_text(document.text) if document.text is not None else _cameras_binary(document.data)
+    if document.text is None:
+        records = colmap_records.cameras_from_bytes(document.data)
+    else:
+        records = colmap_records.cameras_from_text(document.text)
     cameras: dict[str, Camera] = {}
-    for id_, model, width, height, parameters in rows:
+    for id_, model, width, height, parameters in records:
         if id_ in cameras:
             raise ValueError(f"camera {id_}: want each id once, got it twice")
         cameras[id_] = camera_from(model, width, height, parameters)
     return cameras
 
 
-def _cameras_text(text: str) -> list[tuple[str, str, float, float, list[float]]]:
-    rows = []
-    for line in text.splitlines():
-        words = line.split()
-        if not words or words[0][0] == "#":
-            continue
-        if len(words) < 5 or not words[0].isdecimal():
-            raise ValueError(f"want CAMERA_ID MODEL WIDTH HEIGHT PARAMS[], got {line[:80]!r}")
-        width, height, *parameters = map(_float, words[2:])
-        rows.append((words[0], words[1], width, height, parameters))
-    return rows
+def _images(document: Document) -> list[ImageRecord]:
+    if document.text is None:
+        return colmap_records.images_from_bytes(document.data)
+    return colmap_records.images_from_text(document.text)
 
 
-def _cameras_binary(data: bytes) -> list[tuple[str, str, float, float, list[float]]]:
-    reader, rows = _Bytes(data), []
-    for _ in range(reader.count(24)):
-        id_, number_, width, height = reader.take("<IiQQ")
-        if not 0 <= number_ < len(MODELS):
-            raise ValueError(f"camera {id_}: want a model that equals OpenCV's, got the number {number_}")
-        model, count = MODELS[number_]
-        rows.append((str(id_), model, width, height, list(reader.take(f"<{count}d"))))
-    reader.check_end()
-    return rows
-
-
-Image = tuple[str, tuple[np.ndarray, np.ndarray], str]
-
-
-def _images_text(document: Document) -> list[Image]:
-    images, lines = [], iter((document.text or "").splitlines())
-    for line in lines:
-        words = line.split(maxsplit=9)
-        if not words or words[0][0] == "#":
-            continue
-        if len(words) < 10:
-            raise ValueError(f"want IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {line[:80]!r}")
-        images.append(_image(words[9], [_float(word) for word in words[1:8]], words[8]))
-        points = next(lines, "").split()
-        if len(points) % 3:
-            raise ValueError(f"{words[9]}: want the line of its points below the line of its pose, got another")
-    return images
-
-
-def _images_binary(data: bytes) -> list[Image]:
-    reader, images = _Bytes(data), []
-    for _ in range(reader.count(72)):
-        _, *pose, id_ = reader.take("<I7dI")
-        name = reader.name()
-        images.append(_image(name, pose, str(id_)))
-        reader.skip(24 * reader.count(24))
-    reader.check_end()
-    return images
-
-
-def _image(name: str, numbers: list[float], id_: str) -> Image:
-    R = from_quaternion(name, *numbers[:4])
-    return name, (R, np.array([number(name, part) for part in numbers[4:]])), id_
-
-
-def _float(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        raise ValueError(f"want numbers, got {word[:40]!r}") from None
-
-
-class _Bytes:
-    """Little-endian numbers one after the other."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data, self._at = data, 0
-
-    def take(self, form: str) -> tuple[Any, ...]:
-        """Numbers of that form; a file that ends before them is refused."""
-        try:
-            values = struct.unpack_from(form, self._data, self._at)
-        except struct.error:
-            raise ValueError(f"want a whole file, got one that ends in byte {len(self._data)}") from None
-        self._at += struct.calcsize(form)
-        return values
-
-    def count(self, least: int) -> int:
-        """How many records of at least so many bytes follow."""
-        (count,) = self.take("<Q")
-        if count * least > len(self._data):
-            raise ValueError(f"want as many records as the file has room for, got the number {count}")
-        return count
-
-    def name(self) -> str:
-        """A text that ends in a NUL."""
-        end = self._data.find(b"\0", self._at)
-        if end < 0:
-            raise ValueError("want a name that ends, got none")
-        name, self._at = self._data[self._at : end].decode("utf-8", errors="replace"), end + 1
-        return name
-
-    def skip(self, length: int) -> None:
-        """Go on behind so many bytes."""
-        self._at += length
-
-    def check_end(self) -> None:
-        """Refuse a file with more or less in it."""
-        if self._at != len(self._data):
-            raise ValueError(f"want {self._at} bytes as its records need, got {len(self._data)}")
+def _pose(record: ImageRecord) -> tuple[np.ndarray, np.ndarray]:
+    R = from_quaternion(record.name, *record.pose[:4])
+    return R, np.array([number(record.name, part) for part in record.pose[4:]])

@@ -104,6 +104,7 @@ SUFFIXES: dict[str, FormatName] = {
     ".xml": "opencv",
     ".npz": "numpy",
     ".txt": "colmap",
+    ".bin": "colmap",
 }
 """What is written under a suffix where no format is named."""
 

@@ -50,7 +50,8 @@ def read(document: Document) -> Found:
     if not structs:
         if any(isinstance(value, mat5.Unreadable) for value in fields.values()):
             raise ValueError(f"want numbers, got an object, which only MATLAB opens; there: {TO_STRUCT}")
-        raise ValueError(f"want K or IntrinsicMatrix, or Bouguet's fc and cc, got {', '.join(fields) or 'nothing'}")
+        listed = ", ".join(list(fields)[:6]) + " and more" * (len(fields) > 6)
+        raise ValueError(f"want K or IntrinsicMatrix, or Bouguet's fc and cc, got {listed or 'nothing'}")
     return Found({name or "camera": _camera(value) for name, value in structs.items()})
 
 

@@ -2,10 +2,12 @@
 
 The principal point is measured from the middle of the image, whose first pixel has its centre at 0.5:
 `c_here = side / 2 + c - 0.5`. `p1` is OpenCV's p2 and `p2` its p1; `b1` widens f_x, `b2` is skew; `k4` has no
-counterpart. A camera's `transform` is camera to chunk in OpenCV's axes; the chunk's own, with its scale, leads to the
-world. The names are the labels. Only frame sensors have these equations.
+counterpart. A camera's `transform` is camera to chunk in OpenCV's axes; that of its component, or the chunk's own where
+it has none, with its scale, leads to the world: the geocentric one where the chunk's reference is in degrees. The names
+are the labels, with the id behind where several have one label. Only frame sensors have these equations.
 """
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -50,26 +52,46 @@ def read(document: Document) -> Found:
     chunk = tree["chunk"]
     if not isinstance(chunk, dict):
         raise ValueError("chunk: want one, got several; export them one by one")
-    sensors: dict[str, Camera] = {}
-    labels: dict[str, Camera] = {}
-    for fields in _all(chunk.get("sensors"), "sensor"):
-        label = str(fields.get("label", fields.get("id")))
-        if label in labels or str(fields.get("id")) in sensors:
-            raise ValueError(f"sensor {label}: want each once, got two")
-        labels[label] = sensors[str(fields.get("id"))] = _calibrated(label, fields)
+    listed = _named(chunk.get("sensors"), "sensor")
+    if not listed:
+        raise ValueError("want sensors in the chunk, got none")
+    by_id = {str(fields["id"]): (name, fields) for name, fields in listed.items()}
+    calibrated = {name: _calibrated(name, fields) for name, fields in listed.items() if fields.get("calibration")}
     posed: dict[str, Camera] = {}
-    place = _place(chunk.get("transform"))
-    for fields in _all(chunk.get("cameras"), "camera"):
-        label = str(fields.get("label", fields.get("id")))
+    places = _Places(chunk)
+    for name, fields in _named(chunk.get("cameras"), "camera").items():
         if fields.get("transform") is None:
             continue
-        if label in posed or str(fields.get("sensor_id")) not in sensors:
-            raise ValueError(f"camera {label}: want it once, with the sensor_id of a sensor, got something else")
-        sensor = sensors[str(fields["sensor_id"])]
-        posed[label] = camera_of(sensor.K.numpy(), sensor.distortion, sensor.size, _pose(label, fields, place))
-    if not labels:
-        raise ValueError("want sensors in the chunk, got none")
-    return Found(posed, labels) if posed else Found(labels)
+        if str(fields.get("sensor_id")) not in by_id:
+            raise ValueError(f"camera {name}: want the sensor_id of a sensor, got {fields.get('sensor_id')}")
+        label, of_sensor = by_id[str(fields["sensor_id"])]
+        sensor = calibrated.get(label) or _calibrated(label, of_sensor)
+        posed[name] = camera_of(
+            sensor.K.numpy(), sensor.distortion, sensor.size, _pose(name, fields, places.of(fields))
+        )
+    if posed:
+        return Found(posed, calibrated)
+    return Found(calibrated or {name: _calibrated(name, fields) for name, fields in listed.items()})
+
+
+def _named(tree: Any, tag: str) -> dict[str, dict[str, Any]]:
+    """The elements of a tag by their labels, with their ids behind where they share one.
+
+    Raises:
+        ValueError: an element has no id, or that of another.
+    """
+    items = list(_all(tree, tag))
+    labels = [str(fields.get("label", fields.get("id"))) for fields in items]
+    shared = {label for label, count in Counter(labels).items() if count > 1}
+    named: dict[str, dict[str, Any]] = {}
+    ids: set[str] = set()
+    for fields, label in zip(items, labels, strict=True):
+        id_ = str(fields.get("id"))
+        if "id" not in fields or id_ in ids:
+            raise ValueError(f"{tag} {label}: want an id of its own, got {fields.get('id')}")
+        ids.add(id_)
+        named[f"{label} {id_}" if label in shared else label] = fields
+    return named
 
 
 def _all(tree: Any, tag: str) -> Iterator[dict[str, Any]]:
@@ -119,6 +141,19 @@ def _attribute(name: str, value: Any) -> float:
         return float(value)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: want a number, got {value!r}") from None
+
+
+class _Places:
+    """Where the frames of the components of a chunk are in the world."""
+
+    def __init__(self, chunk: dict[str, Any]) -> None:
+        self._whole = _place(chunk.get("transform"))
+        components = _named(chunk.get("components"), "component").values()
+        self._parts = {str(fields["id"]): _place(fields["transform"]) for fields in components if "transform" in fields}
+
+    def of(self, camera: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, float]:
+        """Rotation, translation and scale for a camera's component; the chunk's where it has none."""
+        return self._parts.get(str(camera.get("component_id")), self._whole)
 
 
 def _place(transform: Any) -> tuple[np.ndarray, np.ndarray, float]:

@@ -15,6 +15,9 @@ from xml.etree import ElementTree
 
 import yaml
 
+METASHAPE = "document"
+"""The root of its files, where an element of one tag may follow another."""
+
 DEEPEST = 40
 """Levels of nesting that a camera file may have; those of the wild have ten."""
 
@@ -65,7 +68,8 @@ def xml_tree(text: str) -> Any:
     """The tree of an XML text; of its root, the content alone, but for its name under the key `"<root>"`.
 
     Raises:
-        ValueError: it is not XML, declares entities or a document type, or has an element twice.
+        ValueError: it is not XML, declares entities or a document type, or has an element twice that is no document of
+            Metashape, where sensors, cameras and others stand one after the other.
     """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("want XML without a document type, got one, as no camera file that is known here has")
@@ -73,7 +77,7 @@ def xml_tree(text: str) -> Any:
         root = ElementTree.fromstring(text.strip())  # noqa: S314  # no entities, as checked above
     except ElementTree.ParseError as error:
         raise ValueError(f"want XML, got something else ({error})") from None
-    tree = _xml_node(root, 0)
+    tree = _xml_node(root, 0, lists=root.tag == METASHAPE)
     return {"<root>": root.tag} | tree if isinstance(tree, dict) else {"<root>": root.tag}
 
 
@@ -139,10 +143,11 @@ def _number(text: str) -> float | int | None:
     return float(text) if _NUMBER.fullmatch(text) and not re.match(r"[-+]?0\d", text) else None
 
 
-def _xml_node(element: ElementTree.Element, depth: int) -> Any:
+def _xml_node(element: ElementTree.Element, depth: int, lists: bool) -> Any:
+    """What an element holds; with `lists`, several of one tag are a list of them."""
     if depth > DEEPEST:
         raise ValueError(f"want at most {DEEPEST} levels of nesting, got more")
-    children = [(child.tag, _xml_node(child, depth + 1)) for child in element]
+    children = [(child.tag, _xml_node(child, depth + 1, lists)) for child in element]
     attributes = list(element.attrib.items())
     if not children:
         content = _xml_text(element.text or "")
@@ -153,17 +158,11 @@ def _xml_node(element: ElementTree.Element, depth: int) -> Any:
     for tag, item in children:
         many.setdefault(tag, []).append(item)
     for tag, items in many.items():
-        if len(items) > 1 and tag not in PLURAL:
+        if len(items) > 1 and not lists:
             raise ValueError(f"{tag}: want the element once, got it {len(items)} times")
     return _without_doubles(
         [*attributes, *((tag, items if len(items) > 1 else items[0]) for tag, items in many.items())]
     )
-
-
-PLURAL = frozenset(
-    {"sensor", "camera", "group", "component", "property", "marker", "chunk", "covariance", "frame", "calibration"}
-)
-"""Elements that stand more than once in one element, in Metashape's files."""
 
 
 def _xml_text(text: str) -> Any:

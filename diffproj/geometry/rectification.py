@@ -6,6 +6,8 @@ coordinates (s, t),
     s = s_min + (j + 1/2) (s_max - s_min) / columns     t = t_min + (i + 1/2) (t_max - t_min) / rows
     X = origin + s axis_s + t axis_t
 
+With `north_up`, as maps have it, the first row is at the top instead: t falls from t_max as i grows.
+
 A pixel covers a rectangle, a square where the extent is a whole multiple of the resolution, so that areas and edges
 keep their places at any resolution. Every pixel of the target image is mapped to the source image through the camera,
 lens included. Where its footprint there is larger than a pixel, it is the mean of bilinear samples about a pixel apart,
@@ -21,8 +23,8 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from diffproj._core.arguments import called, number, numbers
-from diffproj._core.numerics import BLOCK_POINTS, broadcast_batches, check_same_kind, check_tensor
+from diffproj._core.arguments import called, flag, number, numbers
+from diffproj._core.numerics import block_points, broadcast_batches, check_same_kind, check_tensor
 from diffproj.geometry.back_projection import back_project, warn_if_rounded
 from diffproj.geometry.camera import Camera, as_camera, meeting_camera
 from diffproj.geometry.grid import checked_size, inside, pixel_grid
@@ -75,6 +77,7 @@ def rectify(
     extent: Sequence[float],
     resolution: float,
     axes: Axes | None = None,
+    north_up: bool = False,
 ) -> tuple[Float[Tensor, "*out c rows columns"], Bool[Tensor, "*out rows columns"]]:
     """The metric top view of a plane.
 
@@ -86,6 +89,7 @@ def rectify(
         resolution: world units per pixel of the top view. Where the extent is no whole multiple of it, the number of
             pixels is rounded, and they fill the extent.
         axes: `(origin, axis_s, axis_t)`, each `(*B, 3)`; those of `plane_axes` if left out.
+        north_up: whether the first row is at t_max, as in maps; at t_min if not. `geotransform` goes with it.
 
     Returns:
         The top view `(*B, C, rows, columns)`, 0 where not valid; and `valid (*B, rows, columns)`: at least half of the
@@ -108,7 +112,7 @@ def rectify(
     rows, columns = _shape(extent, resolution)
     warn_if_rounded(camera, plane)
     H, W = image.shape[-2:]
-    low, unit = _corner_and_pixel(extent, (rows, columns), camera.K)
+    low, unit = _corner_and_pixel(extent, (rows, columns), camera.K, north_up)
 
     def look_up(places: Tensor) -> tuple[Tensor, Tensor]:
         s, t = (places * unit + low).unbind(-1)
@@ -127,6 +131,7 @@ def render(
     extent: Sequence[float],
     size: tuple[int, int] | None = None,
     axes: Axes | None = None,
+    north_up: bool = False,
 ) -> tuple[Float[Tensor, "*out c h w"], Bool[Tensor, "*out h w"]]:
     """Render a plane's texture into a camera's image: the inverse of `rectify`.
 
@@ -137,6 +142,7 @@ def render(
         extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes.
         size: `(width, height)` of the image; the camera's if left out.
         axes: `(origin, axis_s, axis_t)`, each `(*B, 3)`; those of `plane_axes` if left out.
+        north_up: whether the texture's first row is at t_max, as in maps; at t_min if not.
 
     Returns:
         The image `(*B, C, H, W)`, 0 where not valid; and `valid (*B, H, W)`: at least half of the pixel's samples are
@@ -163,7 +169,7 @@ def render(
     if width * height > MOST_PIXELS:
         raise ValueError(f"size: want one that fits into memory, got {width} x {height} px")
     rows, columns = texture.shape[-2:]
-    low, unit = _corner_and_pixel(extent, (rows, columns), camera.K)
+    low, unit = _corner_and_pixel(extent, (rows, columns), camera.K, north_up)
 
     def look_up(places: Tensor) -> tuple[Tensor, Tensor]:
         points, valid = back_project(places - 0.5, camera, plane)
@@ -174,9 +180,43 @@ def render(
     return _resampled(texture, look_up, (height, width), (columns, rows), camera.K)
 
 
-def _corner_and_pixel(extent: Sequence[float], shape: tuple[int, int], like: Tensor) -> tuple[Tensor, Tensor]:
-    """`(s, t)` of an extent's first corner, and the size along s and t of the pixels that fill it."""
+def geotransform(
+    extent: Sequence[float], resolution: float, origin: Sequence[float] = (0.0, 0.0)
+) -> tuple[float, float, float, float, float, float]:
+    """Where a top view of `rectify(..., north_up=True)` is on the map, as the six numbers that GDAL takes.
+
+    They are `(x, dx, 0, y, 0, -dy)`: x and y of the outer corner of the first pixel, and the pixels' sides, so that
+    column j and row i, counted from that corner, are at `x + j dx` and `y - i dy`. With rasterio,
+    `Affine.from_gdal(*numbers)` is the transform.
+
+    Args:
+        extent: `(s_min, t_min, s_max, t_max)` as `rectify` took it, s to the east and t to the north.
+        resolution: as `rectify` took it.
+        origin: east and north of the world's origin on the map, where that is not the map's own: the offset that
+            `camera.shifted` took off.
+
+    Raises:
+        TypeError: an argument is of the wrong kind.
+        ValueError: an empty or infinite extent, or a resolution that is not positive or too fine.
+
+    Example:
+        >>> geotransform((-20, 0, 20, 30), 0.5, origin=(642700, 8304290))
+        (642680.0, 0.5, 0.0, 8304320.0, 0.0, -0.5)
+    """
+    rows, columns = _shape(extent, resolution)
+    east, north = numbers("origin", origin, "finite (east, north)", 2)
+    width, height = _checked_extent(extent)
+    s_min, _, _, t_max = (float(side) for side in extent)
+    return east + s_min, width / columns, 0.0, north + t_max, 0.0, -height / rows
+
+
+def _corner_and_pixel(
+    extent: Sequence[float], shape: tuple[int, int], like: Tensor, north_up: bool
+) -> tuple[Tensor, Tensor]:
+    """`(s, t)` of the corner where the first pixel begins, and the steps along s and t from pixel to pixel."""
     (s_min, t_min, s_max, t_max), (rows, columns) = extent, shape
+    if flag("north_up", north_up):
+        t_min, t_max = t_max, t_min
     return like.new_tensor([s_min, t_min]), like.new_tensor([(s_max - s_min) / columns, (t_max - t_min) / rows])
 
 
@@ -195,7 +235,7 @@ def _resampled(
     part = corners.shape[:2]
     offsets = ((pixel_grid(down, right, like) + 0.5) / like.new_tensor([right, down])).reshape(-1, 2)
     total, counts = torch.zeros((), dtype=source.dtype, device=source.device), torch.zeros((), device=source.device)
-    for some in offsets.split(max(1, BLOCK_POINTS // max(1, part.numel() * valid.shape[:-1].numel()))):
+    for some in offsets.split(max(1, block_points(like.device) // max(1, part.numel() * valid.shape[:-1].numel()))):
         places, valid = look_up((corners + some[:, None, None]).reshape(-1, 2))
         sampled, seen = _sampled(source, places, valid, (len(some) * part[0], part[1]), size)
         total = total + sampled.unflatten(-2, (len(some), part[0])).sum(-3)

@@ -109,7 +109,7 @@ class AccuracyMap(Shown):
             raise ValueError(f"step: want a positive distance in px that gives at most 10^8 places, got {step:g}")
         columns, rows = (math.ceil((side - 1) / step) + 1 for side in size)
         pixels = _grid(rows, columns, (0.0, 0.0, size[0] - 1.0, size[1] - 1.0), calibration.points)
-        return _mapped(pixels, calibration, _single(plane), view, pixel_sigma)
+        return _mapped(pixels, calibration, _single(plane, calibration.points), view, pixel_sigma)
 
     @classmethod
     def over_plane(
@@ -149,7 +149,7 @@ class AccuracyMap(Shown):
         x_min, y_min, x_max, y_max = numbers("extent", extent, want, 4)
         if not (x_max > x_min and y_max > y_min):
             raise ValueError(f"extent: want {want}, got {tuple(extent)}")
-        plane = _single(plane)
+        plane = _single(plane, calibration.points)
         if abs(float(plane.unit_normal[2])) < UPRIGHT:
             raise ValueError("plane: want one that is a height over the board's x and y, got an upright one")
         rows, columns = _checked_shape(shape)
@@ -180,9 +180,9 @@ def _checked_shape(shape: Sequence[int]) -> tuple[int, int]:
     return rows, columns
 
 
-def _single(plane: Plane | None) -> Plane:
-    """One plane in float64; the board's where none was given."""
-    plane = (Plane.z(0.0) if plane is None else as_plane(plane)).to(torch.float64)
+def _single(plane: Plane | None, points: Tensor) -> Plane:
+    """One plane in float64; the board's, where its points are, if none was given."""
+    plane = (Plane.z(0.0) if plane is None else as_plane(plane)).like(points).to(torch.float64)
     if plane.normal.is_meta:
         raise ValueError("plane: want one with values, got one on the device meta")
     if plane.batch_shape:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,6 +21,7 @@ from diffproj.measurement.intervals import angle_interval, curved_interval, norm
 from diffproj.measurement.propagation import Noise, Propagated, kink_variance
 from diffproj.measurement.quantity import Bounds, Quantity
 from diffproj.measurement.shapes import area_vector, difference, length, turn
+from diffproj.measurement.sight import Sight
 
 EXTRAPOLATED = (
     "Extrapolated: outside of the region that the calibration's corners covered. Only the lens model tells the lens "
@@ -51,6 +52,11 @@ class Measurement(Copied, Shown):
     _noise: Noise = field(repr=False)
     _region: Tensor | None = field(default=None, repr=False)
     doubts: str = ""
+
+    @property
+    def _sight(self) -> Sight:
+        """Pixels, camera and plane; joined measurements, which have another, ask for none of them."""
+        return cast(Sight, self._noise.sight)
 
     @property
     def degrees_of_freedom(self) -> Float[Tensor, "*batch"]:
@@ -127,7 +133,7 @@ class Measurement(Copied, Shown):
         calibration from `locate` that of the calibration it was given. `None` where the corners are not known: for a
         camera alone, and a pose that was located with one.
         """
-        return None if self._region is None else ~in_region(self._noise.sight.pixels, self._region)
+        return None if self._region is None else ~in_region(self._sight.pixels, self._region)
 
     def quantity(self, function: Callable[[Tensor], Tensor], which: Sequence[Sequence[int]] | Tensor) -> Quantity:
         """Any number that depends on a few of the points, with its standard deviation.
@@ -245,7 +251,7 @@ class Measurement(Copied, Shown):
             >>> found["point"], found["reason"], [round(x) for x in found["x"]]
             ([0, 1], ['VALID', 'VALID'], [0, 25])
         """
-        sight, batch = self._noise.sight, self.points.shape[:-2]
+        sight, batch = self._sight, self.points.shape[:-2]
         reasons = explain(sight.pixels, sight.camera, sight.plane).expand(self.valid.shape)
         places = torch.where(self.valid.unsqueeze(-1), self.points, torch.nan)
         beyond = self.extrapolated

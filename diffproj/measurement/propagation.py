@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.covariance import zero_where_infinite
-from diffproj.measurement.sight import Sight
+from diffproj.measurement.sight import Sight, Straight
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Noise:
         pixels_too: whether the standard deviation of the pixels was estimated along with it.
     """
 
-    sight: Sight
+    sight: Sight | Straight
     common: Tensor
     sigma: Tensor
     own: Tensor

@@ -66,3 +66,25 @@ class Sight:
         return Plane.unchecked(
             normal.repeat_interleave(k, dim=-2), offset.repeat_interleave(k, dim=-1), is_per_point=True
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Straight:
+    """Joined points, which no single camera sees: a step of their errors moves them along a line.
+
+    Attributes:
+        at: the points `(*B, N, 3)`.
+        valid: which of them somebody measured `(*B, N)`.
+        by_theta: their derivative by their q errors `(*B, N, 3, q)`.
+    """
+
+    at: Tensor
+    valid: Tensor
+    by_theta: Tensor
+
+    def points(self, index: Tensor, theta: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """As `Sight.points` gives them; there are no pixels with a noise of their own."""
+        step = (self.by_theta[..., index, :, :] @ theta[..., None].unsqueeze(-3)).squeeze(-1)
+        return self.at[..., index, :] + step + 0 * noise.sum(-1, keepdim=True), self.valid[..., index].expand(
+            step.shape[:-1]
+        )

@@ -159,9 +159,9 @@ def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px:
     noise_px = number("noise_px", noise_px, "a standard deviation of at least 0 px", least=0)
     if not camera.batch_shape:
         raise ValueError("camera: want a batch of views (V,), got a single camera; camera.at(R, t) makes one")
-    pixels, visible = camera.project(board.points.to(camera.dtype))
-    generator = _generator(seed)
-    pixels = pixels + noise_px * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype, device="cpu")
+    pixels, visible = camera.project(board.points.to(camera.K))
+    noise = torch.randn(pixels.shape, generator=_generator(seed), dtype=pixels.dtype, device="cpu")
+    pixels = pixels + noise_px * noise.to(pixels.device)
     if camera.size is not None:
         visible = visible & camera.in_image(pixels)
     return Views(pixels, visible, size=camera.size)
@@ -210,7 +210,8 @@ def random_cameras(
     upright = torch.eye(3, dtype=camera.dtype, device="cpu")
     if board.axes == "paper":
         upright = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=camera.dtype, device="cpu")
-    singles = [camera] if not camera.batch_shape else [camera[i] for i in _indices(camera.batch_shape)]
+    here = camera.to("cpu")  # as the draws, so that a seed gives the same poses on every device
+    singles = [here] if not camera.batch_shape else [here[i] for i in _indices(camera.batch_shape)]
     rotations, shifts = [], []
     for single in singles:
         R, t = upright.new_zeros(0, 3, 3), upright.new_zeros(0, 3)
@@ -241,7 +242,7 @@ def random_cameras(
         shifts.append(t[:views])
     R = torch.cat([upright.new_zeros(0, 3, 3), *rotations]).reshape(*camera.batch_shape, views, 3, 3)
     t = torch.cat([upright.new_zeros(0, 3), *shifts]).reshape(*camera.batch_shape, views, 3)
-    return (camera if not camera.batch_shape else camera[..., None]).at(R, t)
+    return (camera if not camera.batch_shape else camera[..., None]).at(R.to(camera.device), t.to(camera.device))
 
 
 def _sized(camera: Camera | PinholeCamera) -> Camera:

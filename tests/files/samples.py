@@ -358,6 +358,11 @@ METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
       <sensor id="0" label="FC6310" type="frame">
         <resolution width="5472" height="3648"/>
         <property name="focal_length" value="8.8"/>
+        <property name="layer_index" value="0"/>
+        <bands>
+          <band label="Red"/>
+          <band label="Green"/>
+        </bands>
         <calibration type="frame" class="initial">
           <resolution width="5472" height="3648"/>
           <f>3600</f>

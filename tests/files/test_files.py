@@ -181,7 +181,9 @@ def test_calibrations_that_are_not_there_are_named(
     dp.save_camera(tmp_path / "camera.yaml", camera.without_pose())
     with pytest.raises(ValueError, match="want a calibration as save_camera writes it to .json"):
         dp.load_calibration(tmp_path / "camera.yaml")
-    with pytest.raises(ValueError, match=r"want a suffix of .json, .yaml, .yml, .xml, .npz, .txt, or format='json' or"):
+    with pytest.raises(
+        ValueError, match=r"want a suffix of .json, .yaml, .yml, .xml, .npz, .txt, .bin, or format='json' or"
+    ):
         dp.save_camera(tmp_path / "camera.png", camera)
     dp.save_camera(tmp_path / "c.json", calibration)
     document = json.loads((tmp_path / "c.json").read_text())

@@ -379,6 +379,65 @@ def test_metashape_projects_as_its_manual_says(tmp_path: Path) -> None:
     assert load(tmp_path, "cameras.xml", camera="FC6310").size == (5472, 3648)
 
 
+def test_metashape_has_components_unused_sensors_and_labels_that_several_share(tmp_path: Path) -> None:
+    text = SAMPLES["cameras.xml"].decode()
+    place = text[text.index("    <transform>\n") : text.index("  </chunk>")]
+    other = place.replace("100 200 300", "7 8 9").replace("2.5<", "4<")
+    components = f'<components><component id="3" label="Component 1">{other}</component></components>'
+    sensor = '<sensor id="1" label="FC6310" type="frame"><resolution width="100" height="80"/></sensor>'
+    camera = text[text.index('<camera id="0"') : text.index('<camera id="1"')]
+    third = camera.replace('id="0" sensor_id', 'id="2" component_id="3" sensor_id')
+    text = text.replace("    </sensors>", f"{sensor}</sensors>{components}").replace(
+        "    </cameras>", f"{third}</cameras>"
+    )
+    of_chunk, of_component = (load(tmp_path, "cameras.xml", text, camera=f"DJI_0001 {i}") for i in (0, 2))
+    center = np.array([1.5, 2.5, 3.5]) @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # transposed
+    np.testing.assert_allclose(of_chunk.center.numpy(), 2.5 * center + [100, 200, 300], atol=1e-9)
+    np.testing.assert_allclose(of_component.center.numpy(), 4 * center + [7, 8, 9], atol=1e-9)
+    assert load(tmp_path, "cameras.xml", text, camera="FC6310 0").size == (5472, 3648)
+    with pytest.raises(ValueError, match="sensor FC6310 1: want a calibration with f"):  # a camera that needs it
+        load(tmp_path, "cameras.xml", text.replace('component_id="3" sensor_id="0"', 'component_id="3" sensor_id="1"'))
+    with pytest.raises(ValueError, match=r"camera DJI_0001: want the sensor_id of a sensor, got 5"):
+        load(
+            tmp_path,
+            "cameras.xml",
+            SAMPLES["cameras.xml"].decode().replace('sensor_id="0" label="DJI_0001"', 'sensor_id="5" label="DJI_0001"'),
+        )
+    with pytest.raises(ValueError, match="camera DJI_0002: want an id of its own, got 0"):
+        load(tmp_path, "cameras.xml", SAMPLES["cameras.xml"].decode().replace('camera id="1"', 'camera id="0"'))
+
+
+def test_metashape_s_calibration_of_one_sensor(tmp_path: Path) -> None:
+    text = """<calibration><projection>frame</projection><width>640</width><height>480</height>
+      <f>500</f><cx>1</cx><cy>-2</cy><k1>0.1</k1></calibration>"""
+    assert numbers(load(tmp_path, "sensor.xml", text)) == ([500.0, 500.0, 320.5, 237.5], [0.1, 0.0, 0.0, 0.0, 0.0])
+    for old, new, message in (
+        ("frame", "fisheye", "type: want a frame sensor, got 'fisheye'"),
+        ("<width>640</width><height>480</height>", "", "want the size of the image, from whose middle"),
+        ("<f>500</f>", "<fx>500</fx><fy>500</fy>", "want f, got none; export with Metashape 1.3"),
+        ("<k1>", "<k4>0.5</k4><k1>", "k4: want"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            load(tmp_path, "sensor.xml", text.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("</chunk>", "</chunk><chunk/>", "chunk: want one, got several"),
+        (">2.5</scale>", ">0</scale>", "scale: want a positive number, got 0"),
+        ('<resolution width="5472"', '<resolution width="wide"', "width: want a number, got 'wide'"),
+        ("<f>3668.1</f>", "<f>3668.1</f><f>3000</f>", "f: want"),
+        ("<f>3668.1</f>", "", "sensor FC6310: want a calibration with f"),
+        ("0.8 0.6 0 1.5", "0.8 0.6 0", "camera DJI_0001, transform"),
+        ('<sensors next_id="1">', '<sensors next_id="1"/><nothing>', "want sensors in the chunk|want XML"),
+    ],
+)
+def test_metashape_s_faults_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load(tmp_path, "cameras.xml", SAMPLES["cameras.xml"].decode().replace(old, new))
+
+
 @pytest.mark.parametrize(
     ("matrix", "lens"),
     [("camMatrix", "distCoef"), ("cameraMatrix", "distCoeffs"), ("mtx", "dist"), ("camera_matrix", "distortion_coeff")],

@@ -164,16 +164,21 @@ np.save(sys.argv[1] + "/pixels.npy", np.array(pixels))
 """
 
 
+@pytest.mark.parametrize("suffix", [".txt", ".bin"])
 @pytest.mark.parametrize("lens", HELD["colmap"])
-def test_colmap_projects_the_same_half_a_pixel_on(tmp_path: Path, lens: str) -> None:
+def test_colmap_projects_the_same_half_a_pixel_on(tmp_path: Path, lens: str, suffix: str) -> None:
     pytest.importorskip("pycolmap")
     want = cameras(lens)
-    dp.save_camera(tmp_path / "images.txt", want, format="colmap")
+    dp.save_camera(tmp_path / f"images{suffix}", want)
     X = points(want)
     np.save(tmp_path / "points.npy", X.numpy())
     subprocess.run([sys.executable, "-c", PYCOLMAP, str(tmp_path)], check=True, capture_output=True)
     pixels = np.load(tmp_path / "pixels.npy")
     np.testing.assert_allclose(pixels.reshape(3, -1, 2) - 0.5, want.project(X)[0].numpy(), atol=1e-9)
+    assert_same_pixels(dp.load_camera(tmp_path / f"images{suffix}"), want)
+    dp.save_camera(tmp_path / f"alone{suffix}", want.without_pose(), format="colmap")
+    (tmp_path / f"alone{suffix}").rename(tmp_path / f"cameras{suffix}")
+    assert_same_pixels(dp.load_camera(tmp_path / f"cameras{suffix}"), want.without_pose())
 
 
 def test_a_model_of_colmap_is_not_written_over(tmp_path: Path) -> None:
@@ -184,6 +189,14 @@ def test_a_model_of_colmap_is_not_written_over(tmp_path: Path) -> None:
     dp.save_camera(tmp_path / "images.txt", cameras("none"))
     dp.save_camera(tmp_path / "images.txt", cameras("brown4"))  # its own it does
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cameras.txt", "images.txt", "points3D.txt"]
+    dp.save_camera(tmp_path / "images.bin", cameras("none"))
+    dp.save_camera(tmp_path / "images.bin", cameras("none"))
+    before = (tmp_path / "images.bin").read_bytes()
+    with pytest.raises(ValueError, match=r"want a folder without the cameras.bin of another model"):
+        dp.save_camera(tmp_path / "images.bin", cameras("brown4"))
+    assert (tmp_path / "images.bin").read_bytes() == before
+    with pytest.raises(ValueError, match=r"want the suffix .txt or .bin of COLMAP's files, got .dat"):
+        dp.save_camera(tmp_path / "images.dat", cameras("none"), format="colmap")
 
 
 @pytest.mark.parametrize("name", ["opencv", "ros", "numpy"])

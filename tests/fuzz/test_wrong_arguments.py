@@ -197,7 +197,14 @@ def _geometry(t: Things) -> dict[str, Call]:
             dp.paper_route, {"pixels": p, "camera": dp.Camera(t.K), "plane": dp.Plane.z(9.0), "focal_length": 1.0}
         ),
         "plane_axes": Call(dp.plane_axes, {"plane": n}),
-        "rectify": Call(dp.rectify, {"image": image, **onto, "extent": extent, "resolution": 2.0, "axes": axes}, 5),
+        "rectify": Call(
+            dp.rectify, {"image": image, **onto, "extent": extent, "resolution": 2.0, "axes": axes, "north_up": True}, 5
+        ),
+        "geotransform": Call(dp.geotransform, {"extent": extent, "resolution": 2.0, "origin": (3.0, 4.0)}, 5),
+        "metres_from_degrees": Call(dp.metres_from_degrees, {"degrees": [[40.4, -3.7]], "crs": "EPSG:32630"}, 2),
+        "degrees_from_metres": Call(
+            dp.degrees_from_metres, {"points": [[440291.5, 4474254.9]], "crs": "EPSG:32630"}, 2
+        ),
         "render": Call(dp.render, {"texture": image, **onto, "extent": extent, "size": (64, 48), "axes": axes}, 5),
         "rotation_from_euler": Call(dp.rotation_from_euler, {"psi": angle, "phi": angle, "theta": angle}),
         "euler_from_rotation": Call(dp.euler_from_rotation, {"R": t.cameras.R}),
@@ -390,6 +397,7 @@ def _measurement(t: Things) -> dict[str, Call]:
             dp.measure, {"pixels": t.pixels, "calibration": t.camera, "plane": t.plane, "pixel_sigma": 0.1}
         ),
         "measure located": Call(dp.measure, {"pixels": t.pixels, "calibration": t.located, **on}, 3),
+        "fuse": Call(dp.fuse, {"measurements": [m, m]}, 3),
         "Measurement.interval": Call(m.interval, {"level": 0.9}, 2),
         "Measurement.quantity": Call(m.quantity, {"function": lambda p: p.square().sum(), "which": [[0, 1], [1, 2]]}),
         "Measurement.lengths": Call(m.lengths, {"pairs": [[0, 1]]}),
@@ -468,6 +476,7 @@ OTHER = {
     "CrossValidation",
     "Experiment",
     "AccuracyMap",
+    "FusedMeasurement",
     "Measurement",
     "PaperSetup",
     "Quantity",

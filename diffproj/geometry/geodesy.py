@@ -1,0 +1,141 @@
+"""Degrees of latitude and longitude to metres and back, by pyproj.
+
+Cameras are measured in metres on a flat ground. A map projection, a UTM zone if no other is said, makes them of
+degrees: x east, y north, within 0.1 % of true lengths. Heights are handed on as they are, above whatever they were
+measured from. pyproj comes with `pip install 'diffproj[maps]'`.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from diffproj._core.arguments import Array, called
+from diffproj._core.numerics import check_tensor
+
+WGS84 = "EPSG:4326"
+
+
+def metres_from_degrees(
+    degrees: Float[Tensor, "*batch n d"] | Array, crs: str | None = None
+) -> tuple[Float[Tensor, "*batch n d"], str]:
+    """Metres east and north of latitudes and longitudes of WGS 84, as GPS has them.
+
+    Args:
+        degrees: `(*B, N, 2)` or with heights `(*B, N, 3)`: latitude, to the north, then longitude, to the east.
+        crs: the map's coordinate reference system, such as `"EPSG:32630"`; the UTM zone of the points' middle if left
+            out.
+
+    Returns:
+        The points `(*B, N, 2)` or `(*B, N, 3)`, east, north, and the heights as they were, in float64; and the
+        coordinate reference system.
+
+    Raises:
+        TypeError: no numbers, or a system that is no text.
+        ValueError: degrees out of their range, as when the two are exchanged, a system that pyproj does not know, that
+            is not in metres, or that does not reach the points.
+        ModuleNotFoundError: pyproj is not installed.
+
+    Example:
+        >>> points, crs = metres_from_degrees([[40.4168, -3.7038], [40.4169, -3.7038]])
+        >>> crs, [round(x, 2) for x in (points[1] - points[0]).tolist()]
+        ('EPSG:32630', [0.09, 11.1])
+    """
+    degrees = _checked("degrees", degrees)
+    latitude, longitude = degrees[..., 0], degrees[..., 1]
+    if not bool(((latitude.abs() <= 90) & (longitude.abs() <= 360)).all()):
+        raise ValueError(
+            "degrees: want latitudes from -90 to 90, then longitudes from -360 to 360, got others; are they exchanged, "
+            "or metres already?"
+        )
+    if crs is None:
+        crs = _utm(float(latitude.mean()), float(longitude.mean()))
+    east, north = _transformed(WGS84, crs, latitude, longitude, swap=True)
+    return torch.stack([east, north, *degrees[..., 2:].unbind(-1)], dim=-1), crs
+
+
+def degrees_from_metres(points: Float[Tensor, "*batch n d"] | Array, crs: str) -> Float[Tensor, "*batch n d"]:
+    """Latitudes and longitudes of WGS 84 of points on a map: what `metres_from_degrees` undoes.
+
+    Args:
+        points: east, north, and, where there are three, heights, `(*B, N, 2)` or `(*B, N, 3)`.
+        crs: the map's coordinate reference system, such as `"EPSG:32630"`.
+
+    Raises:
+        TypeError: no numbers, or a system that is no text.
+        ValueError: a system that pyproj does not know, that is not in metres, or that does not reach the points.
+        ModuleNotFoundError: pyproj is not installed.
+
+    Example:
+        >>> degrees = degrees_from_metres([[440291.53, 4474254.98, 650.0]], "EPSG:32630")
+        >>> [round(x, 5) for x in degrees[0].tolist()]
+        [40.41678, -3.70379, 650.0]
+    """
+    points = _checked("points", points)
+    latitude, longitude = _transformed(crs, WGS84, points[..., 0], points[..., 1], swap=False)
+    return torch.stack([latitude, longitude, *points[..., 2:].unbind(-1)], dim=-1)
+
+
+def _checked(name: str, value: Tensor | Array) -> Tensor:
+    """Two or three float64 numbers a point."""
+    found = check_tensor(name, value, "N", "2 or 3")
+    if found.shape[-1] not in (2, 3):
+        raise ValueError(f"{name}: want shape (*B, N, 2) or (*B, N, 3), got {tuple(found.shape)}")
+    if found.dtype != torch.float64:
+        raise TypeError(
+            f"{name}: want float64, got {found.dtype}, which rounds them by up to half a metre; read them so"
+        )
+    return found
+
+
+def _pyproj() -> Any:
+    try:
+        import pyproj
+        import pyproj.aoi
+        import pyproj.database
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "pyproj: want it installed, to turn degrees into metres; pip install pyproj"
+        ) from error
+    return pyproj
+
+
+def _transformed(source: str, target: str, first: Tensor, second: Tensor, swap: bool) -> tuple[Tensor, Tensor]:
+    """Two coordinates from one system to another, east before north, latitude before longitude."""
+    pyproj = _pyproj()
+    systems = [_system(pyproj, name) for name in (source, target)]
+    transformer = pyproj.Transformer.from_crs(*systems, always_xy=True)
+    given = (second, first) if swap else (first, second)
+    found = transformer.transform(*(part.detach().cpu().numpy() for part in given))
+    x, y = (torch.as_tensor(part, dtype=first.dtype, device=first.device).reshape(first.shape) for part in found)
+    if not bool((x.isfinite() & y.isfinite()).all()):
+        raise ValueError(f"crs: want a coordinate reference system that reaches the points, got {source} to {target}")
+    return (x, y) if swap else (y, x)
+
+
+def _system(pyproj: Any, name: str) -> Any:
+    if not isinstance(name, str):
+        raise TypeError(f"crs: want a coordinate reference system such as 'EPSG:32630', got {called(name)}")
+    try:
+        system = pyproj.CRS.from_user_input(name)
+    except pyproj.exceptions.CRSError as error:
+        raise ValueError(f"crs: want a coordinate reference system such as 'EPSG:32630', got {name!r}") from error
+    metres = all(axis.unit_name == "metre" for axis in system.axis_info[:2])
+    if name != WGS84 and not (system.is_projected and metres):
+        raise ValueError(f"crs: want a map in metres, as UTM is, got {name!r} ({system.name})")
+    return system
+
+
+def _utm(latitude: float, longitude: float) -> str:
+    """The UTM zone of a place."""
+    pyproj = _pyproj()
+    longitude = (longitude + 180) % 360 - 180
+    place = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
+    zones = pyproj.database.query_utm_crs_info(datum_name="WGS 84", area_of_interest=place)
+    if not zones:
+        raise ValueError(
+            f"crs: want a coordinate reference system, such as 'EPSG:3031', got none, and no UTM zone holds latitude "
+            f"{latitude:g}, longitude {longitude:g}"
+        )
+    return f"EPSG:{zones[0].code}"

@@ -1,0 +1,250 @@
+"""Several cameras' measurements of the same points on one plane, joined by their covariances.
+
+With y_c the points that camera c measured, as coordinates along the plane, and C_c their joint covariance, the best
+estimate and its covariance are
+
+    y = C sum_c C_c^-1 y_c        C^-1 = sum_c C_c^-1
+
+where a camera that did not see a point adds nothing about it, and what it knows of the others still counts. The errors
+of different cameras are taken to be independent, as they are where each was calibrated and located by itself.
+
+Whether the cameras agree is tested: each camera against the estimate of all others, by the chi-square of the difference
+(by F's distribution where deviations were estimated from few residuals). The camera that disagrees most is named, then
+tested is the rest. Where cameras disagree, nothing tells by itself which one is right: all stay in, and the covariance
+grows by chi-square over its degrees of freedom (Birge 1932), until its owner mends or leaves one out.
+"""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from diffproj._core.arguments import called
+from diffproj._core.numerics import broadcast_batches
+from diffproj.geometry.plane import Plane
+from diffproj.measurement.agreement import chances, chi_square, disagreeing, inverse, joined, without
+from diffproj.measurement.measurement import Measurement
+from diffproj.measurement.propagation import Noise
+from diffproj.measurement.sight import Sight, Straight
+
+MOST_POINTS = 3000
+"""Whose joint covariance is inverted for each camera."""
+
+
+class CameraDisagreementWarning(UserWarning):
+    """Cameras that measured the same points disagree by more than their deviations explain."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FusedMeasurement(Measurement):
+    """Points that several cameras measured; with lengths, areas and intervals as those of one camera have them.
+
+    Attributes:
+        names: of the C cameras.
+        seen: which camera measured which point `(*B, C, N)`.
+        chance: how likely a camera differs from the estimate of all others as much as it does, by chance, `(*B, C)`;
+            1 where no other saw its points.
+        disagrees: which cameras differ by more than chance `(*B, C)`.
+        scale: by what the deviations were multiplied, as the cameras disagree, `(*B,)`; 1 where they agree.
+    """
+
+    names: tuple[str, ...] = ()
+    seen: Bool[Tensor, "*batch c n"] | None = None
+    chance: Float[Tensor, "*batch c"] | None = None
+    disagrees: Bool[Tensor, "*batch c"] | None = None
+    scale: Float[Tensor, "*batch"] | None = None
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """The points as columns of Python's own numbers; `cameras` counts those that measured a point."""
+        counts = torch.zeros_like(self.valid, dtype=torch.long) if self.seen is None else self.seen.sum(-2)
+        places = torch.where(self.valid.unsqueeze(-1), self.points, torch.nan)
+        columns = {"point": torch.arange(self.valid.shape[-1], device="cpu").expand(self.valid.shape)}
+        columns |= {"valid": self.valid, "cameras": counts} | dict(zip("xyz", places.unbind(-1), strict=True))
+        columns |= {f"{axis}_deviation": part for axis, part in zip("xyz", self.deviations.unbind(-1), strict=True)}
+        found = {name: values.detach().flatten().tolist() for name, values in columns.items()}
+        reasons = ["VALID" if valid else "NOT_MEASURED" for valid in found["valid"]]
+        return found | {"nonlinear": self.nonlinear.flatten().tolist(), "reason": reasons}
+
+    def _facts(self) -> list[str]:
+        return [f"{len(self.names)} cameras", *super()._facts()]
+
+
+def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> FusedMeasurement:
+    """Join what several cameras measured of the same points on one plane.
+
+    Args:
+        measurements: of each camera, of the same N points in the same order and on the same plane, as `measure` gives
+            them; a mapping names the cameras, which are "camera 0", "camera 1", ... otherwise. A point that a camera
+            does not see has NaN pixels there.
+
+    Returns:
+        The joined points in float64, with their covariance; see `FusedMeasurement`. Where cameras disagree, `doubts`
+        and a `CameraDisagreementWarning` name them, and deviations are as much larger as it takes to explain it.
+
+    Raises:
+        TypeError: something else than measurements.
+        ValueError: less than two of them, different points or planes, points without any uncertainty, or an uncertain
+            plane, whose error all cameras would share.
+
+    Example:
+        >>> import diffproj as dp
+        >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+        >>> table, dot = dp.Plane.z(0.0), torch.tensor([[2.0, 3.0, 0.0]], dtype=torch.float64)
+        >>> near, far = (dp.Camera(K, t=torch.tensor([0.0, 0, depth], dtype=torch.float64)) for depth in (50, 100))
+        >>> seen = {
+        ...     name: dp.measure(camera.project(dot)[0], camera, table, pixel_sigma=0.5)
+        ...     for name, camera in (("near", near), ("far", far))
+        ... }
+        >>> fused = fuse(seen)
+        >>> for found in (*seen.values(), fused):
+        ...     print("{:.3f}".format(found.deviations[0, 0]))
+        0.050
+        0.100
+        0.045
+    """
+    names, found = _checked(measurements)
+    batch = broadcast_batches(**{f"m{i}": one.points.shape[:-2] for i, one in enumerate(found)})
+    plane = found[0]._sight.plane
+    N = found[0].points.shape[-2]
+    T = (plane.tangents() if plane.is_per_point else plane.tangents().unsqueeze(-3)).to(torch.float64)
+    T = T.expand(*batch, N, 3, 2)
+    seen = torch.stack([_seen(one).expand(*batch, N) for one in found], dim=-2)  # (*B, C, N)
+    points = torch.stack([one.points.expand(*batch, N, 3) for one in found], dim=-3)
+    origin = _mean(points, seen)  # near the points, so that their coordinates are small
+    y = torch.einsum("...nij,...cni->...cnj", T, points - origin.unsqueeze(-3)).flatten(-2)  # (*B, C, 2 N)
+    both = seen.repeat_interleave(2, dim=-1)
+    y = torch.where(both, y, 0.0)
+    C = torch.stack([_along(one.joint().expand(*batch, 3 * N, 3 * N), T) for one in found], dim=-3)
+    C = without(C, both)
+    information, sound = inverse(C)
+    if not bool(sound.all()):
+        who = next(name for name, bad in zip(names, _of_any(~sound), strict=True) if bad)
+        raise ValueError(
+            f"measurements: want points with an uncertainty of their own, got {who} without; give pixel_sigma above 0"
+        )
+    information = torch.where(both.unsqueeze(-1) & both.unsqueeze(-2), information, 0.0)
+    estimate, covariance, valid = joined(information, y)
+    chi2 = chi_square(information, y - estimate.unsqueeze(-2)).sum(-1)
+    spare = both.sum((-1, -2)) - valid.sum(-1)
+    freedom = torch.stack([one.degrees_of_freedom.expand(batch) for one in found], dim=-1)
+    chance = chances(information, y, C, both, freedom)
+    disagrees = disagreeing(information, y, C, both, freedom)
+    grown = disagrees.any(-1) & (chi2 > spare)
+    scale = torch.where(grown, (chi2 / spare.clamp(min=1)).sqrt(), 1.0)
+    common = scale[..., None, None, None] * T @ torch.linalg.cholesky(covariance).unflatten(-2, (N, 2))
+    there = valid.unflatten(-1, (N, 2)).all(-1)
+    placed = origin + (T @ estimate.unflatten(-1, (N, 2)).unsqueeze(-1)).squeeze(-1)
+    placed = torch.where(there.unsqueeze(-1), placed, 0.0)
+    common = torch.where(there[..., None, None], common, 0.0)
+    unit = torch.eye(2 * N, dtype=y.dtype, device=y.device).expand(*batch, 2 * N, 2 * N)
+    noise = Noise(
+        Straight(placed.detach(), there, common), common, unit, common[..., :2] * 0, freedom.amin(-1), pixels_too=False
+    )
+    doubts = _doubts(names, disagrees)
+    if doubts:
+        warnings.warn(doubts, CameraDisagreementWarning, stacklevel=2)
+    told = "; ".join(dict.fromkeys([doubts, *(one.doubts for one in found)])).strip("; ")
+    includes = all(one.includes_intrinsics for one in found)
+    return FusedMeasurement(placed, there, includes, noise, None, told, names, seen, chance, disagrees, scale)
+
+
+def _checked(
+    measurements: Sequence[Measurement] | Mapping[str, Measurement],
+) -> tuple[tuple[str, ...], list[Measurement]]:
+    """Names and measurements, known to fit together."""
+    want = "what dp.measure gives for each camera, in a list or by name"
+    if isinstance(measurements, Mapping):
+        names, found = tuple(map(str, measurements)), list(measurements.values())
+    elif isinstance(measurements, Sequence) and not isinstance(measurements, str):
+        names, found = tuple(f"camera {i}" for i in range(len(measurements))), list(measurements)
+    else:
+        raise TypeError(f"measurements: want {want}, got {called(measurements)}")
+    for name, one in zip(names, found, strict=True):
+        if not isinstance(one, Measurement):
+            raise TypeError(f"measurements: want {want}, got {called(one)} for {name}")
+        if not isinstance(one._noise.sight, Sight):
+            raise TypeError(f"measurements: want {want}, got fused ones for {name}; fuse all cameras at once")
+    if len(found) < 2:
+        raise ValueError(f"measurements: want those of two cameras or more, got {len(found)}")
+    first = found[0]
+    if first.points.shape[-2] > MOST_POINTS:
+        raise ValueError(f"measurements: want at most {MOST_POINTS} points at once, got {first.points.shape[-2]}")
+    for name, one in zip(names[1:], found[1:], strict=True):
+        if one.points.shape[-2] != first.points.shape[-2]:
+            raise ValueError(
+                f"measurements: want the same points of each camera, got {first.points.shape[-2]} of {names[0]} and "
+                f"{one.points.shape[-2]} of {name}; give NaN as the pixels of points that a camera does not see"
+            )
+        if one.points.device != first.points.device:
+            raise ValueError(f"measurements: want one device, got {first.points.device} and {one.points.device}")
+        if not _same(first._sight.plane, one._sight.plane):
+            raise ValueError(
+                f"measurements: want one plane, in one world frame, got different ones of {names[0]} and {name}; "
+                "locate both cameras by the same landmarks"
+            )
+    for name, one in zip(names, found, strict=True):
+        n = one._sight.plane.unit_normal
+        n = (n if n.ndim > 1 and n.shape[-2:-1] == one.points.shape[-2:-1] else n.unsqueeze(-2)).expand(
+            one.points.shape
+        )
+        across = (n.unsqueeze(-2) @ one.covariance.nan_to_num(0.0, 0.0) @ n.unsqueeze(-1)).abs()
+        size = one.covariance.nan_to_num(0.0, 0.0).diagonal(dim1=-2, dim2=-1).sum(-1)
+        if bool((across.squeeze(-1).squeeze(-1) > 1e-6 * size).any()):
+            raise ValueError(
+                f"measurements: want an exact plane, got an uncertain one, or a doubtful pose, of {name}, whose "
+                "error the cameras would share; measure without plane_covariance"
+            )
+    return names, found
+
+
+def _same(a: Plane, b: Plane) -> bool:
+    """Whether two planes are one, up to rounding."""
+    try:
+        close = torch.isclose(a.unit_normal.to(torch.float64), b.unit_normal.to(torch.float64), rtol=0, atol=1e-9)
+        distance = a.offset / a.length, b.offset / b.length
+        return bool(close.all()) and bool(
+            torch.isclose(*(d.to(torch.float64) for d in distance), rtol=1e-9, atol=1e-9).all()
+        )
+    except RuntimeError:  # of shapes that do not meet
+        return False
+
+
+def _seen(one: Measurement) -> Tensor:
+    """Which points a camera tells something about: valid ones of finite variance."""
+    return one.valid & one.covariance.isfinite().all(-1).all(-1)
+
+
+def _mean(points: Tensor, seen: Tensor) -> Tensor:
+    """About where each point is `(*B, N, 3)`, of those that saw it."""
+    kept = torch.where(seen.unsqueeze(-1), points.detach(), 0.0)
+    return kept.sum(-3) / seen.sum(-2).clamp(min=1).unsqueeze(-1)
+
+
+def _along(joint: Tensor, T: Tensor) -> Tensor:
+    """The covariance `(*B, 2 N, 2 N)` of coordinates along the plane, of that in the world `(*B, 3 N, 3 N)`."""
+    N = T.shape[-3]
+    blocks = joint.unflatten(-1, (N, 3)).unflatten(-3, (N, 3))  # (*B, N, 3, N, 3)
+    return torch.einsum("...nia,...nimj,...mjb->...namb", T, blocks, T).flatten(-2).flatten(-3, -2)
+
+
+def _of_any(mask: Tensor) -> list[bool]:
+    """Which cameras `(C,)` the mask `(*B, C)` marks anywhere in the batch."""
+    return mask.reshape(-1, mask.shape[-1]).any(0).tolist()
+
+
+def _doubts(names: Sequence[str], disagrees: Tensor) -> str:
+    """Which cameras disagree, in words; empty where all agree."""
+    who = [name for name, bad in zip(names, _of_any(disagrees), strict=True) if bad]
+    if not who:
+        return ""
+    if len(who) == len(names):
+        listed = " and ".join((", ".join(who[:-1]), who[-1]))
+        return f"{listed} disagree by more than their deviations explain: was one moved, or is its pose wrong?"
+    verb = "disagrees" if len(who) == 1 else "disagree"
+    return (
+        f"{', '.join(who)} {verb} with the other cameras by more than the deviations explain: moved, or a wrong pose?"
+    )

@@ -1,0 +1,191 @@
+"""`fuse`: the best estimate of several cameras' measurements, its covariance, and cameras that disagree."""
+
+import math
+import warnings
+
+import pytest
+import torch
+
+import diffproj as dp
+from diffproj.measurement.agreement import _tail as tail
+
+D = torch.float64
+K = torch.tensor([[900.0, 0, 640], [0, 900, 480], [0, 0, 1]], dtype=D)
+GROUND = dp.Plane.z(0.0)
+BOARD = dp.Chessboard(columns=4, rows=3, square=2.0, axes="paper")  # z up
+
+
+def camera(where: tuple[float, float, float], onto: tuple[float, float] = (3.0, 2.0)) -> dp.Camera:
+    """At a place over the ground z = 0, its axis through a point of it."""
+    center, target = torch.tensor(where, dtype=D), torch.tensor([*onto, 0.0], dtype=D)
+    z = (target - center) / (target - center).norm()
+    x = torch.linalg.cross(z, torch.tensor([0.0, 0, 1], dtype=D))
+    x = x / x.norm()
+    R = torch.stack([x, torch.linalg.cross(z, x), z])
+    return dp.Camera(K, R, -R @ center, size=(1280, 960))
+
+
+PLACES = ((20.0, 2.0, 8.0), (3.0, -15.0, 6.0), (-9.0, 12.0, 10.0))
+POINTS = torch.tensor([[1.0, 1, 0], [4, 0, 0], [2, 5, 0], [7, 6, 0]], dtype=D)
+
+
+def located(truth: dp.Camera, noise: torch.Tensor) -> dp.Calibration:
+    """The camera's poses from the board's corners on the ground, seen with noise `(*B, 12, 2)`."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        seen = dp.Views((truth.project(BOARD.points)[0] + noise).unsqueeze(-3), size=truth.size)
+        return dp.locate(seen, BOARD, truth.without_pose())
+
+
+def measured(seed: int, points: torch.Tensor = POINTS, batch: tuple[int, ...] = ()) -> list[dp.Measurement]:
+    """What the three cameras measure of points, each located by itself, with noise of 1 px."""
+    g = torch.Generator().manual_seed(seed)
+    found = []
+    for place in PLACES:
+        truth = camera(place)
+        calibration = located(truth, torch.randn(*batch, 12, 2, dtype=D, generator=g))
+        pixels = truth.project(points)[0] + torch.randn(*batch, len(points), 2, dtype=D, generator=g)
+        found.append(dp.measure(pixels, calibration, GROUND, view=0, pixel_sigma=1.0))
+    return found
+
+
+def test_it_is_the_weighted_mean_that_one_writes_down() -> None:
+    found = measured(0)
+    fused = dp.fuse(found)
+    xy = [one.points[:, :2].flatten() for one in found]
+    information = [torch.linalg.inv(one.joint().reshape(4, 3, 4, 3)[:, :2, :, :2].reshape(8, 8)) for one in found]
+    C = torch.linalg.inv(sum(information))
+    want = C @ sum(i @ y for i, y in zip(information, xy, strict=True))
+    torch.testing.assert_close(fused.points[:, :2].flatten(), want, rtol=1e-9, atol=1e-12)
+    joint = fused.joint().reshape(4, 3, 4, 3)[:, :2, :, :2].reshape(8, 8)
+    torch.testing.assert_close(joint, C, rtol=1e-7, atol=1e-12)
+    assert not fused.points[:, 2].any()
+    assert bool((fused.deviations[:, :2] < torch.stack([one.deviations[:, :2] for one in found]).amin(0)).all())
+    assert fused.names == ("camera 0", "camera 1", "camera 2")
+    assert fused.scale == 1
+    assert fused.doubts == ""
+
+
+def test_sampling_reproduces_covariance_and_false_alarms() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dp.CameraDisagreementWarning)
+        fused = dp.fuse(measured(5, batch=(600,)))
+    off = (fused.points - POINTS)[..., :2].flatten(-2)
+    C = fused.joint().reshape(600, 4, 3, 4, 3)[:, :, :2, :, :2].reshape(600, 8, 8)
+    standard = (off * torch.linalg.solve(C, off)).sum(-1) / 8
+    assert 0.95 < float(standard.mean()) < 1.25  # above 1, for deviations are told by 18 residuals of each camera
+    low, high = fused.lengths([[0, 3]]).interval()
+    length = (POINTS[3] - POINTS[0]).norm()
+    assert 0.92 < float(((low <= length) & (length <= high)).double().mean()) < 0.98
+    assert int(fused.disagrees.any(-1).sum()) <= 3
+    assert 0.02 < float((fused.chance < 0.1).double().mean()) < 0.13  # cautious: the pixels' noise is known exactly
+
+
+@pytest.mark.parametrize("moved", [0, 1, 2])
+def test_a_camera_that_was_moved_is_named(moved: int) -> None:
+    found = measured(1)
+    found[moved] = measured(1, POINTS + torch.tensor([0.4, -0.3, 0], dtype=D))[moved]  # 0.5 m off
+    names = ["mast", "roof", "gate"]
+    with pytest.warns(dp.CameraDisagreementWarning, match=f"{names[moved]} disagrees with the other cameras"):
+        fused = dp.fuse(dict(zip(names, found, strict=True)))
+    assert fused.disagrees.tolist() == [c == moved for c in range(3)]
+    assert names[moved] in fused.doubts
+    assert float(fused.scale) > 2
+    reach = 3 * fused.deviations[:, :2]
+    assert bool(((fused.points - POINTS)[:, :2].abs() < reach).all())  # the deviations hold the disagreement
+    others = dp.fuse([one for c, one in enumerate(found) if c != moved])
+    assert not bool(others.disagrees.any())
+
+
+def test_of_two_cameras_nothing_tells_which_one_is_wrong() -> None:
+    found = measured(2)[:2]
+    found[1] = measured(2, POINTS + 1 - torch.tensor([0, 0, 1.0], dtype=D))[1]
+    with pytest.warns(dp.CameraDisagreementWarning, match="mast and roof disagree by more than"):
+        fused = dp.fuse({"mast": found[0], "roof": found[1]})
+    assert fused.disagrees.tolist() == [True, True]
+
+
+def test_what_a_camera_does_not_see_others_tell() -> None:
+    pixels = camera(PLACES[0]).project(POINTS)[0].clone()
+    pixels[1] = torch.nan
+    first = dp.measure(pixels, located(camera(PLACES[0]), torch.zeros(12, 2, dtype=D)), GROUND, view=0, pixel_sigma=1.0)
+    second = measured(3)[1]
+    fused = dp.fuse([first, second])
+    assert fused.seen.tolist() == [[True, False, True, True], [True] * 4]
+    assert bool(fused.valid.all())
+    # The second camera's pose, better known by the points that both see, helps the point that it alone sees.
+    assert float(fused.deviations[1].norm()) < float(second.deviations[1].norm())
+    neither = dp.fuse([first, dp.measure(pixels, camera(PLACES[0]), GROUND, pixel_sigma=1.0)])
+    assert neither.valid.tolist() == [True, False, True, True]
+    assert bool(neither.covariance[1].isnan().all())
+    columns = neither.to_dict()
+    assert columns["cameras"] == [2, 0, 2, 2]
+    assert columns["reason"] == ["VALID", "NOT_MEASURED", "VALID", "VALID"]
+    assert "not on the plane" in neither.summary()
+
+
+def test_batches_heights_and_gradients() -> None:
+    heights = dp.Plane.per_point([0.0, 0.0, 1.0], torch.tensor([0.0, 0.5, 1.0, 2.0], dtype=D))
+    points = POINTS + torch.tensor([[0, 0, h] for h in (0.0, 0.5, 1.0, 2.0)], dtype=D)
+    pair = [camera(place) for place in PLACES[:2]]
+    pixels = [one.project(points)[0].requires_grad_() for one in pair]
+    alone = [dp.measure(p, one, heights, pixel_sigma=1.0) for p, one in zip(pixels, pair, strict=True)]
+    fused = dp.fuse(alone)
+    torch.testing.assert_close(fused.points, points, rtol=0, atol=1e-9)
+    (slope,) = torch.autograd.grad(fused.points[0, 0], pixels[0], retain_graph=True)
+    assert slope[0].abs().sum() > 0
+    assert torch.autograd.grad(fused.deviations.sum(), pixels[0])[0].isfinite().all()
+
+    def x_of_first(p: torch.Tensor) -> torch.Tensor:
+        return dp.fuse([dp.measure(p, pair[0], heights, pixel_sigma=1.0), alone[1]]).points[0, 0]
+
+    step = torch.zeros_like(pixels[0])
+    step[0, 0] = 1e-3
+    difference = (x_of_first(pixels[0].detach() + step) - x_of_first(pixels[0].detach() - step)) / 2e-3
+    torch.testing.assert_close(slope[0, 0], difference.detach(), rtol=1e-6, atol=1e-12)
+
+    both = dp.Camera.stack([pair[0], pair[0]])
+    twice = torch.stack([pixels[0].detach(), pixels[0].detach() + 1])
+    batch = dp.fuse([dp.measure(twice, both, heights, pixel_sigma=1.0), alone[1]])
+    for b in range(2):
+        one = dp.fuse([dp.measure(twice[b], pair[0], heights, pixel_sigma=1.0), alone[1]])
+        torch.testing.assert_close(batch.points[b], one.points)
+        torch.testing.assert_close(batch.covariance[b], one.covariance)
+
+
+def test_the_tail_of_the_f_distribution() -> None:
+    # scipy.stats.f.sf(2.5, 8, 18), chi2.sf(20, 8), f.sf(6, 2, 5)
+    chi2, count, freedom = (torch.tensor(x, dtype=D) for x in ([20.0, 20, 12], [8, 8, 2], [18.0, math.inf, 5]))
+    torch.testing.assert_close(
+        tail(chi2, count, freedom), torch.tensor([0.0513, 0.0103, 0.0471], dtype=D), rtol=0.06, atol=0
+    )
+
+
+def test_it_refuses_what_cannot_be_joined() -> None:
+    first, second, _ = measured(4)
+    with pytest.raises(ValueError, match="want those of two cameras or more, got 1"):
+        dp.fuse([first])
+    with pytest.raises(
+        ValueError, match="want the same points of each camera, got 4 of camera 0 and 2 of gate|camera 1"
+    ):
+        dp.fuse([first, measured(4, POINTS[:2])[1]])
+    pixels = camera(PLACES[1]).project(POINTS)[0]
+    with pytest.raises(ValueError, match="want one plane, in one world frame, got different ones of a and b"):
+        dp.fuse({"a": first, "b": dp.measure(pixels, camera(PLACES[1]), dp.Plane.z(1.0), pixel_sigma=1.0)})
+    uncertain = dp.measure(
+        pixels, camera(PLACES[1]), GROUND, pixel_sigma=1.0, plane_covariance=0.01 * torch.eye(4, dtype=D)
+    )
+    with pytest.raises(ValueError, match="want an exact plane, got an uncertain one"):
+        dp.fuse([first, uncertain])
+    exact = dp.measure(pixels, camera(PLACES[1]), GROUND, pixel_sigma=0.0)
+    with pytest.raises(ValueError, match="want points with an uncertainty of their own, got camera 1 without"):
+        dp.fuse([first, exact])
+    with pytest.raises(TypeError, match="got fused ones for camera 0; fuse all cameras at once"):
+        dp.fuse([dp.fuse([first, second]), second])
+
+
+@pytest.mark.plain
+def test_wrong_types_are_named() -> None:
+    for wrong in (None, 3, "measurements", [1, 2], {"a": 1, "b": 2}):
+        with pytest.raises(TypeError, match="measurements: want what dp.measure gives for each camera"):
+            dp.fuse(wrong)
