@@ -117,7 +117,10 @@ class PlaneMap(Copied, Shown):
             camera = camera[..., None]
         broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape)
         self.matrix = _plane_matrix(camera, plane, warn).to(camera.dtype)
-        self.camera, self.is_per_point = camera, plane.is_per_point
+        # The principal point is read at each call: that of a K that was written to since would not go with the matrix.
+        K = camera.K.clone()
+        self.camera = Camera.unchecked(K, camera.R, camera.t, camera.distortion, camera.size)
+        self.is_per_point = plane.is_per_point
 
     @classmethod
     def unchecked(cls, matrix: Any, camera: Any, is_per_point: bool) -> "PlaneMap":

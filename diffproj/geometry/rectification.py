@@ -10,31 +10,25 @@ With `north_up`, as maps have it, the first row is at the top instead: t falls f
 
 A pixel covers a rectangle, a square where the extent is a whole multiple of the resolution, so that areas and edges
 keep their places at any resolution. Every pixel of the target image is mapped to the source image through the camera,
-lens included. Where its footprint there is larger than a pixel, it is the mean of bilinear samples about a pixel apart,
-against aliasing. Both are differentiable in image and camera.
+lens included, and sampled there as `resampling.py` says. Both are differentiable in image and camera.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
-from diffproj._core.arguments import called, flag, number, numbers
-from diffproj._core.numerics import block_points, broadcast_batches, check_same_kind, check_tensor
-from diffproj.geometry.back_projection import back_project, warn_if_rounded
+from diffproj._core.arguments import called, flag, number, numbers, whole_number
+from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor
+from diffproj.geometry.back_projection import PlaneMap, warn_if_rounded
 from diffproj.geometry.camera import Camera, as_camera, meeting_camera
-from diffproj.geometry.grid import checked_size, inside, pixel_grid
+from diffproj.geometry.grid import checked_size
 from diffproj.geometry.plane import Plane, as_plane
+from diffproj.geometry.resampling import MAX_SUPERSAMPLING, Chosen, LookUp, resampled
 
-LookUp = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Maps places in the target `(N, 2)`, in pixels from its first corner, to positions in the source `(*B, N, 2)`, in
-pixels from the centre of its first pixel, and `valid (*B, N)`."""
-MAX_SUPERSAMPLING = 128
-"""Maximum number of samples along each side of a pixel."""
 MOST_PIXELS = 2**31
 """Of an image to be made: more would not fit into memory, and is a resolution in the wrong unit."""
 
@@ -78,18 +72,23 @@ def rectify(
     resolution: float,
     axes: Axes | None = None,
     north_up: bool = False,
+    samples: int | tuple[int, int] | None = None,
 ) -> tuple[Float[Tensor, "*out c rows columns"], Bool[Tensor, "*out rows columns"]]:
     """The metric top view of a plane.
 
     Args:
         image: `(*B, C, H, W)`, floating point.
-        camera: with its pose, of batch shape `*B`; the image is taken to be its full image.
+        camera: with its pose, of batch shape `*B`; the image is its full image. `camera.resized((w, h))` is the camera
+            of a feature map of fewer pixels.
         plane: of batch shape `*B`.
         extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes.
         resolution: world units per pixel of the top view. Where the extent is no whole multiple of it, the number of
             pixels is rounded, and they fill the extent.
         axes: `(origin, axis_s, axis_t)`, each `(*B, 3)`; those of `plane_axes` if left out.
         north_up: whether the first row is at t_max, as in maps; at t_min if not. `geotransform` goes with it.
+        samples: how many samples a pixel takes along each side, or to the right and down; about as many as it covers
+            pixels of the image, for each image by itself, if left out. Where it is said, nothing depends on values, as
+            `torch.compile(fullgraph=True)` needs; 1 is fastest, and right where pixels are about equally large.
 
     Returns:
         The top view `(*B, C, rows, columns)`, 0 where not valid; and `valid (*B, rows, columns)`: at least half of the
@@ -109,19 +108,24 @@ def rectify(
         (torch.Size([3, 50, 100]), True)
     """
     image, camera, plane, (origin, along_s, along_t) = _checked("image", image, camera, plane, axes)
+    _check_size(image, camera)
     rows, columns = _shape(extent, resolution)
     warn_if_rounded(camera, plane)
-    H, W = image.shape[-2:]
     low, unit = _corner_and_pixel(extent, (rows, columns), camera.K, north_up)
 
-    def look_up(places: Tensor) -> tuple[Tensor, Tensor]:
-        s, t = (places * unit + low).unbind(-1)
-        points = (
-            origin.unsqueeze(-2) + s.unsqueeze(-1) * along_s.unsqueeze(-2) + t.unsqueeze(-1) * along_t.unsqueeze(-2)
-        )
-        return camera._project(meeting_camera(camera, "points", points, 3))
+    def look_up_of(chosen: Chosen) -> LookUp:
+        seen_by, _, (start, s_axis, t_axis) = _of(chosen, camera, plane, (origin, along_s, along_t), image)
 
-    return _resampled(image, look_up, (rows, columns), (W, H), camera.K)
+        def look_up(places: Tensor) -> tuple[Tensor, Tensor]:
+            s, t = (places * unit + low).unbind(-1)
+            points = (
+                start.unsqueeze(-2) + s.unsqueeze(-1) * s_axis.unsqueeze(-2) + t.unsqueeze(-1) * t_axis.unsqueeze(-2)
+            )
+            return seen_by._project(meeting_camera(seen_by, "points", points, 3))
+
+        return look_up
+
+    return resampled(image, look_up_of, (rows, columns), camera.K, _numbers(samples))
 
 
 def render(
@@ -132,6 +136,7 @@ def render(
     size: tuple[int, int] | None = None,
     axes: Axes | None = None,
     north_up: bool = False,
+    samples: int | tuple[int, int] | None = None,
 ) -> tuple[Float[Tensor, "*out c h w"], Bool[Tensor, "*out h w"]]:
     """Render a plane's texture into a camera's image: the inverse of `rectify`.
 
@@ -143,6 +148,9 @@ def render(
         size: `(width, height)` of the image; the camera's if left out.
         axes: `(origin, axis_s, axis_t)`, each `(*B, 3)`; those of `plane_axes` if left out.
         north_up: whether the texture's first row is at t_max, as in maps; at t_min if not.
+        samples: how many samples a pixel takes along each side, or to the right and down; about as many as it covers
+            pixels of the texture, for each image by itself, if left out. Where it is said, nothing depends on values,
+            as `torch.compile(fullgraph=True)` needs; 1 is fastest, and right where pixels are about equally large.
 
     Returns:
         The image `(*B, C, H, W)`, 0 where not valid; and `valid (*B, H, W)`: at least half of the pixel's samples are
@@ -171,13 +179,19 @@ def render(
     rows, columns = texture.shape[-2:]
     low, unit = _corner_and_pixel(extent, (rows, columns), camera.K, north_up)
 
-    def look_up(places: Tensor) -> tuple[Tensor, Tensor]:
-        points, valid = back_project(places - 0.5, camera, plane)
-        off = points - origin.unsqueeze(-2)
-        st = torch.stack([(off * along_s.unsqueeze(-2)).sum(-1), (off * along_t.unsqueeze(-2)).sum(-1)], dim=-1)
-        return (st - low) / unit - 0.5, valid
+    def look_up_of(chosen: Chosen) -> LookUp:
+        seen_by, on, (start, s_axis, t_axis) = _of(chosen, camera, plane, (origin, along_s, along_t), texture)
+        to_plane = PlaneMap.quietly(seen_by, on)
 
-    return _resampled(texture, look_up, (height, width), (columns, rows), camera.K)
+        def look_up(places: Tensor) -> tuple[Tensor, Tensor]:
+            points, valid = to_plane(places - 0.5)
+            off = points - start.unsqueeze(-2)
+            st = torch.stack([(off * s_axis.unsqueeze(-2)).sum(-1), (off * t_axis.unsqueeze(-2)).sum(-1)], dim=-1)
+            return (st - low) / unit - 0.5, valid
+
+        return look_up
+
+    return resampled(texture, look_up_of, (height, width), camera.K, _numbers(samples))
 
 
 def geotransform(
@@ -220,77 +234,6 @@ def _corner_and_pixel(
     return like.new_tensor([s_min, t_min]), like.new_tensor([(s_max - s_min) / columns, (t_max - t_min) / rows])
 
 
-def _resampled(
-    source: Tensor, look_up: LookUp, shape: tuple[int, int], size: tuple[int, int], like: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Resample a source, of `(width, height)` `size`, to a target of `(rows, columns)` `shape`, with supersampling."""
-    corners = pixel_grid(*shape, like)
-    with torch.no_grad():
-        places, valid = look_up((corners + 0.5).reshape(-1, 2))
-        shown = (valid & inside(places, size)).unflatten(-1, shape)
-        right, down = (_samples(look_up, corners, places.unflatten(-2, shape), shown, axis) for axis in (-1, -2))
-    # A target may reach far beyond the source: only the part about what is shown is sampled.
-    (top, bottom), (left, end) = (_range_of(shown.transpose(-1, axis).flatten(0, -2).any(0)) for axis in (-2, -1))
-    corners = corners[top:bottom, left:end]
-    part = corners.shape[:2]
-    offsets = ((pixel_grid(down, right, like) + 0.5) / like.new_tensor([right, down])).reshape(-1, 2)
-    total, counts = torch.zeros((), dtype=source.dtype, device=source.device), torch.zeros((), device=source.device)
-    for some in offsets.split(max(1, block_points(like.device) // max(1, part.numel() * valid.shape[:-1].numel()))):
-        places, valid = look_up((corners + some[:, None, None]).reshape(-1, 2))
-        sampled, seen = _sampled(source, places, valid, (len(some) * part[0], part[1]), size)
-        total = total + sampled.unflatten(-2, (len(some), part[0])).sum(-3)
-        counts = counts + seen.unflatten(-2, (len(some), part[0])).sum(-3)
-    covered = counts >= 0.5 * len(offsets)
-    mean = torch.where(covered.unsqueeze(-3), total / counts.clamp(min=1).unsqueeze(-3).to(total), 0.0)
-    around = (left, shape[1] - end, top, shape[0] - bottom)
-    return torch.nn.functional.pad(mean, around), torch.nn.functional.pad(covered, around)
-
-
-def _range_of(lines: Tensor) -> tuple[int, int]:
-    """The range of lines `(n,)` that are shown, and one more on each side; all where none is."""
-    where = lines.nonzero().flatten()
-    return (max(0, int(where[0]) - 1), min(len(lines), int(where[-1]) + 2)) if len(where) else (0, len(lines))
-
-
-def _samples(look_up: LookUp, corners: Tensor, places: Tensor, shown: Tensor, axis: int) -> int:
-    """Samples along a pixel's side, as many as its footprint in the source has pixels, at most `MAX_SUPERSAMPLING`.
-
-    The footprint is the 90th percentile over the target's pixels that are shown, from neighbour to neighbour, or, where
-    there are none, from edge to edge. From a footprint of `n + 1/4` pixels on there are n + 1 samples.
-
-    Args:
-        look_up: where places of the target are in the source.
-        corners: of the target's pixels `(rows, columns, 2)`.
-        places: of their middles in the source `(*B, rows, columns, 2)`.
-        shown: which of these lie in the source `(*B, rows, columns)`.
-        axis: along which: -1 to the right, -2 down.
-    """
-    step, pairs = places.diff(dim=axis - 1).norm(dim=-1), shown.shape[axis] - 1
-    step = step[shown.narrow(axis, 0, pairs) & shown.narrow(axis, 1, pairs)]
-    if len(step) == 0:
-        half = corners.new_tensor([0.5, 0.0] if axis == -1 else [0.0, 0.5])
-        (first, seen), (last, too) = (look_up((corners + 0.5 + side * half).reshape(-1, 2)) for side in (-1, 1))
-        step = (last - first).norm(dim=-1)[seen & too & shown.flatten(-2)]
-    footprint = float(step[:: 1 + len(step) // 100_000].quantile(0.9)) if len(step) else 1.0
-    return min(MAX_SUPERSAMPLING, max(1, math.ceil(footprint - 0.25)))
-
-
-def _sampled(
-    source: Tensor, places: Tensor, valid: Tensor, shape: tuple[int, int], size: tuple[int, int]
-) -> tuple[Tensor, Tensor]:
-    """Bilinear samples `(*B, C, rows, columns)` of the source at `places`, and which are inside it."""
-    seen = valid & inside(places, size)
-    last = places.new_tensor([max(size[0] - 1, 1), max(size[1] - 1, 1)])
-    grid = torch.where(seen.unsqueeze(-1), places, 0.0) * 2 / last - 1
-    batch = torch.broadcast_shapes(source.shape[:-3], grid.shape[:-2])
-    source, grid = source.expand(*batch, *source.shape[-3:]), grid.expand(*batch, *grid.shape[-2:])
-    flat = grid.reshape(-1, *shape, 2).to(source)
-    sampled = grid_sample(source.reshape(-1, *source.shape[-3:]), flat, padding_mode="border", align_corners=True)
-    sampled = sampled.reshape(*batch, *sampled.shape[1:])
-    seen = seen.expand(*batch, seen.shape[-1]).unflatten(-1, shape)
-    return torch.where(seen.unsqueeze(-3), sampled, 0.0), seen
-
-
 def _checked(
     name: str, image: Tensor, camera: Camera | PinholeCamera, plane: Plane, axes: Axes | None
 ) -> tuple[Tensor, Camera, Plane, Axes]:
@@ -327,6 +270,38 @@ def _checked(
         raise TypeError(f"axes: want (origin, axis_s, axis_t) as plane_axes gives them, got {called(axes)}")
     broadcast_batches(**shapes)
     return image, camera, plane, axes
+
+
+def _check_size(image: Tensor, camera: Camera) -> None:
+    """An image of another size than the camera's is another image: content from somewhere else, or none."""
+    height, width = image.shape[-2:]
+    if camera.size not in (None, (width, height)):
+        raise ValueError(
+            f"image: want {camera.size[0]} x {camera.size[1]} px as the camera has, got {width} x {height}; "
+            f"camera.resized(({width}, {height})) is the camera of the image or feature map at that size, and "
+            "camera.warped(matrix, size=...) of one that was cut or turned"
+        )
+
+
+def _numbers(samples: int | tuple[int, int] | None) -> tuple[int, int] | None:
+    """Of samples to the right and down."""
+    if samples is None:
+        return None
+    want = f"a number of samples from 1 to {MAX_SUPERSAMPLING}, or two of them"
+    both = samples if isinstance(samples, tuple | list) and len(samples) == 2 else (samples, samples)
+    right, down = (whole_number("samples", one, want, least=1, most=MAX_SUPERSAMPLING) for one in both)
+    return right, down
+
+
+def _of(chosen: Chosen, camera: Camera, plane: Plane, axes: Axes, image: Tensor) -> tuple[Camera, Plane, Axes]:
+    """Camera, plane and axes of some images of a batch."""
+    if chosen is None:
+        return camera, plane, axes
+    batch = torch.broadcast_shapes(
+        image.shape[:-3], camera.batch_shape, plane.batch_shape, *(axis.shape[:-1] for axis in axes)
+    )
+    origin, along_s, along_t = (axis.expand(*batch, 3)[chosen] for axis in axes)
+    return camera.expand(*batch)[chosen], plane.expand(*batch)[chosen], (origin, along_s, along_t)
 
 
 def _checked_extent(extent: Sequence[float]) -> tuple[float, float]:

@@ -314,3 +314,93 @@ def test_bad_input_is_refused_by_name() -> None:
     for kind, message, call in cases:
         with pytest.raises(kind, match=message):
             call()
+
+
+def _pair() -> tuple[torch.Tensor, dp.Camera]:
+    """Two images, one from 300 and one from 1000 above the plane."""
+    K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+    R = dp.rotation_from_euler(*torch.tensor([0.3, 0.2, 0.1], dtype=torch.float64))
+    t = torch.tensor([[0.0, 0, 300], [0, 0, 1000]], dtype=torch.float64)
+    image = torch.rand(2, 1, 480, 640, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    return image, dp.Camera(K, R, t, size=(640, 480))
+
+
+def test_an_image_does_not_depend_on_its_batch_mates() -> None:
+    image, cameras = _pair()
+    extent = (-150, -150, 150, 150)
+    both, seen = dp.rectify(image, cameras, dp.Plane.z(0.0), extent, 4.0)
+    texture = torch.rand(2, 1, 600, 600, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    rendered, shown = dp.render(texture, cameras, dp.Plane.z(0.0), extent)
+    for b in range(2):
+        alone, valid = dp.rectify(image[b], cameras[b], dp.Plane.z(0.0), extent, 4.0)
+        torch.testing.assert_close(both[b], alone, rtol=0, atol=1e-12)
+        assert torch.equal(seen[b], valid)
+        alone, valid = dp.render(texture[b], cameras[b], dp.Plane.z(0.0), extent)
+        torch.testing.assert_close(rendered[b], alone, rtol=0, atol=1e-12)
+        assert torch.equal(shown[b], valid)
+    one_image, _ = dp.rectify(image[0], cameras, dp.Plane.z(0.0), extent, 4.0)  # seen by both
+    torch.testing.assert_close(one_image[0], both[0], rtol=0, atol=1e-12)
+    many = image.expand(3, 2, 1, 480, 640)
+    torch.testing.assert_close(dp.rectify(many, cameras, dp.Plane.z(0.0), extent, 4.0)[0][1], both, rtol=0, atol=1e-12)
+
+
+def test_a_view_changes_without_a_jump_as_the_camera_moves() -> None:
+    image, cameras = _pair()
+    extent, steps = (-60.0, -50.0, 60.0, 50.0), 300
+    heights = torch.linspace(420, 560, steps, dtype=torch.float64)  # the footprint passes from 3 to 2 pixels
+    t = torch.stack([torch.zeros_like(heights), torch.zeros_like(heights), heights], dim=-1)
+    views, valid = dp.rectify(image[0], cameras[0].at(cameras.R[0], t), dp.Plane.z(0.0), extent, 2.5)
+    assert valid.all()
+    change = views.diff(dim=0).abs().mean((-1, -2, -3))
+    assert float(change.max()) < 3 * float(change.median())  # 30 times with numbers of samples that jump
+
+
+def test_slopes_where_two_numbers_of_samples_meet() -> None:
+    """The gradient by the camera agrees with finite differences there, the weights of both results included."""
+    image, cameras = _pair()
+    smooth = torch.nn.functional.avg_pool2d(image[:1], 9, 1, 4)[0]
+
+    def value(height: torch.Tensor) -> torch.Tensor:
+        t = torch.stack([torch.zeros_like(height), torch.zeros_like(height), height])
+        view, _ = dp.rectify(smooth, cameras[0].at(cameras.R[0], t), dp.Plane.z(0.0), (-60, -50, 60, 50), 2.5)
+        return (view * torch.linspace(0, 1, view.shape[-1], dtype=view.dtype)).sum()
+
+    for z in (425.0, 445.0, 500.0, 555.0):
+        height = torch.tensor(z, dtype=torch.float64, requires_grad=True)
+        (slope,) = torch.autograd.grad(value(height), height)
+        step = 1e-4
+        difference = (value(height.detach() + step) - value(height.detach() - step)) / (2 * step)
+        torch.testing.assert_close(slope, difference, rtol=2e-2, atol=1e-3)
+
+
+def test_samples_that_are_said() -> None:
+    image, cameras = _pair()
+    extent = (-150, -150, 150, 150)
+    top, valid = dp.rectify(image, cameras, dp.Plane.z(0.0), extent, 4.0, samples=1)
+    s = -148 + 4 * torch.arange(75, dtype=torch.float64)
+    cells = torch.stack([*torch.meshgrid(s, s, indexing="xy"), torch.zeros(75, 75, dtype=torch.float64)], dim=-1)
+    pixels, _ = cameras.project(cells.reshape(1, -1, 3).expand(2, -1, -1))
+    grid = (pixels * 2 / torch.tensor([639.0, 479], dtype=torch.float64) - 1).reshape(2, 75, 75, 2)
+    want = torch.nn.functional.grid_sample(image, grid, padding_mode="border", align_corners=True)
+    torch.testing.assert_close(
+        torch.where(valid.unsqueeze(1), top - want, 0.0), torch.zeros_like(top), rtol=0, atol=1e-12
+    )
+    assert valid.float().mean() > 0.5
+    two = dp.rectify(image, cameras, dp.Plane.z(0.0), extent, 4.0, samples=(2, 1))[0]
+    assert not torch.equal(two, top)
+    for wrong in (0, 129, (1, 0)):
+        with pytest.raises(ValueError, match="samples: want a number of samples from 1 to 128"):
+            dp.rectify(image, cameras, dp.Plane.z(0.0), extent, 4.0, samples=wrong)
+
+
+def test_an_image_of_another_size_than_the_camera_is_refused() -> None:
+    image, cameras = _pair()
+    features = torch.nn.functional.avg_pool2d(image, 8)
+    extent = (-100, -100, 100, 100)
+    with pytest.raises(ValueError, match=r"image: want 640 x 480 px as the camera has, got 80 x 60; camera.resized"):
+        dp.rectify(features, cameras, dp.Plane.z(0.0), extent, 4.0)
+    top, valid = dp.rectify(features, cameras.resized((80, 60)), dp.Plane.z(0.0), extent, 20.0)
+    full, too = dp.rectify(image, cameras, dp.Plane.z(0.0), extent, 20.0)
+    both = valid & too
+    assert both.float().mean() > 0.5
+    assert float((top - full).abs()[both.unsqueeze(1)].mean()) < 0.02

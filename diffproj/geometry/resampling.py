@@ -1,0 +1,205 @@
+"""Resampling an image to another grid, against aliasing: how many samples a target pixel takes, and their mean.
+
+Where a target pixel's footprint in the source is larger than a pixel, it is the mean of n x m bilinear samples about a
+pixel apart. Each image of a batch has numbers of its own, so that no image depends on the others. They follow the
+footprint f without a jump: n samples up to f = n, n + 1 from f = n + 1/4 on, and between the two the mean of both
+results, weighted by where f lies. Said by the caller, the numbers are the same for all, nothing is looked up in
+advance, and nothing depends on values: that is for `torch.compile`, export, and speed.
+"""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from diffproj._core.numerics import block_points
+from diffproj.geometry.grid import inside, pixel_grid
+
+LookUp = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Maps places in the target `(N, 2)`, in pixels from its first corner, to positions in the source `(*B, N, 2)`, in
+pixels from the centre of its first pixel, and `valid (*B, N)`."""
+Chosen = tuple[Tensor, ...] | None
+"""Which images of the batch: an index as `Tensor.nonzero(as_tuple=True)` gives it; `None` for all."""
+
+MAX_SUPERSAMPLING = 128
+"""Maximum number of samples along each side of a pixel."""
+BAND = 0.25
+"""By how much a footprint goes beyond n pixels until there are n + 1 samples alone."""
+MOST_STEPS = 100_000
+"""Of the target's pixels of an image, whose footprints are compared."""
+
+
+def resampled(
+    source: Tensor,
+    look_up_of: Callable[[Chosen], LookUp],
+    shape: tuple[int, int],
+    like: Tensor,
+    samples: tuple[int, int] | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Resample sources to targets.
+
+    Args:
+        source: `(*B, C, H, W)`.
+        look_up_of: gives the look-up of some images of the batch.
+        shape: `(rows, columns)` of the target.
+        like: a tensor of the look-up's dtype and device.
+        samples: along a pixel's sides, to the right and down; from the footprint of each image if left out.
+
+    Returns:
+        The targets `(*B, C, rows, columns)`, 0 where not valid; and `valid (*B, rows, columns)`: at least half of the
+        pixel's samples are in the source.
+    """
+    corners = pixel_grid(*shape, like)
+    if samples is not None:
+        total, share = _mean(source, look_up_of(None), corners, samples)
+        return _finished(total, share)
+    with torch.no_grad():
+        places, valid = look_up_of(None)((corners + 0.5).reshape(-1, 2))
+        shown = (valid & inside(places, _size(source))).unflatten(-1, shape)
+        footprints = _footprints(look_up_of(None), corners, places.unflatten(-2, shape), shown)
+        between = any(bool(((more > 0) & (more < 1)).any()) for _, more in map(_numbers, footprints))
+    if between and torch.is_grad_enabled():  # how the weights of two results move with the camera
+        places, _ = look_up_of(None)((corners + 0.5).reshape(-1, 2))
+        footprints = _footprints(look_up_of(None), corners, places.unflatten(-2, shape), shown)
+    # A target may reach far beyond the source: only the part about what is shown is sampled.
+    (top, bottom), (left, end) = (_range_of(shown.transpose(-1, axis).flatten(0, -2).any(0)) for axis in (-2, -1))
+    part = corners[top:bottom, left:end]
+    batch = torch.broadcast_shapes(source.shape[:-3], shown.shape[:-2])
+    every = source.expand(*batch, *source.shape[-3:])
+    numbers = [_numbers(footprint.expand(batch)) for footprint in footprints]
+    total, share = torch.zeros((), dtype=source.dtype, device=source.device), like.new_zeros(())
+    for right in _distinct(numbers[0]):
+        for down in _distinct(numbers[1]):
+            weight = _weight(numbers[0], right) * _weight(numbers[1], down)
+            if not bool((weight > 0).any()):
+                continue
+            chosen = None if bool((weight > 0).all()) else weight.nonzero(as_tuple=True)
+            if chosen is not None and not batch:
+                chosen = None
+            images = source if chosen is None else every[chosen]
+            found, seen = _mean(images, look_up_of(chosen), part, (right, down))
+            of_each = weight if chosen is None else weight[chosen]
+            found, seen = found * of_each[..., None, None, None].to(found), seen * of_each[..., None, None]
+            if chosen is not None:
+                found = found.new_zeros(*batch, *found.shape[-3:]).index_put(chosen, found)
+                seen = seen.new_zeros(*batch, *seen.shape[-2:]).index_put(chosen, seen)
+            total, share = total + found, share + seen
+    around = (left, shape[1] - end, top, shape[0] - bottom)
+    mean, covered = _finished(total, share)
+    return torch.nn.functional.pad(mean, around), torch.nn.functional.pad(covered, around)
+
+
+def _finished(total: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+    """The mean over the samples that are in the source, and where these are at least half."""
+    covered = share >= 0.5 - 1e-6
+    return torch.where(covered.unsqueeze(-3), total / share.clamp(min=0.25).unsqueeze(-3).to(total), 0.0), covered
+
+
+def _mean(source: Tensor, look_up: LookUp, corners: Tensor, samples: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """The sum of samples over their number `(*B, C, rows, columns)`, and the share that is in the source.
+
+    Args:
+        source: `(*B, C, H, W)`.
+        look_up: where places of the target are in the source.
+        corners: of the target's pixels `(rows, columns, 2)`.
+        samples: to the right and down.
+    """
+    right, down = samples
+    rows, columns = corners.shape[:2]
+    offsets = ((pixel_grid(down, right, corners) + 0.5) / corners.new_tensor([right, down])).reshape(-1, 2)
+    most = max(1, block_points(corners.device) // max(1, rows * columns * source.shape[:-3].numel()))
+    total, share = torch.zeros((), dtype=source.dtype, device=source.device), corners.new_zeros(())
+    for some in offsets.split(most):
+        places, valid = look_up((corners + some[:, None, None]).reshape(-1, 2))
+        sampled, seen = _sampled(source, places, valid, (len(some) * rows, columns))
+        if len(offsets) == 1:
+            return sampled, seen.to(corners.dtype)
+        total = total + sampled.unflatten(-2, (len(some), rows)).sum(-3)
+        share = share + seen.unflatten(-2, (len(some), rows)).sum(-3)
+    return total / len(offsets), share / len(offsets)
+
+
+def _sampled(source: Tensor, places: Tensor, valid: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Bilinear samples `(*B, C, rows, columns)` of the source at `places`, and which are inside it."""
+    size = _size(source)
+    seen = valid & inside(places, size)
+    last = places.new_tensor([max(size[0] - 1, 1), max(size[1] - 1, 1)])
+    grid = torch.where(seen.unsqueeze(-1), places, 0.0) * 2 / last - 1
+    batch = torch.broadcast_shapes(source.shape[:-3], grid.shape[:-2])
+    source, grid = source.expand(*batch, *source.shape[-3:]), grid.expand(*batch, *grid.shape[-2:])
+    flat = grid.reshape(-1, *shape, 2).to(source)
+    sampled = grid_sample(source.reshape(-1, *source.shape[-3:]), flat, padding_mode="border", align_corners=True)
+    sampled = sampled.reshape(*batch, *sampled.shape[1:])
+    seen = seen.expand(*batch, seen.shape[-1]).unflatten(-1, shape)
+    return torch.where(seen.unsqueeze(-3), sampled, 0.0), seen
+
+
+def _size(source: Tensor) -> tuple[int, int]:
+    """Width and height."""
+    return source.shape[-1], source.shape[-2]
+
+
+def _range_of(lines: Tensor) -> tuple[int, int]:
+    """The range of lines `(n,)` that are shown, and one more on each side; all where none is."""
+    where = lines.nonzero().flatten()
+    return (max(0, int(where[0]) - 1), min(len(lines), int(where[-1]) + 2)) if len(where) else (0, len(lines))
+
+
+# ----------------------------------------------------------------------------------------------------- how many samples
+
+
+def _footprints(look_up: LookUp, corners: Tensor, places: Tensor, shown: Tensor) -> list[Tensor]:
+    """To the right and down: see `_footprint`."""
+    return [_footprint(look_up, corners, places, shown, axis) for axis in (-1, -2)]
+
+
+def _footprint(look_up: LookUp, corners: Tensor, places: Tensor, shown: Tensor, axis: int) -> Tensor:
+    """The footprint of the target's pixels in the source along a side, in px, for each image `(*B,)`.
+
+    It is the 90th percentile over the target's pixels that are shown, from neighbour to neighbour, or, where there are
+    none, from edge to edge; 1 where nothing is shown.
+
+    Args:
+        look_up: where places of the target are in the source.
+        corners: of the target's pixels `(rows, columns, 2)`.
+        places: of their middles in the source `(*B, rows, columns, 2)`.
+        shown: which of these lie in the source `(*B, rows, columns)`.
+        axis: along which: -1 to the right, -2 down.
+    """
+    step, pairs = places.diff(dim=axis - 1).norm(dim=-1), shown.shape[axis] - 1
+    both = shown.narrow(axis, 0, pairs) & shown.narrow(axis, 1, pairs)
+    footprint = _percentile(step.flatten(-2), both.flatten(-2))
+    if bool(footprint.isnan().any()):
+        half = corners.new_tensor([0.5, 0.0] if axis == -1 else [0.0, 0.5])
+        (first, seen), (last, too) = (look_up((corners + 0.5 + side * half).reshape(-1, 2)) for side in (-1, 1))
+        alone = _percentile((last - first).norm(dim=-1), seen & too & shown.flatten(-2))
+        footprint = torch.where(footprint.isnan(), alone, footprint)
+    return footprint.nan_to_num(1.0)
+
+
+def _percentile(values: Tensor, counts: Tensor) -> Tensor:
+    """The 90th percentile of those values `(*B, n)` that count; NaN where none does."""
+    if values.shape[-1] == 0:
+        return values.new_full(values.shape[:-1], torch.nan)
+    every = 1 + values.shape[-1] // MOST_STEPS
+    return torch.where(counts, values, torch.nan)[..., ::every].nanquantile(0.9, dim=-1)
+
+
+def _numbers(footprint: Tensor) -> tuple[Tensor, Tensor]:
+    """The number of samples along a side, and the share of the result with one more, `(*B,)`."""
+    fewer = (footprint - BAND).ceil().clamp(1, MAX_SUPERSAMPLING)
+    more = ((footprint - fewer) / BAND).clamp(0, 1)
+    return fewer, torch.where(fewer < MAX_SUPERSAMPLING, more, 0.0)
+
+
+def _distinct(numbers: tuple[Tensor, Tensor]) -> list[int]:
+    """All numbers of samples that some image needs."""
+    fewer, more = numbers
+    return sorted({int(n) for n in fewer.unique().tolist()} | {int(n) + 1 for n in fewer[more > 0].unique().tolist()})
+
+
+def _weight(numbers: tuple[Tensor, Tensor], n: int) -> Tensor:
+    """The share of the result with n samples, of each image `(*B,)`."""
+    fewer, more = numbers
+    return torch.where(fewer == n, 1 - more, torch.where(fewer + 1 == n, more, 0.0))
