@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import diffproj as dp
+from diffproj.cli import main
 
 BOARD = dp.Chessboard()
 
@@ -96,3 +97,11 @@ def test_what_a_format_cannot_hold_is_refused(rig: dp.RigCalibration, tmp_path: 
         dp.save_camera(tmp_path / "rig.yaml", many)
     with pytest.raises(ValueError, match="radtan"):
         dp.save_camera(tmp_path / "rig.yaml", many, format="kalibr")
+
+
+def test_the_command_line_converts_rigs(rig: dp.RigCalibration, tmp_path: Path) -> None:
+    dp.save_camera(tmp_path / "rig.json", rig)
+    assert main(["convert", str(tmp_path / "rig.json"), str(tmp_path / "pair.yaml")]) == 0
+    assert dp.load_camera(tmp_path / "pair.yaml", camera=1).t.equal(rig.cameras["right"].t)
+    assert main(["convert", str(tmp_path / "rig.json"), str(tmp_path / "one.json"), "--camera", "right"]) == 0
+    assert isinstance(dp.load(tmp_path / "one.json"), dp.Camera)
