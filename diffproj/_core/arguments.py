@@ -269,9 +269,11 @@ def tensor_of(name: str, value: object, like: Kind | None = None) -> Tensor:
 
     Raises:
         TypeError: it is no such thing.
+        ValueError: an array some of whose entries are masked.
     """
     if isinstance(value, Tensor):
         return value
+    _check_unmasked(name, value)
     taken = isinstance(value, _ARRAYS) or hasattr(value, "__array__")
     try:
         array = np.asarray(value) if taken and not isinstance(value, type | bool) else np.asarray(None)
@@ -290,15 +292,27 @@ def tensor_of(name: str, value: object, like: Kind | None = None) -> Tensor:
     return tensor.to(like.device, like.dtype)
 
 
+def _check_unmasked(name: str, value: object) -> None:
+    """That no entry of an array is masked: its values would be taken for good.
+
+    Raises:
+        ValueError: some are.
+    """
+    if isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value)):
+        raise ValueError(f"{name}: want an array without masked entries, got some; .filled(...) gives them values")
+
+
 def booleans(name: str, value: object, device: torch.device | None = None) -> Tensor:
     """A tensor of booleans as it is; an array or lists of booleans as a new tensor on that device.
 
     Raises:
         TypeError: anything else.
+        ValueError: an array some of whose entries are masked.
     """
     if isinstance(value, Tensor):
         found = value
     else:
+        _check_unmasked(name, value)
         taken = isinstance(value, np.ndarray | np.bool_ | bool | list | tuple)
         try:
             array = np.asarray(value if taken else None)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import Kind, tensor_of
-from diffproj._core.torch_private import in_forward_mode, in_functional_transform
+from diffproj._core.torch_private import has_no_values, in_forward_mode, in_functional_transform
 
 BLOCK_POINTS = 2**16
 """Points handled at once on a CPU when no derivative is asked: large enough to hide the cost of dispatch, small enough
@@ -52,13 +52,16 @@ def check_tensor(name: str, value: object, *shape: int | str, like: Kind | None 
         The tensor, in float32 if it came in half precision.
 
     Raises:
-        TypeError: no tensor, array or numbers, or a tensor that is not of floating-point type.
+        TypeError: no tensor, array or numbers, or a tensor that is not dense or not of floating-point type.
         ValueError: the trailing axes do not fit.
     """
     if not isinstance(value, Tensor):
         value = tensor_of(name, value, like)
+    if not torch.compiler.is_compiling():
+        value = _dense(name, value)
     if not value.is_floating_point():
-        raise TypeError(f"{name}: want a floating-point tensor, got {value.dtype}; .double() or .float() makes one")
+        remedy = ".real and .imag are" if value.is_complex() else ".double() or .float() makes one"
+        raise TypeError(f"{name}: want a floating-point tensor, got {value.dtype}; {remedy}")
     if shape:
         fits = value.ndim >= len(shape) and all(
             isinstance(want, str) or want == got
@@ -68,6 +71,23 @@ def check_tensor(name: str, value: object, *shape: int | str, like: Kind | None 
             want = ", ".join(["*B", *map(str, shape)])
             raise ValueError(f"{name}: want shape ({want}), got {tuple(value.shape)}")
     return at_least_float32(value)
+
+
+def _dense(name: str, tensor: Tensor) -> Tensor:
+    """A tensor with its values in memory one by one, as all but sparse, nested and quantised ones are.
+
+    One that PyTorch keeps as the negative of another, such as `z.conj().imag`, is worked out.
+
+    Raises:
+        TypeError: it is sparse, nested or quantised.
+    """
+    if tensor.is_nested:
+        raise TypeError(f"{name}: want a dense tensor, got a nested one; torch.stack(...) joins tensors of one shape")
+    if tensor.layout is not torch.strided:
+        raise TypeError(f"{name}: want a dense tensor, got layout {tensor.layout}; .to_dense() makes one")
+    if tensor.is_quantized:
+        raise TypeError(f"{name}: want a dense tensor, got {tensor.dtype}; .dequantize() makes one")
+    return tensor.resolve_neg() if tensor.is_neg() else tensor
 
 
 def check_same_kind(**tensors: Kind | None) -> None:
@@ -104,9 +124,9 @@ def broadcast_batches(**shapes: Sequence[int]) -> torch.Size:
 
 
 def has_values(*tensors: Tensor) -> bool:
-    """Whether the values of these tensors can be read here: not while compiling, exporting or under `vmap`."""
+    """Whether the values of these tensors can be read here: not while compiling, under `vmap`, or of a fake tensor."""
     tracing = torch.compiler.is_compiling() or in_functional_transform()
-    return not (tracing or any(tensor.is_meta for tensor in tensors))
+    return not (tracing or any(has_no_values(tensor) for tensor in tensors))
 
 
 def spread_evenly(total: int, count: int, device: torch.device) -> Tensor:

@@ -21,6 +21,11 @@ def in_forward_mode() -> bool:
     return torch.autograd.forward_ad._current_level >= 0
 
 
+def has_no_values(tensor: torch.Tensor) -> bool:
+    """Whether it is a shape alone: on the meta device, or fake, as `FakeTensorMode` makes tensors."""
+    return tensor.is_meta or type(tensor).__name__ == "FakeTensor"
+
+
 def constant_in_graphs(function: F) -> F:
     """Mark a function that `torch.compile` is to call once, while it traces, and whose result is a constant.
 

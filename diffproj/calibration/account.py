@@ -206,7 +206,7 @@ class Account(Shown):
             >>> import diffproj as dp
             >>> found = dp.calibrate(dp.example_views("left"), dp.Chessboard()).to_dict()
             >>> found["status"], found["views"], round(found["f_x"]), round(found["f_x_deviation"], 1)
-            ('CONVERGED', 13, 533, 0.9)
+            ('CONVERGED', 13, 534, 0.9)
         """
         many = bool(self.views.batch_shape)
 

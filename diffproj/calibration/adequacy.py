@@ -1,9 +1,10 @@
 """How far the model of a calibration may be off before it counts as none, and which model would be better."""
 
+import torch
 from torch import Tensor
 
 from diffproj.calibration.fit import Fit
-from diffproj.calibration.leftover import leftover
+from diffproj.calibration.leftover import Effect, Leftover, leftover
 from diffproj.calibration.task import Task
 from diffproj.lens.models import MODELS
 
@@ -44,6 +45,25 @@ def gravely_inadequate(found: Fit) -> Tensor:
 def poses_only(task: Task) -> bool:
     """Whether intrinsics and lens are all held."""
     return task.basis is not None and task.basis.shape[-1] == 0
+
+
+def counts(effect: Effect, i: int, share: float) -> bool:
+    """Whether an effect on camera `i` is none of chance, and explains more than a part of the sum of squares."""
+    return float(effect.deviations[i]) > SIGNIFICANT and float(effect.least_share[i]) > share
+
+
+def wants_skew(task: Task, left: Leftover, i: int) -> bool:
+    """Whether skew, which is held, is the word for most of what the residuals of camera `i` leave over."""
+    least = max(SMOOTH_SHARE, SKEW_PART * float(left.smooth.least_share[i]))
+    return not task.skew and counts(left.skew, i, least)
+
+
+def grave_remedy(found: Fit, p: int) -> str:
+    """What residuals are like that are far too large for a calibration, and the remedy."""
+    left = leftover(found, torch.tensor([p], device=found.task.used.device), SIGNIFICANT)
+    if wants_skew(found.task, left, 0):
+        return "as through a K with skew: take skew=True"
+    return f"as through another lens: {other_lens(found.task, p, radial=True)}"
 
 
 def other_lens(task: Task, p: int, radial: bool) -> str:

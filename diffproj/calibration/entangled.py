@@ -29,9 +29,12 @@ from diffproj.calibration.leftover import effect
 from diffproj.calibration.parametrisation import INTRINSICS, SKEW
 from diffproj.calibration.solver import Status
 from diffproj.calibration.uncertainty import covariance_of
+from diffproj.lens.models import MODELS
 
 ONE_SIDED = (("tau_x", "tau_y"), ("s1", "s2", "s3", "s4"), (SKEW,))
 """Groups of parameters that bend the image to one side, as a shift of the principal point does."""
+DENOMINATOR = ("k4", "k5", "k6")
+"""The terms below the line of a rational lens."""
 FAR = 2.0
 """Deviations of an intrinsic parameter beyond which its error bar does not cover another value."""
 
@@ -80,6 +83,26 @@ class Entangled:
             which = sound.nonzero().flatten()
             return _simpler(self.found.part(which), which.tolist(), groups) if len(which) else {}
 
+    @cached_property
+    def needless(self) -> dict[int, float]:
+        """Where the terms below the line buy nothing that corners could tell: the part by which residuals grow without.
+
+        Such terms stand for noise, and of many places where they could, the fit ended in one.
+        """
+        names = tuple(name for name in DENOMINATOR if name in _free(self.found))
+        if not names or not MODELS[self.found.task.lens].perspective:  # a fisheye has another k4
+            return {}
+        with torch.no_grad():
+            sound = (self.status == Status.CONVERGED) & (self.found.pixel_sigma() > EXACT_PX)
+            which = sound.nonzero().flatten()
+            if len(which) == 0:
+                return {}
+            whole = self.found.part(which)
+            without = _without(whole, names)
+            same = (without.solution.status == Status.CONVERGED) & (_noticed(whole, without, names) < SIGNIFICANT)
+            growth = (without.solution.cost / whole.solution.cost).sqrt() - 1
+            return {int(which[i]): float(growth[i]) for i in same.nonzero().flatten().tolist()}
+
     def widened(self, covariance: Covariance) -> Covariance:
         """The covariance `(P, ...)` with the doubt in it."""
         if not self.simpler:
@@ -112,15 +135,21 @@ def _simpler(found: Fit, numbers: list[int], groups: list[tuple[str, ...]]) -> d
     return told
 
 
-def _free_groups(found: Fit) -> list[tuple[str, ...]]:
-    """The groups that are free, and of which nothing is known beforehand."""
+def _free(found: Fit) -> list[str]:
+    """The names of the shared parameters that are free, and of which nothing is known beforehand."""
     names = found.task.names
     free = torch.ones(len(names), dtype=torch.bool, device="cpu")
     if found.task.basis is not None:
         free &= (found.task.basis != 0).any(-1).any(0).cpu()
     if (known := found.measured_precision()) is not None:
         free &= ~(known.diagonal(dim1=-2, dim2=-1) > 0).any(0).cpu()
-    groups = [tuple(name for name in group if name in names and free[names.index(name)]) for group in ONE_SIDED]
+    return [name for name, is_free in zip(names, free.tolist(), strict=True) if is_free]
+
+
+def _free_groups(found: Fit) -> list[tuple[str, ...]]:
+    """The one-sided groups as far as they are free."""
+    free = _free(found)
+    groups = [tuple(name for name in group if name in free) for group in ONE_SIDED]
     return [group for group in groups if group]
 
 

@@ -4,12 +4,11 @@ import torch
 
 from diffproj.calibration import start
 from diffproj.calibration.data import Data
+from diffproj.calibration.nested import Nested
 from diffproj.calibration.options import Options
-from diffproj.calibration.outcome import minimised, outcome
+from diffproj.calibration.outcome import outcome
 from diffproj.calibration.parametrisation import Parametrisation
-from diffproj.calibration.restraint import restrained
 from diffproj.calibration.result import Calibration
-from diffproj.calibration.second_look import second_look
 from diffproj.lens.models import LensModel, model_named
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
@@ -19,7 +18,7 @@ def calibrated(
     views: Views, target: Target, distortion: LensModel, chosen: Options, who: str = "calibrate"
 ) -> Calibration:
     """What `calibrate` promises, for one lens and checked options; errors name `who` was asked."""
-    model = model_named(distortion)
+    model_named(distortion)
     data = Data(views, target, chosen.weights)
     if views.size is None:
         raise ValueError("views: want the photographs' size, got None; give Views(..., size=(width, height))")
@@ -28,20 +27,5 @@ def calibrated(
     # The start is a guess from the corners; what is held, or known, is not.
     reference = shared.clone()
     reference[:, :2], reference[:, 4:] = torch.nan, 0.0
-    near = None
-    if model.count > 5:
-        # The rational terms nearly cancel each other: from far off they lead into side valleys.
-        early = chosen.but(
-            fixed=(*chosen.fixed, *model.coefficient_names[5:]),
-            objective="image",
-            reject_outliers=False,
-            loss=None if chosen.objective == "plane" else chosen.loss,  # its scale is in world units
-        )
-        poorer, _ = minimised(data, early, parameters, shared, local, reference)
-        shared, local = near = poorer.solution.shared, poorer.solution.local
-    found, _ = minimised(data, chosen, parameters, shared, local, reference)
-    limits = {"max_iterations": chosen.max_iterations, "tolerance": chosen.tolerance}
-    found = second_look(found, straight, reject=chosen.outlier_limit, **limits)
-    if near is not None:
-        found = restrained(found, *near, views.size, reject=chosen.outlier_limit, **limits)
+    found = Nested(data, chosen, parameters, shared, local, reference, straight, views.size).richest()
     return outcome(who, data, found, views.size, chosen.throw)

@@ -12,16 +12,20 @@ from diffproj.calibration.adequacy import (
     SHAPE_SHARE,
     SHAPE_VIEWS,
     SIGNIFICANT,
-    SKEW_PART,
     SMOOTH_SHARE,
+    counts,
     other_lens,
     poses_only,
+    wants_skew,
 )
 from diffproj.calibration.entangled import Entangled, Simpler
 from diffproj.calibration.fit import Fit
-from diffproj.calibration.leftover import Effect, Leftover, leftover
+from diffproj.calibration.leftover import Leftover, leftover
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
+
+NO_DENOMINATOR = {"brown8": "'brown5'"} | dict.fromkeys(("brown12", "brown14"), "fixed=('k4', 'k5', 'k6')")
+"""What a lens with a denominator is without it."""
 
 
 def remarks(found: Fit, status: Tensor, doubt: Entangled) -> tuple[str, ...]:
@@ -33,7 +37,15 @@ def remarks(found: Fit, status: Tensor, doubt: Entangled) -> tuple[str, ...]:
         held = (task.prior.precision != task.prior.known).any(-1).any(-1)
     texts: list[list[str]] = [[] for _ in status]
     for p in (converged & held).nonzero().flatten().tolist():
-        texts[p].append("k4, k5 and k6 are drawn towards 0, for without that the lens folds inside the image")
+        texts[p].append(
+            "k4, k5 and k6 are held near those of a poorer lens, for without that the lens folds inside the image"
+        )
+    for p, growth in doubt.needless.items():
+        if not bool(held[p]):
+            texts[p].append(
+                f"k4, k5 and k6 stand for noise, without them the residuals are {100 * growth:.1f} % larger: "
+                f"{NO_DENOMINATOR[task.lens]} fits as well"
+            )
     for p, other in doubt.simpler.items():
         texts[p].append(_not_told(other))
     sigma = found.pixel_sigma().detach()
@@ -56,21 +68,17 @@ def _not_told(other: Simpler) -> str:
 
 def _left_over(task: Task, left: Leftover, i: int, p: int, sigma: float) -> str:
     """The sentence on the residuals of camera `p`, number `i` of those that were tested; empty where they are noise."""
-
-    def counts(effect: Effect, share: float) -> bool:
-        return float(effect.deviations[i]) > SIGNIFICANT and float(effect.least_share[i]) > share
-
-    if not task.skew and counts(left.skew, max(SMOOTH_SHARE, SKEW_PART * float(left.smooth.least_share[i]))):
+    if wants_skew(task, left, i):
         part = f"{100 * float(left.skew.share[i]):.0f} % of their sum of squares"
         return f"the residuals {LENS_WORDS} over the image, as through a K with skew ({part}): take skew=True"
     for radial, effect, share in ((True, left.radial, RADIAL_SHARE), (False, left.smooth, SMOOTH_SHARE)):
-        if counts(effect, share):
+        if counts(effect, i, share):
             where = "with the distance from the principal point" if radial else "over the image"
             part = f"{100 * float(effect.share[i]):.0f} % of their sum of squares"
             remedy = other_lens(task, p, radial)
             return f"the residuals {LENS_WORDS} {where}, as through another lens ({part}): {remedy}"
-    if int(task.used[p].any(-1).sum()) >= SHAPE_VIEWS and counts(left.shape, SHAPE_SHARE):
-        if counts(left.bow, BOW_PART * float(left.shape.share[i])):
+    if int(task.used[p].any(-1).sum()) >= SHAPE_VIEWS and counts(left.shape, i, SHAPE_SHARE):
+        if counts(left.bow, i, BOW_PART * float(left.shape.share[i])):
             return "the residuals repeat on the board, as if it were bent: take bow=True"
         return (
             f"the residuals repeat on the board, whose corners lie {float(left.moved[i]):.2g} world units (RMS) "

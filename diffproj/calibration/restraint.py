@@ -2,9 +2,12 @@
 
 The six radial terms of a rational lens nearly cancel each other, so that its unrestrained minimum may have a pole or a
 fold where corners were seen: the terms above and below the line go to zero together, a hair apart, and buy a
-fraction of the noise. Then the terms below the line, k4 to k6, are drawn towards 0, as little as makes the lens
-one-to-one over its corners and the image. At 0 they are the lens without them, from whose minimum the solver starts:
-the restrained lens never ends above it.
+fraction of the noise. Then the terms below the line, k4 to k6, are drawn towards those of the poorer lens that the fit
+starts from, 0 if it has none, as little as makes the lens one-to-one over its corners and the image. As the start costs
+nothing by this, a restrained lens does not end above the poorer one either.
+
+Held the valley is short, and its lowest place is found. From there the terms are let go step by step, as long as the
+lens does not fold: of several minima without restraint this leads to one that makes sense, where there is one.
 """
 
 import math
@@ -14,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffproj.calibration.entangled import DENOMINATOR
 from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.parametrisation import Pose
 from diffproj.calibration.reach import folds_at_corners, reaches_image
@@ -21,12 +25,19 @@ from diffproj.calibration.solver import Prior, Status
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import replaced, view_costs
 
-DENOMINATOR = ("k4", "k5", "k6")
-STRENGTHS = (1.0, 0.3, 0.1, 0.03, 0.01)
-"""Deviations to which the terms below the line are held, one after the other until the lens does not fold: what each
-adds to the denominator half an image's diagonal from the axis, where 1 is as much as there is without it."""
+FIRST = 1.0
+"""Deviation to which the terms below the line are held at first: what each adds to the denominator half an image's
+diagonal from the axis, where 1 is as much as there is without it."""
+TIGHTER = (0.3, 0.1, 0.03, 0.01)
+"""Then these, one after the other until the lens does not fold."""
+LOOSER = (3.0, 10.0, 30.0, math.inf)
+"""Or these, as long as it does not."""
+RUNG_STEPS = 100
+"""Steps of the solver at one of these; with the terms held most take ten to twenty."""
 HAIR = 1.1
 """Factor of the cost that is paid to make a lens that reaches all of its corners reach the whole image, too."""
+LOWER = 1e-9
+"""Part of the cost by which another minimum must be lower to be taken."""
 
 
 def restrained(
@@ -39,11 +50,11 @@ def restrained(
     max_iterations: int,
     tolerance: float,
 ) -> Fit:
-    """The fit with lenses that fold replaced by restrained ones; `Fit.task.prior` then holds what restrains them.
+    """The lowest fit whose lens does not fold; `Fit.task.prior` then holds what restrains it, if anything does.
 
     Args:
         found: the minimum without restraint.
-        shared: `(P, s)` of a fit with nothing below the line.
+        shared: `(P, s)` of the fit of a poorer lens.
         poses: of that fit.
         size: of the image.
         reject: robust standard deviations beyond which a corner is an outlier.
@@ -54,42 +65,55 @@ def restrained(
     below = [names.index(name) for name in DENOMINATOR if name in names]
     if task.basis is not None:
         below = [i for i in below if bool(task.basis[:, i].any())]
-    if not below:
+    which = (found.degrees_of_freedom() > 0).nonzero().flatten()
+    if not below or len(which) == 0:
         return found
     steps: dict[str, Any] = {"max_iterations": max_iterations, "tolerance": tolerance}
-    lost = folds_at_corners(task, found.solution.shared, found.solution.local)
-    lost |= found.solution.status != Status.CONVERGED
-    reached = torch.where(lost, -1.0, reaches_image(task, found.solution.shared, size))
-    which = ((reached < 1) & (found.degrees_of_freedom() > 0)).nonzero().flatten()
-    if len(which) == 0:
-        return found
-    given = replace(task, used=task.used | found.rejected).part(which)
-    poorer = given.holding(below)
-    start = fit(poorer, shared[which], tuple(z[which] for z in poses), reject=reject, **steps)
+    given = replace(task, used=task.used | found.rejected)
+    start = fit(given, shared, poses, max_iterations=0)
     precision = _unit_precision(start, below, size)
-    left = torch.arange(len(which), device=which.device)
-    for strength in STRENGTHS:
-        prior = _drawn_to_zero(given.part(left), precision[left] / strength**2)
-        tried = fit(
-            replace(given.part(left), prior=prior),
-            start.solution.shared[left],
-            tuple(z[left] for z in start.solution.local),
-            reject=reject,
-            **steps,
+    best, reached = found, _reached(found, size)
+    lost = reached < 0
+    dearest = torch.where(lost, torch.inf, HAIR * _data_cost(found))
+
+    def tried(which: Tensor, strength: float, near: Fit) -> tuple[Fit, Tensor]:
+        """Those of the cameras `(n,)` at that strength, from `near` `(n, ...)`; and which of them do not fold."""
+        nonlocal best, reached
+        part = given.part(which)
+        if strength < math.inf:
+            part = replace(part, prior=_drawn_to(shared[which], precision[which] / strength**2, part))
+        limits: dict[str, Any] = (
+            steps if strength == math.inf else steps | {"max_iterations": min(max_iterations, RUNG_STEPS)}
         )
-        rows = which[left]
-        sound = ~folds_at_corners(tried.task, tried.solution.shared, tried.solution.local)
-        sound &= tried.solution.status == Status.CONVERGED
-        sound &= lost[rows] | (_data_cost(tried) <= HAIR * found.solution.cost[rows])
-        reach = torch.where(sound, reaches_image(tried.task, tried.solution.shared, size), -1.0)
-        better = reach > reached[rows]
-        if bool(better.any()):
-            found = _put(found, rows[better], tried, better)
-            reached[rows] = reach.maximum(reached[rows])
-        left = left[reach < 1]
-        if len(left) == 0:
+        other = fit(part, near.solution.shared, near.solution.local, reject=reject, **limits)
+        cost = _data_cost(other)
+        reach = torch.where(cost <= dearest[which], _reached(other, size), -1.0)
+        better = (reach > reached[which]) | ((reach == reached[which]) & (cost < _data_cost(best)[which] * (1 - LOWER)))
+        best = _put(best, which[better], other, better)
+        reached[which] = reach.maximum(reached[which])
+        return other, reach >= 1
+
+    first, sound = tried(which, FIRST, start.part(which))
+    up, near = which[sound], first.part(sound.nonzero().flatten())
+    for strength in LOOSER:
+        if len(up) == 0:
             break
-    return found
+        near, sound = tried(up, strength, near)
+        up, near = up[sound], near.part(sound.nonzero().flatten())
+    down = which[reached[which] < 1]
+    for strength in TIGHTER:
+        if len(down) == 0:
+            break
+        tried(down, strength, start.part(down))
+        down = down[reached[down] < 1]
+    return best
+
+
+def _reached(found: Fit, size: tuple[int, int]) -> Tensor:
+    """Which part of the image's border the lens reaches `(P,)`; -1 where not even its own corners, or no minimum."""
+    task, solution = found.task, found.solution
+    lost = folds_at_corners(task, solution.shared, solution.local) | (solution.status != Status.CONVERGED)
+    return torch.where(lost, -1.0, reaches_image(task, solution.shared, size))
 
 
 def _unit_precision(start: Fit, below: list[int], size: tuple[int, int]) -> Tensor:
@@ -103,30 +127,38 @@ def _unit_precision(start: Fit, below: list[int], size: tuple[int, int]) -> Tens
     return precision
 
 
-def _drawn_to_zero(task: Task, precision: Tensor) -> Prior:
-    """The task's prior with precisions `(P, s)` about 0 added."""
+def _drawn_to(shared: Tensor, precision: Tensor, task: Task) -> Prior:
+    """The task's prior with precisions `(P, s)` about shared parameters `(P, s)` added."""
     more = torch.diag_embed(precision)
     if task.prior is None:
-        return Prior(torch.zeros_like(precision), more, torch.zeros_like(more))
+        return Prior(torch.where(precision > 0, shared, 0.0), more, torch.zeros_like(more))
     mean, given, _ = task.prior
     own = given.diagonal(dim1=-2, dim2=-1)
     total = own + precision
-    return Prior(torch.where(total > 0, own * mean / total, 0.0), given + more, given)
+    return Prior(torch.where(total > 0, (own * mean + precision * shared) / total, 0.0), given + more, given)
 
 
 def _data_cost(found: Fit) -> Tensor:
-    return view_costs(found.task, found.solution.shared, found.solution.local).sum(-1)
+    costs = view_costs(found.task, found.solution.shared, found.solution.local)
+    return (costs if found.task.shares is None else costs * found.task.shares).sum(-1)
 
 
 def _put(found: Fit, which: Tensor, other: Fit, taken: Tensor) -> Fit:
     """The fit with some cameras `(n,)` replaced by the others that are taken, their priors included."""
+    if len(which) == 0:
+        return found
     task = found.task
     used, rejected = task.used.clone(), found.rejected.clone()
     used[which], rejected[which] = other.task.used[taken], other.rejected[taken]
-    shared = found.solution.shared
-    nothing = shared.new_zeros(*shared.shape, shared.shape[-1])
-    prior = task.prior or Prior(torch.zeros_like(shared), nothing, nothing)
-    parts = [prior.mean, prior.precision, prior.precision if prior.known is None else prior.known]
-    new = Prior(*(a.index_put((which,), b[taken]) for a, b in zip(parts, other.task.prior, strict=True)))  # type: ignore
+    new = Prior(*(a.index_put((which,), b[taken]) for a, b in zip(_prior(found), _prior(other), strict=True)))
     solution = replaced(found.solution, which, other.solution, taken)
     return Fit(replace(task, used=used, prior=new), solution, rejected)
+
+
+def _prior(found: Fit) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, precision and known precision of the prior, 0 where there is none."""
+    shared, prior = found.solution.shared, found.task.prior
+    if prior is None:
+        nothing = shared.new_zeros(*shared.shape, shared.shape[-1])
+        return torch.zeros_like(shared), nothing, nothing
+    return prior.mean, prior.precision, prior.precision if prior.known is None else prior.known

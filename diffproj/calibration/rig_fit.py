@@ -10,7 +10,7 @@ from diffproj.calibration.fit import MAX_REJECTION_ROUNDS, normal_tensors
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.options import Options
 from diffproj.calibration.parametrisation import POSE
-from diffproj.calibration.restraint import DENOMINATOR
+from diffproj.calibration.entangled import DENOMINATOR
 from diffproj.calibration.rig_options import free_directions
 from diffproj.calibration.rig_problem import RigParameters, RigProblem
 from diffproj.calibration.rig_start import RigStart

@@ -36,24 +36,27 @@ BEST = 2
 """Focal lengths of the grid that are solved to the end."""
 SAMPLE_VIEWS = 16
 """Views of a camera that the grid and the correlation of residuals are judged by."""
-CORRELATED = 0.5
+CORRELATED = 0.65
 """Correlation of the residuals of neighbouring corners from which on they are not noise. (A printed board that is off
-its grid by 0.08 mm gives 0.43 at an RMS of 0.18 px.)"""
+its grid by 0.08 mm gives 0.58 at an RMS of 0.16 px.)"""
 MANY_STEPS = 12
 """Steps of the solver from which on a minimum is looked at again."""
 SHORT_FIT = 40
 """Steps after which only the best of the starts goes on."""
 MAX_TURNS = 3
 """Maximum number of views of a camera that are turned over, one after the other."""
+ALIKE = 1e-7
+"""Part of the cost up to which two starts have led to one place."""
 LOWER = 1e-9
 """Part of the cost by which another minimum must be lower to replace the first."""
 
 
-def doubtful(found: Fit, rejecting: bool) -> Tensor:
-    """Which minima deserve a second look `(P,)`."""
+def doubtful(found: Fit, steps_tell: bool, long_valley: bool = False) -> Tensor:
+    """Which minima deserve a second look `(P,)`, by their number of steps or by what is left of the residuals."""
     solution = found.solution
-    # Steps that were spent on rejecting outliers say nothing; what is left of the residuals does.
-    suspicious = correlation(found) > CORRELATED if rejecting else solution.iterations > MANY_STEPS
+    if long_valley:  # along which any start takes many steps, or does not come to an end
+        return ~(correlation(found) <= CORRELATED)
+    suspicious = solution.iterations > MANY_STEPS if steps_tell else correlation(found) > CORRELATED
     return suspicious | (solution.status != Status.CONVERGED)
 
 
@@ -72,7 +75,13 @@ def correlation(found: Fit) -> Tensor:
 
 
 def second_look(
-    found: Fit, straight: Straightened, *, reject: float | None, max_iterations: int, tolerance: float
+    found: Fit,
+    straight: Straightened,
+    *,
+    reject: float | None,
+    max_iterations: int,
+    tolerance: float,
+    long_valley: bool = False,
 ) -> Fit:
     """The lower of the first minimum and those from other starts, for each camera.
 
@@ -82,12 +91,14 @@ def second_look(
         reject: robust standard deviations beyond which a corner is an outlier.
         max_iterations: of the solver. Who allows it fewer steps than a start is judged by gets the first minimum.
         tolerance: of the solver.
+        long_valley: whether the last steps to any minimum are many, as with a rational lens.
     """
     if max_iterations < SHORT_FIT:
         return found
     steps: dict[str, Any] = {"max_iterations": max_iterations, "tolerance": tolerance}
     with torch.inference_mode():
-        which = doubtful(found, rejecting=reject is not None).nonzero().flatten()
+        # Steps that were spent on rejecting outliers say nothing.
+        which = doubtful(found, steps_tell=reject is None, long_valley=long_valley).nonzero().flatten()
         if len(which) == 0:
             return found
         task = replace(found.task, used=found.task.used | found.rejected).part(which)
@@ -103,15 +114,19 @@ def second_look(
         poses = tuple(torch.cat(parts) for parts in zip(*(poses for _, poses in starts), strict=True))
         poorer = _poorer(task.part(every))
     short: dict[str, Any] = steps | {"max_iterations": SHORT_FIT}
+    own = torch.ones(len(starts), len(which), dtype=torch.bool, device=which.device)
     if poorer is not None:
         near = fit(poorer, shared, poses, **short).solution
         shared, poses = near.shared, near.local
+        own = _first_of_alike(near.cost.reshape(own.shape))
     # Side by side, as one batch: the time of few views is that of the calls. Only the best goes on to the end.
-    others = fit(task.part(every), shared, poses, reject=reject, **short)
-    rows = torch.arange(len(which), device=which.device)
-    best = others.part(rows)
+    kept = own.flatten()
+    others = fit(task.part(every[kept]), shared[kept], tuple(z[kept] for z in poses), reject=reject, **short)
+    number = (kept.cumsum(0) - 1).reshape(own.shape)
+    best = others.part(number[0])
     for rank in range(1, len(starts)):
-        best = _lower(best, others.part(rows + rank * len(which)), rows, reject)
+        rows = own[rank].nonzero().flatten()
+        best = _lower(best, others.part(number[rank, rows]), rows, reject)
     last = fit(task, best.solution.shared, best.solution.local, reject=reject, **steps)
     found = _lower(found, last, which, reject)
     if straight.lens == "none" and (task.basis is None or bool(task.basis[:, 2:4].any())):
@@ -160,6 +175,13 @@ def _other_side(parameters: Parametrisation, solution: Solution, middle: Tensor)
     shared[:, lens], shared[:, 2:4] = 0.0, shared[:, 2:4] + moved
     aside = (moved / shared[:, :2]).unsqueeze(1) * t[..., 2:]
     return shared, (R, t - torch.nn.functional.pad(aside, (0, 1)))
+
+
+def _first_of_alike(costs: Tensor) -> Tensor:
+    """Which of the starts `(S, P)` of each camera end with a cost that none before them has; the first always does."""
+    same = (costs.unsqueeze(0) - costs.unsqueeze(1)).abs() <= ALIKE * costs.abs()  # (later, earlier, P)
+    before = torch.ones(len(costs), len(costs), dtype=torch.bool, device=costs.device).tril(-1)
+    return ~(same & before.unsqueeze(-1)).any(1)
 
 
 def _poorer(task: Task) -> Task | None:

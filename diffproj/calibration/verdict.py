@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from diffproj.calibration.adequacy import gravely_inadequate, other_lens, poses_only
+from diffproj.calibration.adequacy import LENS_WORDS, grave_remedy, gravely_inadequate, poses_only
 from diffproj.calibration.closed_form import homographies
 from diffproj.calibration.distinct import one_view
 from diffproj.calibration.fit import Fit
@@ -97,8 +97,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
             causes[p] = _folded(task, int(lost_corners(task, solution.shared, solution.local)[p].sum()))
         elif bool(wrong_lens[p]):
             sigma = f"{float(found.pixel_sigma()[p]):.1f} px in each coordinate"
-            remedy = other_lens(task, p, radial=True)
-            causes[p] = f"the residuals, {sigma}, change smoothly over the image, as through another lens: {remedy}"
+            causes[p] = f"the residuals, {sigma}, {LENS_WORDS} over the image, {grave_remedy(found, p)}"
         elif bool(misfits[p].any()):
             causes[p] = (
                 f"the corners of {_joined_names(names, misfits[p])} do not match the board: "

@@ -50,8 +50,8 @@ def run(options: argparse.Namespace) -> int:
         write_drawing(options.draw, figures.corners(calibration))
     with writing("--output", options.output):
         save_camera(options.output, calibration)
-    more = "" if options.output.suffix.lower() == ".json" else "; a .json file would hold the whole calibration"
-    result(f"\nWritten to {options.output}{more}")
+    lost = "; the unit, the poses and the error bars are read from a .json file only"
+    result(f"\nWritten to {options.output}{'' if options.output.suffix.lower() == '.json' else lost}")
     if options.draw is not None:
         result(f"Drawn to {options.draw}")
     return 0

@@ -63,7 +63,7 @@ def _holders(tree: Any) -> dict[str, dict[str, Any]]:
 
 
 def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
-    """One camera, as XML or JSON where the suffix says so; of a calibration also poses and errors.
+    """One camera, as XML or JSON where the suffix says so; of a calibration also poses, their unit and errors.
 
     Raises:
         ValueError: a batch of cameras, a pose, skew or a lens that OpenCV does not have.
@@ -92,6 +92,8 @@ def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
     if isinstance(item, Calibration):
         _, _, rvecs, tvecs = item.cameras.to_opencv()
         storage.write("nframes", len(item.views))
+        if item.unit is not None:  # of the translations
+            storage.write("world_unit", item.unit)
         storage.write("extrinsic_parameters", np.concatenate([rvecs, tvecs], axis=-1))
         storage.write("avg_reprojection_error", float(item.rms))
         storage.write("per_view_reprojection_errors", item.view_rms.numpy().reshape(-1, 1))

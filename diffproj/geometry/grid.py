@@ -18,7 +18,7 @@ def checked_size(size: Any) -> tuple[int, int] | None:
         return None
     try:
         width, height = (int(side) for side in size)
-        whole = (width, height) == tuple(size)
+        whole = (width, height) == tuple(size) and not any(isinstance(side, bool) for side in size)
     except (TypeError, ValueError, OverflowError):
         whole, width, height = False, 0, 0
     if not whole:

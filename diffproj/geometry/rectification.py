@@ -266,6 +266,8 @@ def _checked(
         for axis in axes:
             check_same_kind(camera=camera.K, axes=axis)
             shapes["axes"] = broadcast_batches(axes=shapes.get("axes", ()), axis=axis.shape[:-1])
+        origin, along_s, along_t = (axis.expand(*shapes["axes"], 3) for axis in axes)
+        axes = origin, along_s, along_t
     else:
         raise TypeError(f"axes: want (origin, axis_s, axis_t) as plane_axes gives them, got {called(axes)}")
     broadcast_batches(**shapes)

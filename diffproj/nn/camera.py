@@ -20,10 +20,11 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from diffproj._core.arguments import flag
+from diffproj._core.numerics import has_values
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.cayley import turned
 from diffproj.lens.models import coefficients_of, model_of
-from diffproj.nn.partial import PARTS, GeometryModule, Learn, add_parameter, check_has_values, learned, learned_parts
+from diffproj.nn.partial import PARTS, GeometryModule, Learn, add_kind, add_parameter, learned, learned_parts
 
 _PARAMETERS = {
     "focal": ("log_focal",),
@@ -78,7 +79,6 @@ class LearnableCamera(GeometryModule):
         super().__init__()
         camera = as_camera(camera).detach()
         check_tied(tied_intrinsics)
-        check_has_values("camera", camera.K)
         self._model = model_of(camera.distortion)
         available = [part for part in PARTS if self._model.count or part != "distortion"]
         chosen = learned_parts(available if learn is None else learn, available)
@@ -92,6 +92,7 @@ class LearnableCamera(GeometryModule):
         reach = camera.t.norm(dim=-1, keepdim=True)
         self.register_buffer("reach", torch.where(reach > 0, reach, 1.0))
         self.register_buffer("coefficients_0", coefficients.clone())
+        add_kind(self, camera)
         likes = {"focal": focal, "principal_point": focal, "distortion": coefficients, "pose": camera.t}
         for part, names in _PARAMETERS.items():
             for name in names:
@@ -164,7 +165,9 @@ def _intrinsics(camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _is_constant(tensor: Tensor, axis: int) -> bool:
-    """Whether all values along an axis are the same."""
+    """Whether all values along an axis are the same; without values, whether they are one value in memory."""
+    if not has_values(tensor):
+        return tensor.stride(axis) == 0
     return bool((tensor == tensor.narrow(axis, 0, 1)).all())
 
 

@@ -12,7 +12,7 @@ from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.models import coefficients_of, model_of
-from diffproj.nn.partial import GeometryModule
+from diffproj.nn.partial import GeometryModule, add_kind
 from diffproj.nn.plane import check_one_plane
 
 
@@ -37,7 +37,7 @@ class FixedMap(GeometryModule):
         >>> fixed = FixedMap(Camera(K, t=torch.tensor([0.0, 0, 1000])), Plane.z(0.0))
         >>> points, valid = fixed()(torch.tensor([[370.0, 240.0]]))
         >>> points.tolist(), [name for name, _ in fixed.named_buffers()]
-        ([[100.0, 0.0, 0.0]], ['K', 'R', 't', 'coefficients', 'normal', 'offset', 'matrix'])
+        ([[100.0, 0.0, 0.0]], ['K', 'R', 't', 'coefficients', 'normal', 'offset', 'matrix', 'kind'])
     """
 
     K: Tensor
@@ -61,6 +61,7 @@ class FixedMap(GeometryModule):
         with torch.inference_mode(False):  # so that the module trains and saves wherever it was built
             for name, tensor in tensors.items():
                 self.register_buffer(name, tensor.detach().clone(memory_format=torch.contiguous_format))
+        add_kind(self, camera)
         # The lens of the current coefficients, kept because it remembers what it works out about itself.
         self._lens: CoefficientLens | None = None
         self.register_load_state_dict_post_hook(_rebuild)

@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from torch import nn
 
+from diffproj._core.numerics import has_values
 from diffproj.geometry.back_projection import PlaneMap
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
 from diffproj.nn.camera import LearnableCamera
-from diffproj.nn.partial import check_has_values
 from diffproj.nn.plane import LearnablePlane
 
 
@@ -41,13 +41,12 @@ class LearnableMap(nn.Module):
     ) -> None:
         super().__init__()
         PlaneMap(camera, plane)  # checks that they fit together
-        check_has_values("camera", camera.K)
         plane = plane.like(camera.K)
         distance = plane.distance(camera.center.unsqueeze(-2)).abs()
         of_camera = {part: where for part, where in learn.items() if part != "plane"}
         self.camera = LearnableCamera(camera, of_camera, tied_intrinsics)
-        # Without a distance, as of a camera on the plane or of none at all, steps are in world units.
-        scale = float(distance.mean())
+        # Without a distance, as of a camera on the plane, of none at all, or without values, steps are in world units.
+        scale = float(distance.mean()) if has_values(distance) else 0.0
         self.plane = LearnablePlane(plane, scale if 0 < scale < math.inf else 1.0, learn.get("plane", False))
 
     @property

@@ -1,5 +1,6 @@
 """`PlaneLoss`: a loss in world units over the points that are valid."""
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -8,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from diffproj._core.arguments import Array, booleans
-from diffproj._core.numerics import check_tensor
+from diffproj._core.numerics import check_tensor, has_values
 from diffproj.calibration.losses import Loss, check_loss
 
 
@@ -50,17 +51,21 @@ class PlaneLoss(nn.Module):
             points: `(*B, N, 3)`, in world units.
             target: where they should be; it broadcasts to `points`.
             valid: which points count `(*B, N)`; all if left out. Points that do not count may be NaN or infinite.
-            weights: a factor for each point `(*B, N)`; 1 if left out.
-            resolution: world units per pixel at each point `(*B, N)`, as `ground_resolution` gives it: distances are
-                divided by it, so that far points, which one pixel moves further, count as much as near ones. No
-                gradient flows through it.
+            weights: a factor for each point `(*B, N)`, not negative; 1 if left out.
+            resolution: world units per pixel at each point `(*B, N)`, positive, as `ground_resolution` gives it:
+                distances are divided by it, so that far points, which one pixel moves further, count as much as near
+                ones. No gradient flows through it.
+
+        Weights and resolution may be anything where a point does not count. Their values are checked on a CPU, outside
+        of `torch.compile` and `vmap`; a GPU would have to be waited for.
 
         Without points the loss is 0.
 
         Raises:
             TypeError: points, target, weights or resolution that are no floating-point tensors, or a mask that is not
                 boolean.
-            ValueError: points or target without three coordinates, or something that does not broadcast to the points.
+            ValueError: points or target without three coordinates, something that does not broadcast to the points, or
+                weights or a resolution that cannot be, at a point that counts.
         """
         points = check_tensor("points", points, "N", 3, like=target if isinstance(target, Tensor) else None)
         target = _fitting("target", check_tensor("target", target, "N", 3, like=points), points, points.shape)
@@ -72,12 +77,16 @@ class PlaneLoss(nn.Module):
         off = torch.where(counts.unsqueeze(-1), points - target.to(points), 0.0)
         if resolution is not None:
             resolution = _fitting("resolution", check_tensor("resolution", resolution, like=points), points, each)
-            off = off / torch.where(counts, resolution, 1.0).detach().unsqueeze(-1).to(off)
+            resolution = torch.where(counts, resolution, 1.0).detach()
+            _check_values("resolution", resolution, math.ulp(0.0), "positive finite numbers")
+            off = off / resolution.unsqueeze(-1).to(off)
         value = off.square().sum(-1)
         value = value if self.loss is None else self.loss.value(value)
         if weights is not None:
             weights = _fitting("weights", check_tensor("weights", weights, like=points), points, each)
-            value = value * torch.where(counts, weights, 0.0).to(value)
+            weights = torch.where(counts, weights, 0.0)
+            _check_values("weights", weights, 0.0, "finite numbers that are not negative")
+            value = value * weights.to(value)
         return value.sum() / max(value.numel(), 1)
 
     if TYPE_CHECKING:  # PyTorch types the call of a module as Any
@@ -99,3 +108,17 @@ def _fitting(name: str, tensor: Tensor, points: Tensor, shape: Sequence[int]) ->
     if tensor.device != points.device:
         raise ValueError(f"{name}: want device {points.device} as points has, got {tensor.device}")
     return tensor
+
+
+def _check_values(name: str, values: Tensor, least: float, want: str) -> None:
+    """That values lie between `least` and infinity.
+
+    Raises:
+        ValueError: some do not.
+    """
+    if values.device.type != "cpu" or not values.numel() or not has_values(values):
+        return
+    low, high = (float(limit) for limit in values.detach().aminmax())
+    if not (low >= least and high < math.inf):
+        got = low if not low >= least else high
+        raise ValueError(f"{name}: want {want} at the points that count, got {got:g}; `valid` leaves points out")

@@ -1,12 +1,16 @@
 """What the learnable modules share: their precision, and parameters learned for all, some or none of a batch."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from diffproj._core.arguments import booleans, words
+from diffproj._core.numerics import has_values
+from diffproj.geometry.camera import Camera
+from diffproj.lens.models import MODELS, model_of
 
 PARTS = ("focal", "principal_point", "distortion", "pose")
 """The parts of a camera that can be learned."""
@@ -47,14 +51,35 @@ class GeometryModule(nn.Module):
             return super()._apply(convert, recurse)
 
 
-def check_has_values(name: str, tensor: Tensor) -> None:
-    """Check that what is to be learned starts somewhere.
+def add_kind(module: GeometryModule, camera: Camera) -> None:
+    """Make lens model and image size a part of the module's state, and refuse a state with others.
 
-    Raises:
-        ValueError: it is on the meta device.
+    The coefficients of a fisheye and of another lens may be as many, and one would be taken for the other.
     """
-    if tensor.is_meta:
-        raise ValueError(f"{name}: want values to start from, got one on the device meta")
+    own = (list(MODELS).index(model_of(camera.distortion).name), *(camera.size or NO_SIZE))
+    module.register_buffer("kind", torch.tensor(own, dtype=torch.int64, device=camera.device))
+
+    module.register_load_state_dict_pre_hook(partial(_check_kind, own))
+
+
+def _check_kind(own: tuple[int, ...], _: nn.Module, state: dict[str, Any], prefix: str, *rest: Any) -> None:
+    """Called before `load_state_dict`, which adds the message to its own."""
+    saved = state.get(f"{prefix}kind")
+    if saved is None or not has_values(saved):
+        return
+    theirs, errors = tuple(saved.tolist()), rest[-1]
+    if theirs[0] != own[0]:
+        names = dict(enumerate(MODELS))
+        want, got = f"lens {names[own[0]]!r}", f"lens {names.get(theirs[0], 'of another release')!r}"
+    elif theirs[1:] != own[1:] and NO_SIZE not in (theirs[1:], own[1:]):
+        want, got = f"size {own[1:]}", f"size {theirs[1:]}"
+    else:
+        return
+    errors.append(f"{prefix}kind: want the state of a camera with {want}, got {got}; build the module from such a one")
+
+
+NO_SIZE = (0, 0)
+"""In a state, of a camera that does not know its size."""
 
 
 def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:

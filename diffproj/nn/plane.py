@@ -7,7 +7,7 @@ from torch import Tensor
 
 from diffproj._core.arguments import number
 from diffproj.geometry.plane import Plane, as_plane
-from diffproj.nn.partial import GeometryModule, add_parameter, check_has_values, learned
+from diffproj.nn.partial import GeometryModule, add_parameter, learned
 
 
 class LearnablePlane(GeometryModule):
@@ -47,7 +47,6 @@ class LearnablePlane(GeometryModule):
         super().__init__()
         check_one_plane(plane)
         plane = plane.detach()
-        check_has_values("plane", plane.normal)
         length, (unit, distance) = plane.length, plane.normalised()
         scale = number("scale", scale, "a distance in world units, above 0", above=0)
         self.register_buffer("scale", length.new_tensor(scale))

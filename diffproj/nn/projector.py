@@ -101,7 +101,8 @@ class PlaneProjector(nn.Module):
             TypeError: no floating-point tensors, or others than the camera's dtype.
             ValueError: shapes or devices that do not fit, or a warp that `Camera.warped` refuses.
         """
-        with torch.autocast(self.geometry.device.type, enabled=False):
+        device = self.geometry.device.type
+        with torch.autocast("cpu" if device == "meta" else device, enabled=False):
             if warp is None and plane is None:
                 return self.geometry()(pixels)
             camera = self.camera if warp is None else self.camera.warped_by("warp", warp)

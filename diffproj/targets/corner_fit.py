@@ -1,10 +1,11 @@
 """Where four squares meet, to a hundredth of a pixel: a model of the blurred corner, fitted to the grey values."""
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Float32, Float64, Int, Shaped
 from torch import Tensor
 
 SMALLEST, LARGEST = 3.5, 12.0
@@ -12,17 +13,35 @@ SMALLEST, LARGEST = 3.5, 12.0
 lens bend the edges."""
 
 STEPS = 12
-"""Most steps of the fit."""
+"""Most steps of the fit; three are usual."""
 
 BLOCK = 60
-"""Corners fitted at a time."""
+"""Corners fitted at a time: as many as the processor's cache holds."""
 
-CLOSE = 5e-3
-"""Steps in px below which the fit has settled."""
+BLUR, SHARPEST, BLURRIEST = 1.0, 0.3, 8.0
+"""Standard deviation in px of the blur that the fit starts with, and its limits."""
 
-_UNKNOWNS = 9
+CLOSE, CLOSE_BLUR = 0.04, 0.1
+"""Steps in px of place and blur after which the fit has settled: the next would be some ten times smaller."""
+
+MANY = 0.6
+"""Share of corners that still move from which all of them do: less to be copied."""
+
+FARTHEST = np.array([1.5, 1.5, 0.3, 0.3, 3.0])
+"""Longest step of place in px, directions in radians, and blur in px."""
+
+DAMPING = 1e-3
+"""Share of their diagonal that is added to the equations of the edges."""
+
+_EDGES, _CONTRAST, _LEVEL, _GREY = 5, 5, 6, 9
+"""Rows of a corner's table: first the five derivatives of the model by the edges' place, directions and blur, but for a
+factor; then what the contrast, the level and the two components of the light's gradient multiply; at last the grey
+values. All of them times the root of each pixel's weight, which is what the level multiplies."""
+
+_DAMPED = np.ones((10, 10)) + np.diag([DAMPING] * 5 + [0.0] * 5)
+_RIDGE = 1e-6 * np.eye(10)
 _ROOT_HALF = 0.5**0.5
-_SLOPE = (2 / torch.pi) ** 0.5
+_SLOPE = (2 / np.pi) ** 0.5
 
 
 class Fitted(NamedTuple):
@@ -67,7 +86,7 @@ def fit_corners(
     """
     radius = np.clip(reach * spacing, SMALLEST, LARGEST)
     blocks = [slice(k, k + BLOCK) for k in range(0, len(corners), BLOCK)]
-    parts = [_fit_block(image, corners[k], angles[k], spacing[k], radius[k]) for k in blocks]
+    parts = [_fit_block(image, corners[k], angles[k], radius[k]) for k in blocks]
     return Fitted(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
@@ -75,143 +94,126 @@ def _fit_block(
     image: Shaped[np.ndarray, "h w"],
     corners: Float[np.ndarray, "n 2"],
     angles: Float[np.ndarray, "n 2"],
-    spacing: Float[np.ndarray, " n"],
     radius: Float[np.ndarray, " n"],
 ) -> Fitted:
-    """`fit_corners` for as many corners as the processor's cache holds, by Levenberg and Marquardt's method."""
-    grey, weight, x, y, base = _patches(image, corners, radius)
-    blur = (0.08 * spacing).clip(0.7, 3.0)[:, None]
-    start = np.concatenate([corners - base, angles, np.zeros((len(corners), 4)), blur], axis=1)
-    unknowns = torch.from_numpy(start.astype(np.float32))
-    unknowns[:, 4:6] = _first_light(unknowns, grey, weight, x, y)
-    damping = torch.full((len(corners), 1), 1e-3, dtype=unknowns.dtype, device="cpu")
-    error, slopes = _residuals(unknowns, grey, x, y)
-    cost = (weight * error * error).sum(-1)
-    for _ in range(STEPS):
-        weighted = slopes * weight.unsqueeze(1)
-        normal, gradient = weighted @ slopes.mT, (weighted @ error.unsqueeze(-1)).squeeze(-1)
-        damped = normal + torch.diag_embed(damping * normal.diagonal(dim1=-2, dim2=-1) + 1e-6)
-        step = torch.linalg.solve_ex(damped.double(), gradient.double())[0].float().nan_to_num()
-        proposed = unknowns + step
-        proposed[:, 8].clamp_(0.3, 8.0)
-        new_error, new_slopes = _residuals(proposed, grey, x, y)
-        new_cost = (weight * new_error * new_error).sum(-1)
-        better = new_cost < cost
-        if bool(better.all()):
-            unknowns, error, slopes, cost = proposed, new_error, new_slopes, new_cost
+    """`fit_corners` by Gauss and Newton's method. A corner that has settled leaves the work.
+
+    The grey values are linear in the light, and in the edges' step times the contrast: one solution gives both. Half of
+    the pixels are enough for the first step.
+    """
+    table, places, base = _patches(image, corners, radius)
+    edges = np.concatenate([corners - base, angles, np.full((len(corners), 1), BLUR)], axis=1)
+    products = np.zeros((len(corners), _GREY + 1, _GREY + 1))
+    solution, factor, moving = np.zeros((len(corners), _GREY)), np.ones(len(corners)), np.arange(len(corners))
+    for step in range(STEPS):
+        pixels = slice(0, len(places[0]) // 2 if step == 0 else None)
+        if len(moving) > MANY * len(corners):
+            moving = np.arange(len(corners))
+            part = table[..., pixels]
+            _fill(part, edges, places[:, pixels])
         else:
-            unknowns = torch.where(better[:, None], proposed, unknowns)
-            error = torch.where(better[:, None], new_error, error)
-            slopes = torch.where(better[:, None, None], new_slopes, slopes)
-            cost = torch.where(better, new_cost, cost)
-        damping = torch.where(better[:, None], damping * 0.1, damping * 10).clamp(1e-7, 1e6)
+            part = table[torch.from_numpy(moving)]
+            _fill(part, edges[moving], places)
+            table[torch.from_numpy(moving)] = part
+        products[moving] = (part @ part.mT).numpy()
+        damped = products[moving] * _DAMPED + _RIDGE
+        found = np.linalg.solve(damped[:, :_GREY, :_GREY], damped[:, :_GREY, _GREY:])[..., 0]
+        blur, contrast = edges[moving, 4], found[:, _CONTRAST]
+        factor[moving] = np.where(np.abs(contrast) > 1e-3, contrast, 1e-3) * (_SLOPE / blur)
+        solution[moving] = found
+        move = np.clip(found[:, :_EDGES] / factor[moving, None], -FARTHEST, FARTHEST)
+        edges[moving] += move
+        edges[moving, 4] = np.clip(edges[moving, 4], np.maximum(blur / 2, SHARPEST), np.minimum(blur * 2, BLURRIEST))
         # A start at the very place says nothing yet about the blur, which decides how well the model fits.
-        if bool((step[:, :2].abs().amax(-1) < CLOSE).all()) and bool((step[:, 8].abs() < 0.05).all()):
+        going = (np.abs(move[:, :2]).max(axis=1) > CLOSE) | (np.abs(move[:, 4]) > CLOSE_BLUR)
+        moving = moving[going] if step else moving
+        if not len(moving):
             break
-    return _judged(unknowns, cost, slopes, weight, corners, base, radius)
+    misfit, sigma = _judged(table, products, solution, factor)
+    moved = base + edges[:, :2]
+    failed = ~np.isfinite(misfit) | ~(np.linalg.norm(moved - corners, axis=-1) <= 0.7 * radius)
+    moved = np.where(failed[:, None], corners, moved)
+    return Fitted(moved, np.where(failed, np.inf, misfit), solution[:, _CONTRAST], sigma)
+
+
+def _judged(
+    table: Float32[Tensor, "n 10 p"],
+    products: Float64[np.ndarray, "n 10 10"],
+    solution: Float64[np.ndarray, "n 9"],
+    factor: Float64[np.ndarray, " n"],
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """How well the corners fit, relative to their contrast, and their standard deviation in px."""
+    weight, model = table[:, _LEVEL], table[:, :_GREY]
+    # What a corner's two coordinates take from each pixel: the first two rows of the inverse, times the model.
+    normal = products[:, :_GREY, :_GREY] + _RIDGE[:_GREY, :_GREY]
+    inverse = np.linalg.solve(normal, np.broadcast_to(np.eye(_GREY, 2), (len(normal), _GREY, 2))).swapaxes(1, 2)
+    rows = torch.from_numpy(np.concatenate([inverse, solution[:, None]], axis=1).astype(np.float32)) @ model
+    # With the last step, which was small, as the linear model sees it.
+    error = (table[:, _GREY] - rows[:, 2]).square().sum(-1).double().numpy()
+    variance = error / np.maximum(weight.square().sum(-1).numpy(), 1e-6)
+    # The estimate weighs pixels by w, their noise is alike.
+    spread = rows[:, :2].mul(weight.unsqueeze(1)).square().sum(dim=(1, 2)).double().numpy()
+    contrast = np.maximum(np.abs(solution[:, _CONTRAST]), 1e-3)
+    sigma = np.sqrt(variance * spread / 2) / np.abs(factor)
+    return np.sqrt(variance) / contrast, np.nan_to_num(sigma, nan=np.inf)
 
 
 def _patches(
     image: Shaped[np.ndarray, "h w"], corners: Float[np.ndarray, "n 2"], radius: Float[np.ndarray, " n"]
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Int[np.ndarray, "n 2"]]:
-    """Grey values, weights and places `(N, P)` around each corner, and the pixels `(N, 2)` that places count from."""
-    side = int(np.ceil(radius.max()))
-    place = np.arange(-side, side + 1)
-    x, y = (axis.ravel() for axis in np.meshgrid(place, place))
-    near = x * x + y * y <= (side + 0.5) ** 2
-    x, y = x[near], y[near]
+) -> tuple[Float32[Tensor, "n 10 p"], Float32[Tensor, "3 p"], Int[np.ndarray, "n 2"]]:
+    """Tables whose rows for the edges are still empty, the places x, y, 1 of pixels, and the pixels they count from."""
+    x, y, places = _disc(int(np.ceil(radius.max())))
     base = np.rint(corners).astype(int)
     u, v = base[:, :1] + x, base[:, 1:] + y
     height, width = image.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    grey = torch.from_numpy(image[v.clip(0, height - 1), u.clip(0, width - 1)].astype(np.float32))
-    x, y = (torch.from_numpy(axis.astype(np.float32)).unsqueeze(0) for axis in (x, y))
-    offset = torch.from_numpy(corners - base).to(torch.float32)
-    square = (x - offset[:, :1]) ** 2 + (y - offset[:, 1:]) ** 2
-    square /= torch.from_numpy(radius[:, None].astype(np.float32)) ** 2
-    weight = torch.where(torch.from_numpy(inside) & (square < 1), torch.exp(-square), 0.0)
-    return grey, weight, x, y, base
+    if inside.all():
+        grey = image.reshape(-1).take(v * width + u).astype(np.float32)
+    else:
+        grey = image[v.clip(0, height - 1), u.clip(0, width - 1)].astype(np.float32)
+    offset = (corners - base).astype(np.float32)
+    square = (places[0] - offset[:, :1]) ** 2 + (places[1] - offset[:, 1:]) ** 2
+    square /= radius[:, None].astype(np.float32) ** 2
+    weight = np.exp(-0.5 * square) * (inside & (square < 1))
+    table = np.empty((len(corners), _GREY + 1, len(x)), np.float32)
+    table[:, _LEVEL] = weight
+    np.multiply(weight[:, None], places[:2], out=table[:, _LEVEL + 1 : _GREY])
+    np.multiply(weight, grey - grey.mean(axis=1, keepdims=True), out=table[:, _GREY])
+    return torch.from_numpy(table), torch.from_numpy(places), base
 
 
-def _first_light(unknowns: Tensor, grey: Tensor, weight: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """The mean grey value and the signed contrast `(N, 2)` that suit the first edges."""
-    total = weight.sum(-1, keepdim=True).clamp_min(1e-6)
-    mean = (weight * grey).sum(-1, keepdim=True) / total
-    first, second, *_ = _edges(unknowns, x, y)
-    sign = first * second
-    contrast = (weight * sign * (grey - mean)).sum(-1, keepdim=True)
-    return torch.cat([mean, contrast / (weight * sign * sign).sum(-1, keepdim=True).clamp_min(1e-6)], dim=-1)
+@functools.lru_cache(maxsize=32)
+def _disc(radius: int) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"], Float32[np.ndarray, "3 p"]]:
+    """Places x, y of a disc's pixels, and x, y, 1; the first half of them are the dark squares of a chessboard."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-radius, radius + 1), np.arange(-radius, radius + 1)))
+    near = x * x + y * y <= (radius + 0.5) ** 2
+    order = np.flatnonzero(near)
+    order = order[np.argsort((x + y)[order] % 2, kind="stable")]
+    x, y = x[order], y[order]
+    return x, y, np.stack([x, y, np.ones(len(x))]).astype(np.float32)
 
 
-def _edges(unknowns: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-    """Both edges' profiles from -1 to 1, distances to them, places along them, and the blur; each `(N, P)`."""
-    u, v, first, second, *_, blur = unknowns.unsqueeze(-1).unbind(1)
-    x, y = x - u, y - v
-    parts = []
-    for angle in (first, second):
-        cosine, sine = angle.cos(), angle.sin()
-        parts.append((cosine * y - sine * x, cosine * x + sine * y, cosine, sine))
-    (d1, l1, c1, s1), (d2, l2, c2, s2) = parts
-    return (
-        torch.erf(d1 * (_ROOT_HALF / blur)),
-        torch.erf(d2 * (_ROOT_HALF / blur)),
-        d1,
-        d2,
-        l1,
-        l2,
-        c1,
-        s1,
-        c2,
-        s2,
-        x,
-        y,
-    )
+def _fill(table: Float32[Tensor, "n 10 p"], edges: Float64[np.ndarray, "n 5"], places: Float32[Tensor, "3 p"]) -> None:
+    """Write the rows of the table that depend on the edges; those of their derivatives lack a factor.
 
-
-def _residuals(unknowns: Tensor, grey: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Seen minus modelled grey values `(N, P)`, and the model's derivatives by its unknowns `(N, 9, P)`."""
-    e1, e2, d1, d2, l1, l2, c1, s1, c2, s2, x, y = _edges(unknowns, x, y)
-    *_, level, contrast, along_x, along_y, blur = unknowns.unsqueeze(-1).unbind(1)
-    both = e1 * e2
-    error = grey - (level + contrast * both + along_x * x + along_y * y)
-    k = contrast * (_SLOPE / blur)
-    # Bounded exponents: denormal numbers are slow.
-    by_d1 = k * torch.exp((-0.5 * (d1 / blur) ** 2).clamp_min(-30.0)) * e2
-    by_d2 = k * torch.exp((-0.5 * (d2 / blur) ** 2).clamp_min(-30.0)) * e1
-    slopes = (
-        by_d1 * s1 + by_d2 * s2 - along_x,
-        -by_d1 * c1 - by_d2 * c2 - along_y,
-        -by_d1 * l1,
-        -by_d2 * l2,
-        torch.ones_like(both),
-        both,
-        x,
-        y,
-        -(by_d1 * d1 + by_d2 * d2) / blur,
-    )
-    return error, torch.stack(slopes, dim=1)
-
-
-def _judged(
-    unknowns: Tensor,
-    cost: Tensor,
-    slopes: Tensor,
-    weight: Tensor,
-    corners: Float[np.ndarray, "n 2"],
-    base: Int[np.ndarray, "n 2"],
-    radius: Float[np.ndarray, " n"],
-) -> Fitted:
-    """The fitted corners in px, how well they fit, and how far they may be off."""
-    moved = base + unknowns[:, :2].double().numpy()
-    rms = (cost / weight.sum(-1).clamp_min(1e-6)).sqrt()
-    contrast = unknowns[:, 5].abs()
-    misfit = (rms / contrast.clamp_min(1e-3)).double().numpy()
-    # The estimate weighs pixels by w, their noise is alike: its covariance is a sandwich.
-    weighted = slopes * weight.unsqueeze(1)
-    bread = torch.linalg.pinv((weighted @ slopes.mT).double(), hermitian=True)
-    spread = bread @ (weighted @ weighted.mT).double() @ bread
-    sigma = rms.double() * (spread[:, 0, 0] + spread[:, 1, 1]).clamp_min(0).mul(0.5).sqrt()
-    failed = ~np.isfinite(moved).all(axis=-1)
-    failed |= np.linalg.norm(np.nan_to_num(moved) - corners, axis=-1) > 0.7 * radius
-    moved = np.where(failed[:, None], corners, moved)
-    return Fitted(moved, np.where(failed, np.inf, misfit), unknowns[:, 5].double().numpy(), sigma.numpy())
+    The factor is the contrast times `sqrt(2 / pi)` over the blur.
+    """
+    cosine, sine = np.cos(edges[:, 2:4]), np.sin(edges[:, 2:4])
+    lines = np.empty((len(edges), 4, 3))
+    lines[:, :2, 0], lines[:, :2, 1], lines[:, 2:, 0], lines[:, 2:, 1] = -sine, cosine, -cosine, -sine
+    lines[..., 2] = -(lines[..., :2] @ edges[:, :2, None])[..., 0]
+    lines[:, :2] *= _ROOT_HALF / edges[:, 4, None, None]
+    lines = torch.from_numpy(lines.astype(np.float32))
+    off, back = (lines @ places).split(2, dim=1)
+    off.clamp_(-5.5, 5.5)  # beyond, profiles are flat, and denormal numbers slow
+    first, second = torch.erf(off).unbind(1)
+    slope = off.square().neg_().exp_()
+    weight = table[:, _LEVEL]
+    slope[:, 0] *= second * weight
+    slope[:, 1] *= first * weight
+    turns = torch.from_numpy(np.stack([sine, -cosine]).astype(np.float32)).unsqueeze(-1)
+    torch.sum(slope * turns[0], dim=1, out=table[:, 0])
+    torch.sum(slope * turns[1], dim=1, out=table[:, 1])
+    torch.mul(slope, back, out=table[:, 2:4])
+    torch.sum(slope.mul_(off), dim=1, out=table[:, 4]).mul_(-1 / _ROOT_HALF)
+    torch.mul(first * second, weight, out=table[:, _CONTRAST])

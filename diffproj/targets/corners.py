@@ -1,10 +1,11 @@
 """Corners of a board in a photograph to a hundredth of a pixel, and which of them can be trusted."""
 
+import functools
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 from diffproj.targets.corner_fit import fit_corners
 
@@ -14,8 +15,12 @@ WINDOW = 0.30
 SMALLEST_WINDOW = 2
 """Minimum half side in px: a smaller window contains too few gradients for a stable result."""
 
-MISFIT = 0.12
-"""Misfit from which a corner is doubted: half covered ones leave a third of the contrast."""
+MISFIT, UNUSUAL = 0.05, 2.5
+"""Misfit from which a corner is doubted, and the same relative to the view's median, whichever is larger. Of 4400
+corners in public photographs none had more than 2.44 medians; half covered ones leave a third of the contrast."""
+
+WORSE = 1.25
+"""Misfit relative to the median, above a hundredth, from which a corner looks worse than the others."""
 
 FAINT = 0.15
 """Least contrast, relative to the median of the view: glare drowns the rest."""
@@ -23,9 +28,9 @@ FAINT = 0.15
 VAGUE = 0.15
 """Standard deviation in px from which a corner is doubted."""
 
-LOOSE, TIGHT, LEAST = 0.15, 0.015, 0.15
+LOOSE, TIGHT, LEAST = 0.06, 0.015, 0.15
 """Distances from where neighbours put a corner from which it is doubted: the first two relative to the spacing, for
-corners that look as good as the others and for those that look worse; the third in px, added to the second."""
+corners that look as good as the others and for those that look worse; the third in px, added to either."""
 
 DEVIATIONS = 6.0
 """The least such distance in terms of the view's median."""
@@ -36,7 +41,10 @@ REACH, NARROW = 0.65, 0.4
 FEWEST = 9
 """Corners below which nothing is known about their neighbours."""
 
-_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
+_POWERS = [(i, j) for i in range(4) for j in range(4 - i)]
+# What few neighbours leave open is held near zero: terms of higher degree more.
+_RIDGE = np.diag([[1e-9, 1e-9, 1e-4, 1e-3][i + j] for i, j in _POWERS])
+_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 10, 0.05)
 
 
 class Corners(NamedTuple):
@@ -121,29 +129,51 @@ def predicted(
         grid: corners; what is not used does not matter.
         use: weights of the corners from 0 to 1.
     """
-    rows, columns = grid.shape[:2]
-    weight = use.astype(float)
-    values = np.where(weight[..., None] > 0, grid, 0.0)
+    shape, weight = use.shape, use.astype(float)
+    values = np.where(weight[..., None] > 0, grid, 0.0).reshape(-1, 2)
+    near = _neighbourhoods(*shape)
+    hat = near.hat if (weight == 1).all() else near.hat_of(weight)
+    where = (hat[:, None] @ values[near.numbers])[:, 0]
+    # A ridge draws the value to zero where neighbours are few; hat sums to 1 otherwise.
+    total = hat.sum(axis=1)
+    where = where / np.where(np.abs(total) > 0.5, total, 1.0)[:, None]
+    spread = np.sqrt(1 + (hat**2).sum(axis=1))
+    return Prediction(where.reshape(*shape, 2), spread.reshape(shape))
+
+
+class _Neighbourhoods(NamedTuple):
+    """Each corner's neighbours on a board, of which there are K.
+
+    Attributes:
+        numbers: `(N, K)`, which corners they are, row by row.
+        basis: `(N, K, 10)`, powers of row and column up to the third degree at each.
+        others: `(N, K)`, 0 for the corner itself, else 1.
+        hat: `(N, K)`, what the surface's value at the corner takes from each, where all are used alike.
+    """
+
+    numbers: Int[np.ndarray, "n k"]
+    basis: Float[np.ndarray, "n k 10"]
+    others: Float[np.ndarray, "n k"]
+    hat: Float[np.ndarray, "n k"]
+
+    def hat_of(self, weight: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "n k"]:
+        """What the surface's value at each corner takes from its neighbours, for weights of the corners."""
+        weighted = self.basis * (weight.reshape(-1)[self.numbers] * self.others)[..., None]
+        transposed = np.swapaxes(weighted, 1, 2)
+        return (np.linalg.inv(transposed @ self.basis + _RIDGE)[:, :1] @ transposed)[:, 0]
+
+
+@functools.lru_cache(maxsize=16)
+def _neighbourhoods(rows: int, columns: int) -> _Neighbourhoods:
     near_r, near_c = _nearest_lines(rows), _nearest_lines(columns)
     r = np.broadcast_to(near_r[:, None, :, None], (rows, columns, near_r.shape[1], near_c.shape[1]))
     c = np.broadcast_to(near_c[None, :, None, :], r.shape)
     r, c = (part.reshape(rows * columns, -1) for part in (r, c))
     here_r, here_c = (axis.reshape(-1, 1) for axis in np.indices((rows, columns)))
     dr, dc = (r - here_r) / 2.0, (c - here_c) / 2.0
-    w = weight[r, c] * ((dr != 0) | (dc != 0)) + 0.0
-    powers = [dr**i * dc**j for i in range(4) for j in range(4 - i)]
-    # What few neighbours leave open is held near zero: terms of higher degree more.
-    degree = np.array([i + j for i in range(4) for j in range(4 - i)])
-    basis = np.stack(powers, axis=-1)
-    ridge = np.diag(np.array([1e-9, 1e-9, 1e-4, 1e-3])[degree])
-    weighted = basis * w[..., None]
-    inverse = np.linalg.inv(np.swapaxes(weighted, 1, 2) @ basis + ridge)
-    hat = (inverse[:, :1] @ np.swapaxes(weighted, 1, 2))[:, 0]  # the value at the corner itself
-    where = (hat[..., None] * values[r, c]).sum(axis=1)
-    # A ridge draws the value to zero where neighbours are few; hat sums to 1 otherwise.
-    where = where / np.where(np.abs(hat.sum(axis=1)) > 0.5, hat.sum(axis=1), 1.0)[:, None]
-    spread = np.sqrt(1 + (hat**2).sum(axis=1))
-    return Prediction(where.reshape(rows, columns, 2), spread.reshape(rows, columns))
+    basis = np.stack([dr**i * dc**j for i, j in _POWERS], axis=-1)
+    found = _Neighbourhoods(r * columns + c, basis, ((dr != 0) | (dc != 0)).astype(float), np.empty((0, 0)))
+    return found._replace(hat=found.hat_of(np.ones((rows, columns))))
 
 
 def _nearest_lines(count: int) -> np.ndarray:
@@ -168,7 +198,7 @@ def _trusted(
     # Dark and light change places from one corner to the next.
     contrast = contrast * (1 - 2 * (np.indices(contrast.shape).sum(axis=0) % 2))
     contrast /= float(np.median(contrast[known])) or 1.0
-    use = known & (misfit < max(MISFIT, 2.5 * usual)) & (contrast > FAINT)
+    use = known & (misfit < max(MISFIT, UNUSUAL * usual)) & (contrast > FAINT)
     use &= sigma < np.maximum(VAGUE, 6 * float(np.median(sigma[known])))
     use &= ((grid >= 1) & (grid <= np.array(image.shape[::-1]) - 2)).all(axis=-1)
     if use.sum() < FEWEST:
@@ -179,7 +209,7 @@ def _trusted(
         surface = predicted(grid, weight)
         off = np.linalg.norm(np.where(use[..., None], grid - surface.grid, 0.0), axis=-1) / surface.spread
         scale = DEVIATIONS * float(np.median(off[use]))
-        limit = np.maximum(scale, np.where(misfit < 1.5 * usual + 0.03, LOOSE * spacing, TIGHT * spacing + LEAST))
+        limit = np.maximum(scale, np.where(misfit < WORSE * usual + 0.01, LOOSE, TIGHT) * spacing + LEAST)
         if (off[use] < 0.5 * limit[use]).all():
             break
         weight = use / (1 + (off / (0.5 * limit)) ** 4)

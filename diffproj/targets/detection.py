@@ -93,7 +93,7 @@ def detect(
         BoardNotFoundError: no photograph shows the board.
         FileNotFoundError: a file is missing.
         ValueError: a file is no image, an image has none of the layouts above, sizes differ, or the board has fewer
-            than 3 x 3 inner corners. All files are checked before the first is searched.
+            than 3 x 3 inner corners. A missing file is told before the first is searched, a broken one at its turn.
         TypeError: an argument is of the wrong kind.
 
     Example:
@@ -117,9 +117,10 @@ def detect(
     if frames is not None:
         frames = whole_number("frames", frames, "a whole number from 1 on", least=1)
     listing = listed(photographs, frames)
-    size = _common_size(listing, results_of(functools.partial(_size, orientation=raster), listing, executor))
+    # One reading for size and corners: to decode a photograph takes as long as to find a board in it.
     find = functools.partial(_find, board=board, orientation=raster)
     found = results_of(find, listing, executor, progress)
+    size = _common_size(listing, [one.size for one in found])
     pairs = [(photograph, one.grid) for photograph, one in zip(listing, found, strict=True) if one.grid is not None]
     if not pairs:
         raise BoardNotFoundError(_advice([photograph.label for photograph in listing], found, board))
@@ -144,23 +145,26 @@ class _Found(NamedTuple):
     Attributes:
         grid: `(rows, columns, 2)` px, in order, NaN where hidden; None where there is no such board.
         seen: `(columns, rows)` of the largest pattern where there is no such board; (0, 0) for none.
+        size: `(width, height)` of the photograph.
     """
 
     grid: Float[np.ndarray, "rows columns 2"] | None
     seen: tuple[int, int]
+    size: tuple[int, int]
 
 
 def _find(photograph: Photograph, board: Chessboard, orientation: Orientation) -> _Found:
     """Read one photograph and find the board in it: the work of one task."""
     image = grey(photograph, orientation)
+    size = image.shape[1], image.shape[0]
     try:
         pattern = find_pattern(as_8_bit(image), board)
         if pattern.grid is None:
-            return _Found(None, pattern.seen)
+            return _Found(None, pattern.seen, size)
         refined = refine_grid(image, pattern.grid)
         if not refined.is_board():
-            return _Found(None, (0, 0))
-        return _Found(in_order(refined.grid, image, board), board.size)
+            return _Found(None, (0, 0), size)
+        return _Found(in_order(refined.grid, image, board), board.size, size)
     except Exception as error:
         raise RuntimeError(f"{photograph.label}: {type(error).__name__} while searching it: {error}") from error
 
@@ -175,12 +179,6 @@ def _check_board(board: Chessboard) -> None:
 def _sharpness(photograph: Photograph) -> float | None:
     """Of a frame of a video that was chosen for its sharpness, so that it need not show the board; None for others."""
     return photograph.source.sharpness if isinstance(photograph.source, Frame) else None
-
-
-def _size(photograph: Photograph, orientation: Orientation) -> tuple[int, int]:
-    """Read a photograph, so that none fails after a long search, and return its `(width, height)`."""
-    height, width = grey(photograph, orientation).shape
-    return width, height
 
 
 def _common_size(listing: list[Photograph], sizes: list[tuple[int, int]]) -> tuple[int, int]:

@@ -87,7 +87,7 @@ def _entries(photographs: Any) -> list[Any]:
             hidden = path.name.startswith(".")
             return sorted((file for file in path.parent.glob(path.name) if hidden or not _hidden(file)), key=_natural)
         return [path]
-    if isinstance(photographs, Iterable):
+    if isinstance(photographs, Iterable) and not isinstance(photographs, bytes):
         return list(photographs)
     raise TypeError(f"photographs: want file names, arrays or tensors, got {type(photographs).__name__}")
 

@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Int
 
 from diffproj.targets.saddles import Saddles
 
@@ -35,11 +35,10 @@ def lattices(saddles: Saddles) -> Iterator[dict[Cell, int]]:
         return
     near, opposite = _neighbours(saddles)
     points = (saddles.points[:, 0] + 1j * saddles.points[:, 1]).tolist()
-    partners = [[int(q) for q, fits in zip(*row, strict=True) if fits] for row in zip(near, opposite, strict=True)]
+    rows = zip(near.tolist(), opposite.tolist(), strict=True)
+    partners = [[q for q, fits in zip(*row, strict=True) if fits] for row in rows]
     used: set[int] = set()
-    for seed, axes in _seeds(points, partners):
-        if seed in used:
-            continue
+    for seed, axes in _seeds(points, partners, used):
         found = _grown(seed, axes, points, partners, used)
         if len(found) >= SMALLEST:
             used.update(found.values())
@@ -61,9 +60,13 @@ def _neighbours(saddles: Saddles) -> tuple[Int[np.ndarray, "n k"], Bool[np.ndarr
     return near, (cosine < OPPOSITE) & (ratio > 0.3) & (ratio < 1 / 0.3)
 
 
-def _seeds(points: list[complex], partners: list[list[int]]) -> Iterator[tuple[int, tuple[complex, complex]]]:
-    """Points midway between partners in two directions, and the steps along these."""
+def _seeds(
+    points: list[complex], partners: list[list[int]], used: set[int]
+) -> Iterator[tuple[int, tuple[complex, complex]]]:
+    """Points midway between partners in two directions, and the steps along these; none of those in use by then."""
     for seed, others in enumerate(partners):
+        if seed in used:
+            continue
         steps: list[complex] = []
         for k, q in enumerate(others):
             for r in others[k + 1 :]:
@@ -123,7 +126,7 @@ def _step(cells: dict[Cell, int], points: list[complex], cell: Cell, direction: 
     return None
 
 
-def as_grid(cells: dict[Cell, int], points: Float32[np.ndarray, "n 2"]) -> Float[np.ndarray, "rows columns 2"]:
+def as_grid(cells: dict[Cell, int], points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "rows columns 2"]:
     """A pattern's points by row and column, NaN where a cell is empty."""
     where = np.array(list(cells))
     where -= where.min(axis=0)

@@ -19,7 +19,9 @@ WEAKEST = 4.0
 """Determinant of the Hessian below which a saddle is taken for noise; grey values run to 255."""
 
 _ANGLES = np.arange(16) * (2 * np.pi / 16)
-_RING = RADIUS * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+_RING = np.rint(RADIUS * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)).astype(int)
+_HARMONIC = np.stack([np.cos(2 * _ANGLES), np.sin(2 * _ANGLES)], axis=-1).astype(np.float32)
+_BEFORE, _OPPOSITE = np.roll(range(16), 1), np.roll(range(16), 8)
 _BORDER = int(RADIUS) + 2
 
 
@@ -27,7 +29,7 @@ class Saddles(NamedTuple):
     """Saddle points.
 
     Attributes:
-        points: `(N, 2)` px, to the nearest pixel or so.
+        points: `(N, 2)` px, to the nearest pixel.
         phases: `(N, 2)`, second harmonic of the ring of grey values around each: neighbours on a chessboard have
             opposite ones, since dark and light change places.
     """
@@ -49,22 +51,23 @@ def saddle_points(image: Shaped[np.ndarray, "h w"]) -> Saddles:
     """
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR)
     xx, yy, xy = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((2, 0), (0, 2), (1, 1)))
-    strength = xy * xy - xx * yy
+    strength = cv2.subtract(cv2.multiply(xy, xy), cv2.multiply(xx, yy))
+    # Without noise, pixels around one corner may be equally strong: by a hair, the last of them shall be the peak.
+    height, width = image.shape
+    strength *= 1 + 1e-6 * np.arange(width, dtype=np.float32)
+    strength *= 1 + 5e-6 * np.arange(height, dtype=np.float32)[:, None]
     peak = (strength == cv2.dilate(strength, np.ones((5, 5), np.uint8))) & (strength > WEAKEST)
     peak[:_BORDER] = peak[-_BORDER:] = False
     peak[:, :_BORDER] = peak[:, -_BORDER:] = False
-    # Without noise, pixels around one corner may be equally strong: they are one peak.
-    _, _, _, centres = cv2.connectedComponentsWithStats(peak.astype(np.uint8), connectivity=8)
-    points = centres[1:]
-    if len(points) > MOST:
-        u, v = points.astype(int).T
-        points = points[np.argpartition(-strength[v, u], MOST)[:MOST]]
-    around = np.rint(points[:, None] + _RING).astype(int)
-    ring = smooth[around[..., 1], around[..., 0]].reshape(-1, len(_RING))
+    places = np.flatnonzero(peak)
+    if len(places) > MOST:
+        places = places[np.argpartition(-strength.reshape(-1)[places], MOST)[:MOST]]
+    ring = smooth.reshape(-1)[places[:, None] + (_RING[:, 0] + width * _RING[:, 1])]
     ring -= ring.mean(axis=1, keepdims=True)
-    power = (ring**2).sum(axis=1)
-    changes = ((ring > 0) != np.roll(ring > 0, 1, axis=1)).sum(axis=1)
-    turned = (ring * np.roll(ring, len(_RING) // 2, axis=1)).sum(axis=1)
-    alternates = (changes == 4) & (turned > 0.6 * power)
-    phases = np.stack([ring @ np.cos(2 * _ANGLES), ring @ np.sin(2 * _ANGLES)], axis=-1)
-    return Saddles(*(part[alternates].astype(np.float32) for part in (points, phases)))
+    light = ring > 0
+    changes = (light != light[:, _BEFORE]).sum(axis=1)
+    turned = np.einsum("nk,nk->n", ring, ring[:, _OPPOSITE])
+    alternates = (changes == 4) & (turned > 0.6 * np.einsum("nk,nk->n", ring, ring))
+    places = places[alternates]
+    points = np.stack([places % width, places // width], axis=-1).astype(np.float32)
+    return Saddles(points, ring[alternates] @ _HARMONIC)

@@ -1,5 +1,6 @@
 """Find a chessboard in a photograph: its corners to a pixel or so, or why there are none."""
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -12,7 +13,10 @@ from diffproj.targets.lattice import as_grid, lattices
 from diffproj.targets.saddles import saddle_points
 
 FIRST = 1100
-"""Longer side in px of the copy that is searched first."""
+"""Longer side in px of the copy that is searched thoroughly before others; half of it is looked at before."""
+
+COARSE = 8.0
+"""Least step in px of a board in the first, small copy: a shorter one may have lost corners on the way."""
 
 FULL = 0.5
 """Share of a line of corners beside a board from which the pattern is said to go on there."""
@@ -50,31 +54,53 @@ class Pattern(NamedTuple):
 def find_pattern(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Pattern:
     """Find the board's corners in one grey image, in any of the orders that fit rows and columns.
 
-    Copies of several sizes are searched for patterns of saddle points: first one of at most 1100 px, then a half and a
-    quarter of that for blurred photographs, then larger ones for small boards. This takes a fraction of a second where
-    nothing is found. Where a part of a pattern is found, but no board, OpenCV's two detectors are asked as well.
+    Copies of several sizes are searched for patterns of saddle points: one of at most 550 px, which shows most boards,
+    then one of twice its size, one of half of it for blurred photographs, and larger ones for small boards. This takes
+    a fraction of a second where nothing is found. Where a part of a pattern is found, but no board, OpenCV's two
+    detectors are asked as well.
     """
-    seen, partial, other_boards = (0, 0), None, []
     if min(image.shape) < NARROWEST:
         return Pattern(None)
-    for small in _copies(image):
-        saddles = saddle_points(small)
-        grids = [as_grid(cells, saddles.points) for cells in lattices(saddles)]
-        for grid in sorted(grids, key=_area, reverse=True):
-            found, whole = matched(grid, board), _carried(grid, small, image)
-            if _spacing(whole) < FINEST:
-                continue
+    first = _resized(image, min(1.0, FIRST / max(image.shape)))
+    half = _resized(first, 0.5)
+    coarse = _patterns(half, image)
+    found = matched(coarse[0], board) if coarse else None
+    if (
+        found is not None
+        and extent_of(coarse[0]) == (max(board.size), min(board.size))
+        and _is_plain(found, image, half)
+    ):
+        return Pattern(found)
+    seen, partial, other_boards = (0, 0), None, []
+    for patterns in itertools.chain((_patterns(first, image), coarse), _further_patterns(first, image)):
+        for pattern in patterns:
+            found = matched(pattern, board)
             # Of another board, another copy may show no more, or no less, than what looks like this one.
-            if found is not None and not any(_shadows(other, whole) for other in other_boards):
-                return Pattern(_carried(found, small, image))
-            extent = extent_of(grid)
+            if found is not None and not any(_shadows(other, pattern) for other in other_boards):
+                return Pattern(found)
+            extent = extent_of(pattern)
             if _larger(extent, board):
-                other_boards.append(whole)
+                other_boards.append(pattern)
             if extent[0] * extent[1] > seen[0] * seen[1]:
-                seen, partial = extent, whole
+                seen, partial = extent, pattern
     if partial is None or np.isfinite(partial[..., 0]).sum() < HINT * len(board) or _is_other(seen, partial, board):
         return Pattern(None, seen)
     return Pattern(_by_opencv(image, partial, board), seen)
+
+
+def _patterns(small: UInt8[np.ndarray, "h w"], image: UInt8[np.ndarray, "H W"]) -> list[Float[np.ndarray, "_r _c 2"]]:
+    """The patterns in a copy of the image, in px of the image, largest first."""
+    saddles = saddle_points(small)
+    grids = [_carried(as_grid(cells, saddles.points), small, image) for cells in lattices(saddles)]
+    return sorted((grid for grid in grids if _spacing(grid) >= FINEST), key=_area, reverse=True)
+
+
+def _is_plain(
+    grid: Float[np.ndarray, "r c 2"], image: UInt8[np.ndarray, "H W"], small: UInt8[np.ndarray, "h w"]
+) -> bool:
+    """Whether all corners are seen, and so far apart in the copy that none beyond them can have been lost."""
+    least = COARSE * max(image.shape) / max(small.shape)
+    return all(bool((np.linalg.norm(np.diff(grid, axis=axis), axis=-1) > least).all()) for axis in (0, 1))
 
 
 def matched(grid: Float[np.ndarray, "r c 2"], board: Chessboard) -> Float[np.ndarray, "rows columns 2"] | None:
@@ -152,19 +178,18 @@ def _shadows(other: Float[np.ndarray, "_r _c 2"], one: Float[np.ndarray, "_R _C 
     return bool((middle > np.nanmin(other, axis=(0, 1))).all() and (middle < np.nanmax(other, axis=(0, 1))).all())
 
 
-def _copies(image: UInt8[np.ndarray, "h w"]) -> Iterator[UInt8[np.ndarray, "_h _w"]]:
-    """The image at sizes to search: first at most `FIRST` px, then smaller, then larger by steps of 2."""
+def _further_patterns(
+    first: UInt8[np.ndarray, "h w"], image: UInt8[np.ndarray, "H W"]
+) -> Iterator[list[Float[np.ndarray, "_r _c 2"]]]:
+    """The patterns in a quarter of the first copy, then in larger ones by steps of 2."""
+    yield _patterns(_resized(first, 0.25), image)
     longest = max(image.shape)
-    first = _resized(image, min(1.0, FIRST / longest))
-    yield first
-    for smaller in (0.5, 0.25):
-        yield _resized(first, smaller)
     factor = 2 * FIRST / longest
     while factor < 2 and longest > FIRST:
-        yield _resized(image, min(1.0, factor))
+        yield _patterns(_resized(image, min(1.0, factor)), image)
         factor *= 2
     if longest <= FIRST:
-        yield _resized(image, 2.0)
+        yield _patterns(_resized(image, 2.0), image)
 
 
 def _resized(image: UInt8[np.ndarray, "h w"], factor: float) -> UInt8[np.ndarray, "_h _w"]:

@@ -184,6 +184,8 @@ def view_number(view: int | str, names: Sequence[str]) -> int:
         return position("view", view, len(names), "views")
     if view not in names:
         raise ValueError(f"view: want one of {', '.join(names)}, got {view!r}")
+    if list(names).count(view) > 1:
+        raise ValueError(f"view: want the number of one, got {view!r}, which is the name of several")
     return list(names).index(view)
 
 

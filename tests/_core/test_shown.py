@@ -59,12 +59,12 @@ def test_one_short_line(shown: dict[str, Any]) -> None:
         assert "\n" not in text
         assert len(text) < 160, text
     assert repr(shown["Calibration"]) == (
-        "Calibration(13 views of 54 corners, f 533.0, 533.1 px, BrownConrady, RMS 0.1765 px, converged)"
+        "Calibration(13 views of 54 corners, f 533.5, 533.6 px, BrownConrady, RMS 0.1583 px, converged)"
     )
-    assert "f 533.0, 533.1 px, c 342.3, 234.1 px" in repr(shown["Camera"])
+    assert "f 533.5, 533.6 px, c 342.3, 234.2 px" in repr(shown["Camera"])
     assert "no pose" in repr(shown["Camera"])
-    assert repr(shown["cameras"]).startswith("Camera(13 cameras, f 533.0, 533.1 px")
-    assert repr(shown["Quantity"]).startswith("Quantity(25.16 ± 0.16, 24.90 ± 0.15")
+    assert repr(shown["cameras"]).startswith("Camera(13 cameras, f 533.5, 533.6 px")
+    assert repr(shown["Quantity"]).startswith("Quantity(25.12 ± 0.14, 24.96 ± 0.13")
     assert repr(dp.Camera(torch.eye(3)).to("meta")).startswith("Camera(f ?, ? px")
 
 

@@ -141,3 +141,17 @@ def test_much_skew_is_advised_too(lens: dp.BrownConrady | None, model: str, skew
     K[0, 1] = skew
     for text in dp.calibrate(seen(dp.Camera(K, distortion=lens, size=SIZE), 3), BOARD, model).remarks:  # type: ignore[arg-type]
         assert "take skew=True" in text
+
+
+@pytest.mark.parametrize("skew", [0.1, 0.2])
+def test_very_much_skew_is_advised_where_the_fit_is_refused_for_it(skew: float) -> None:
+    """At a fifth of the focal length it leaves 2.2 px, too much for a calibration."""
+    found = dp.calibrate(dp.example_views("left"), BOARD)
+    K = found.camera.K.clone()
+    K[0, 1] = skew * K[0, 0]
+    pixels, _ = dp.Camera(K, found.cameras.R, found.cameras.t, found.camera.distortion).project(BOARD.points)
+    pixels = pixels - pixels.amin((0, 1)) + 20
+    width, height = (pixels.amax((0, 1)) + 20).long().tolist()
+    views = dp.Views(pixels, size=(width, height))
+    assert "as through a K with skew" in dp.calibrate(views, BOARD, throw=False).message
+    assert dp.calibrate(views, BOARD, skew=True).camera.K[0, 1] == pytest.approx(float(K[0, 1]), rel=1e-3)

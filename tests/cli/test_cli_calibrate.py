@@ -71,7 +71,7 @@ def test_calibrate_writes_what_opencv_reads(
     file.write_text("an older file")
     code, out, _ = calibrate(capsys, photographs, photographs / "6.png", "--distortion", "brown4", "--output", file)
     assert code == 0
-    assert "a .json file would hold the whole calibration" in out
+    assert "the unit, the poses and the error bars are read from a .json file only" in out
     assert "in 5 views" in out  # a photograph that was named twice counts once
     storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
     K, lens = storage.getNode("camera_matrix").mat(), storage.getNode("distortion_coefficients").mat()

@@ -103,6 +103,17 @@ def test_opencv_reads_a_calibration(tmp_path: Path, calibration: dp.Calibration)
     assert_same(dp.load_camera(tmp_path / "c.yaml"), calibration.camera)
 
 
+@pytest.mark.parametrize("suffix", [".yaml", ".xml", ".json"])
+def test_the_unit_of_the_poses_is_written(tmp_path: Path, calibration: dp.Calibration, suffix: str) -> None:
+    file = tmp_path / f"c{suffix}"
+    for unit in ("mm", None):
+        dp.save_camera(file, replace(calibration, unit=unit), "opencv")
+        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+        assert storage.getNode("world_unit").empty() == (unit is None)
+        assert storage.getNode("world_unit").string() == (unit or "")
+        assert_same(dp.load_camera(file), calibration.camera)
+
+
 def test_files_of_opencvs_calibration_program_are_read(tmp_path: Path) -> None:
     text = """%YAML:1.0
 ---

@@ -1,5 +1,6 @@
 """Arguments that users get wrong, each refused by its name; and arrays and lists, which are taken for tensors."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -20,12 +21,18 @@ CAMERA = dp.Camera(
     size=(640, 480),
 )
 PIXELS = torch.tensor([[320.0, 240], [400, 300], [100, 50]], dtype=D)
-IMAGE = torch.rand(1, 48, 64, dtype=D)
+IMAGE = torch.rand(1, 480, 640, dtype=D)
 
 
 @pytest.fixture(scope="module")
 def calibration() -> dp.Calibration:
     return dp.calibrate(VIEWS, BOARD)
+
+
+def nested(tensor: torch.Tensor) -> torch.Tensor:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # PyTorch's own: they are a prototype
+        return torch.nested.nested_tensor([tensor, tensor])
 
 
 Case = tuple[type[Exception], str, Callable[[dp.Calibration], Any]]
@@ -93,6 +100,12 @@ WRONG: list[Case] = [
     # Arrays and tensors.
     (TypeError, "pixels: want torch.float64 as camera has.*pixels.to", lambda _: dp.back_project(PIXELS.float(), CAMERA, PLANE)),
     (TypeError, "pixels: want .* lists of numbers of equal lengths", lambda _: dp.back_project([[1, 2], [3]], CAMERA, PLANE)),
+    (TypeError, "pixels: want a dense tensor, got layout torch.sparse_coo; .to_dense", lambda _: dp.back_project(PIXELS.to_sparse(), CAMERA, PLANE)),
+    (TypeError, "pixels: want a dense tensor, got a nested one", lambda _: dp.back_project(nested(PIXELS), CAMERA, PLANE)),
+    (TypeError, "pixels: want a floating-point tensor, got torch.complex128; .real", lambda _: dp.back_project(PIXELS + 0j, CAMERA, PLANE)),
+    (ValueError, "pixels: want an array without masked entries, got some", lambda _: dp.back_project(np.ma.masked_less(PIXELS.numpy(), 60), CAMERA, PLANE)),
+    (ValueError, "visible: want an array without masked entries, got some", lambda _: dp.Views(VIEWS.pixels, np.ma.masked_equal(VIEWS.visible.numpy(), True))),
+    (TypeError, "size: want .width, height. in whole px, got .True, True", lambda _: CAMERA.resized((True, True))),
     (TypeError, "image: want a tensor .* got ndarray of shape", lambda _: dp.rectify(IMAGE.numpy(), CAMERA, PLANE, (0, 0, 9, 9), 1)),
     (ValueError, "weights: want a shape that broadcasts to", lambda _: dp.PlaneLoss()(PIXELS.new_ones(3, 3), PIXELS.new_ones(3, 3), weights=PIXELS.new_ones(3, 1))),
     (ValueError, "phi|broadcast", lambda _: dp.rotation_from_euler(torch.zeros(2), torch.zeros(3), torch.zeros(2))),
@@ -135,6 +148,7 @@ ARRAYS: dict[str, Callable[[np.ndarray], Any]] = {
     "big endian": lambda x: x.astype(">f8"),
     "list": lambda x: x.tolist(),
     "list of arrays": list,
+    "masked nowhere": np.ma.masked_invalid,
     "tuples": lambda x: tuple(map(tuple, x.tolist())),
 }
 
@@ -158,6 +172,14 @@ def test_arrays_take_the_kind_of_the_camera(form: Callable[[np.ndarray], Any], d
         assert torch.equal(call(array), call(tensor))
     per_point = dp.Plane.per_point([0.0, 0, 1], torch.arange(3.0, dtype=dtype))
     assert torch.equal(dp.back_project(given, camera, per_point)[0], dp.back_project(uv, camera, per_point)[0])
+
+
+def test_a_tensor_that_is_kept_as_the_negative_of_another() -> None:
+    negative = torch.complex(PIXELS, -PIXELS).conj().imag
+    assert negative.is_neg()
+    assert torch.equal(dp.back_project(negative, CAMERA, PLANE)[0], dp.back_project(PIXELS, CAMERA, PLANE)[0])
+    K = torch.complex(CAMERA.K, -CAMERA.K).conj().imag
+    assert torch.equal(dp.Camera(K).K, CAMERA.K)
 
 
 def test_arrays_become_cameras_planes_and_views() -> None:

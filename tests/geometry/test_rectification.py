@@ -213,6 +213,9 @@ def test_a_plane_and_axes_for_each_image() -> None:
         torch.testing.assert_close(images[i], image)
         assert torch.equal(shown[i], seen)
         torch.testing.assert_close(tops[i, :, 2:-2, 2:-2], texture[:, 2:-2, 2:-2], rtol=0, atol=0.1)
+    for shared in ((places, x[0], y), (places, x[0], y[0]), (places, x, y[0])):  # what is the same is given once
+        some, _ = dp.render(texture, above(), dp.Plane.z(heights), extent, axes=shared)
+        assert torch.equal(some, images)
 
 
 def test_batches_and_kornia_cameras() -> None:

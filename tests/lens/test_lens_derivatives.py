@@ -239,3 +239,8 @@ def test_the_lens_s_own_derivatives(count: int | str) -> None:
     torch.testing.assert_close(lens.by_coefficients(given), by_coefficients, rtol=1e-12, atol=1e-18)
     some = given[2:].clone().requires_grad_()
     assert gradcheck(lens.by_direction, some, atol=1e-7)
+    both = kind(torch.stack([coefficients, 0.5 * coefficients]))
+    alone = [kind(one) for one in both.coefficients]
+    for name in ("by_direction", "by_coefficients"):
+        want = torch.stack([getattr(one, name)(given) for one in alone])
+        torch.testing.assert_close(getattr(both, name)(given.expand(2, -1, -1)), want, rtol=1e-13, atol=1e-18)

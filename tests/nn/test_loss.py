@@ -82,3 +82,26 @@ def test_shapes_that_stretch_the_points(name: str) -> None:
             dp.PlaneLoss()(points, **given)
     with pytest.raises(TypeError, match="valid: want booleans"):
         dp.PlaneLoss()(points, points, torch.ones(4, 3))
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "want"),
+    [
+        ("resolution", (0.0, -1.0, torch.nan, torch.inf), "positive finite numbers"),
+        ("weights", (-1.0, torch.nan, torch.inf), "finite numbers that are not negative"),
+    ],
+)
+@pytest.mark.parametrize("dtype", [torch.float32, D])
+def test_factors_that_cannot_be(name: str, values: tuple[float, ...], want: str, dtype: torch.dtype) -> None:
+    points, target = torch.rand(2, 4, 3, dtype=dtype, requires_grad=True), torch.zeros(2, 4, 3, dtype=dtype)
+    for value in values:
+        factors = torch.ones(2, 4, dtype=dtype)
+        factors[1, 2] = value
+        with pytest.raises(ValueError, match=f"{name}: want {want} at the points that count, got {value:g}; `valid`"):
+            dp.PlaneLoss()(points, target, **{name: factors})
+        # Where the point does not count, neither does what it came with.
+        valid = factors == 1
+        got = dp.PlaneLoss()(points, target, valid, **{name: factors})
+        torch.testing.assert_close(got, (points.square().sum(-1) * valid).mean())
+        assert torch.autograd.grad(got, points)[0].isfinite().all()
+    assert dp.PlaneLoss()(points, target, weights=torch.zeros(4, dtype=dtype)) == 0

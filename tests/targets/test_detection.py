@@ -464,16 +464,17 @@ def test_an_empty_folder_and_an_empty_pattern(tmp_path):
         detect(f"{tmp_path}/left*.jpg", BOARD)
 
 
-def test_bad_files_are_named_before_the_search(tmp_path, monkeypatch):
-    """A missing or a broken file stops the run before the first photograph is searched."""
-    monkeypatch.setattr(detection, "find_pattern", lambda *_: pytest.fail("searched before all files were checked"))
+def test_bad_files_are_named(tmp_path, monkeypatch):
+    """A missing file stops the run before the first photograph is searched, a broken one when its turn comes."""
     image, _ = photograph()
     good, broken, empty = tmp_path / "good.png", tmp_path / "broken.png", tmp_path / "empty.png"
     assert cv2.imwrite(str(good), image)
     broken.write_bytes(b"this is text")
     empty.touch()
-    with pytest.raises(FileNotFoundError, match=r"no such file: .*missing\.jpg"):
-        detect([good, tmp_path / "missing.jpg"], BOARD)
+    with monkeypatch.context() as patch:
+        patch.setattr(detection, "find_pattern", lambda *_: pytest.fail("searched before all files were looked for"))
+        with pytest.raises(FileNotFoundError, match=r"no such file: .*missing\.jpg"):
+            detect([good, tmp_path / "missing.jpg"], BOARD)
     with pytest.raises(ValueError, match=r"broken\.png: want an image, got 12 bytes that OpenCV cannot read"):
         detect([good, broken], BOARD)
     with pytest.raises(ValueError, match=r"empty\.png: want an image, got 0 bytes"):

@@ -111,3 +111,12 @@ def test_errors() -> None:
         synthetic.board_texture(setup.board, 0)
     with pytest.raises(ValueError, match="batch of views"):
         synthetic.corner_views(camera, setup.board)
+
+
+@pytest.mark.parametrize("blur_px", [12.0, 50.0])
+def test_blur_wider_than_the_image(blur_px: float) -> None:
+    setup = dp.paper_setup()
+    small = setup.test[0].resized((64, 48))
+    image = synthetic.photograph(small, setup.board, blur_px=blur_px, noise=0.0, vignetting=0.0)
+    assert image.shape == (48, 64)
+    assert int(image.max()) - int(image.min()) < 160

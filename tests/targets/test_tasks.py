@@ -90,6 +90,7 @@ def test_an_exception_names_its_photograph(folder, monkeypatch):
     monkeypatch.setattr(detection, "find_pattern", fails)
     with ThreadPoolExecutor(2) as pool, pytest.raises(RuntimeError, match=r"\d\.png: error while searching it: out of"):
         detect(folder, Chessboard(9, 6), executor=pool)
+    monkeypatch.undo()
     (folder / "1.png").write_bytes(b"text")
     with ThreadPoolExecutor(2) as pool, pytest.raises(ValueError, match=r"1\.png: want an image"):
         detect(folder, Chessboard(9, 6), executor=pool)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
-from diffproj.targets.views import Views
+from diffproj.targets.views import Views, view_number
 
 
 def some_views(*shape, **options):
@@ -297,3 +297,10 @@ def test_a_visible_corner_must_be_finite(value):
         Views(pixels, names=["a", "b"])
     with pytest.raises(ValueError, match=r"camera \(1,\), 'view 2' \(view 1\), corner 2"):
         Views(torch.stack([torch.ones(2, 3, 2), pixels]))
+
+
+def test_a_name_of_several_views_names_none() -> None:
+    with pytest.raises(ValueError, match="view: want the number of one, got 'a', which is the name of several"):
+        view_number("a", ["b", "a", "a"])
+    assert view_number("b", ["b", "a", "a"]) == 0
+    assert view_number(2, ["b", "a", "a"]) == 2

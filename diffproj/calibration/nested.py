@@ -1,0 +1,106 @@
+"""Lenses within lenses: the fit of a rich one starts from the lowest of all the poorer ones that it contains.
+
+The terms of a long lens nearly cancel each other, and those of a tilted sensor, a prism and skew do much the same as a
+shifted principal point: from far off they lead into side valleys. So they come in groups, and the camera is fitted with
+none of them, then with one, with two and so on. Every fit starts from the lowest of those with one group fewer. As the
+solver only ever goes down, a richer lens never ends above a poorer one.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.data import Data
+from diffproj.calibration.entangled import DENOMINATOR
+from diffproj.calibration.fit import Fit
+from diffproj.calibration.options import Options
+from diffproj.calibration.outcome import minimised
+from diffproj.calibration.parametrisation import SKEW, Parametrisation, Pose
+from diffproj.calibration.restraint import restrained
+from diffproj.calibration.second_look import second_look
+from diffproj.calibration.start import Straightened
+from diffproj.lens.models import MODELS
+
+SHORT = 5
+"""Coefficients up to which a lens is fitted at once."""
+PRISM, TILT = ("s1", "s2", "s3", "s4"), ("tau_x", "tau_y")
+GROUPS = ((SKEW,), PRISM, TILT, DENOMINATOR)
+"""Parameters that a long lens gets one group after the other."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nested:
+    """The fits of P cameras with ever more groups of parameters.
+
+    Attributes:
+        data: the views.
+        chosen: options of the richest fit.
+        parameters: which there are.
+        shared: where the poorest fit starts `(P, s)`.
+        local: its poses.
+        reference: what is held, as `minimised` takes it.
+        straight: the corners as the first estimate of the lens straightens them.
+        size: of the image.
+    """
+
+    data: Data
+    chosen: Options
+    parameters: Parametrisation
+    shared: Tensor
+    local: Pose
+    reference: Tensor
+    straight: Straightened
+    size: tuple[int, int]
+
+    def richest(self) -> Fit:
+        """The fit with all groups."""
+        groups = self._groups()
+        if not groups:
+            return self._fit(self.chosen, (self.shared, self.local))
+        early = self.chosen.but(
+            objective="image",
+            reject_outliers=False,
+            loss=None if self.chosen.objective == "plane" else self.chosen.loss,  # its scale is in world units
+            progress=None,
+        )
+        fits: dict[tuple[tuple[str, ...], ...], Fit] = {}
+        for count in range(len(groups)):
+            for inside in combinations(groups, count):
+                if TILT in inside and PRISM in groups and PRISM not in inside:
+                    continue  # no lens has it
+                held = [name for group in groups if group not in inside for name in group]
+                options = early.but(fixed=(*early.fixed, *held))
+                fits[inside] = self._fit(options, self._start(fits, inside), DENOMINATOR in inside)
+        return self._fit(self.chosen, self._start(fits, tuple(groups)), DENOMINATOR in groups)
+
+    def _groups(self) -> list[tuple[str, ...]]:
+        """The groups of which some parameters are free; none for a short lens."""
+        if MODELS[self.parameters.lens].count <= SHORT or "distortion" in self.chosen.fixed:
+            return []
+        names = self.parameters.names
+        return [g for g in GROUPS if set(g) <= set(names) and not set(g) <= set(self.chosen.fixed)]
+
+    def _start(
+        self, fits: dict[tuple[tuple[str, ...], ...], Fit], inside: tuple[tuple[str, ...], ...]
+    ) -> tuple[Tensor, Pose]:
+        """Shared parameters and poses of the lowest fit with one group fewer, of each camera."""
+        poorer = (tuple(g for g in inside if g != left) for left in inside)
+        fewer = [fits[names].solution for names in poorer if names in fits]
+        if not fewer:
+            return self.shared, self.local
+        costs = torch.stack([solution.cost.nan_to_num(torch.inf) for solution in fewer])
+        best = costs.argmin(0), torch.arange(costs.shape[1], device=costs.device)
+        shared = torch.stack([solution.shared for solution in fewer])[best]
+        local = zip(*(solution.local for solution in fewer), strict=True)
+        return shared, tuple(torch.stack(parts)[best] for parts in local)
+
+    def _fit(self, options: Options, start: tuple[Tensor, Pose], rational: bool = False) -> Fit:
+        """The lowest fit that is found from there."""
+        found, _ = minimised(self.data, options, self.parameters, *start, self.reference)
+        steps: dict[str, Any] = {"max_iterations": options.max_iterations, "tolerance": options.tolerance}
+        limit = options.outlier_limit
+        found = second_look(found, self.straight, reject=limit, long_valley=rational, **steps)
+        return restrained(found, *start, self.size, reject=limit, **steps) if rational else found

@@ -1,0 +1,83 @@
+"""The closed-form starts against the cameras that made the views: exact where the views are, and one by one alike."""
+
+import torch
+from torch import Tensor
+
+import diffproj as dp
+from diffproj import synthetic
+from diffproj.calibration import closed_form
+
+D = torch.float64
+BOARD = dp.Chessboard()
+MIDDLE = torch.tensor([320.0, 240.0], dtype=D)
+
+
+def cameras(f: tuple[float, float], c: tuple[float, float] = (320.0, 240.0), seed: int = 0) -> dp.Camera:
+    K = torch.tensor([[f[0], 0, c[0]], [0, f[1], c[1]], [0, 0, 1]], dtype=D)
+    return synthetic.random_cameras(dp.Camera(K, size=(640, 480)), BOARD, 6, seed=seed)
+
+
+def homographies(pixels: Tensor) -> Tensor:
+    """Of views `(P, V, N, 2)` that show every corner."""
+    return closed_form.homographies(BOARD.points, pixels, torch.ones_like(pixels[..., 0], dtype=torch.bool))
+
+
+def test_focal_lengths_of_exact_views_whatever_else_is_in_the_batch() -> None:
+    f = torch.tensor([[600.0, 640.0], [900.0, 700.0], [450.0, 460.0]], dtype=D)
+    seen = torch.stack(
+        [cameras((float(a), float(b)), seed=seed).project(BOARD.points)[0] for seed, (a, b) in enumerate(f)]
+    )
+    enough = torch.ones(seen.shape[:2], dtype=torch.bool)
+    middle = MIDDLE.expand(3, 2)
+    found = closed_form.focal_lengths(homographies(seen), middle, 640.0, enough, False)
+    torch.testing.assert_close(found, f, rtol=1e-6, atol=0)
+    for p in range(3):
+        one = slice(p, p + 1)
+        alone = closed_form.focal_lengths(homographies(seen[one]), middle[one], 640.0, enough[one], False)
+        torch.testing.assert_close(alone, found[one], rtol=1e-9, atol=0)
+
+
+def test_one_focal_length_for_both_axes() -> None:
+    seen = cameras((700.0, 700.0)).project(BOARD.points)[0].unsqueeze(0)
+    enough = torch.ones(seen.shape[:2], dtype=torch.bool)
+    found = closed_form.focal_lengths(homographies(seen), MIDDLE.expand(1, 2), 640.0, enough, True)
+    torch.testing.assert_close(found, torch.tensor([[700.0, 700.0]], dtype=D), rtol=1e-6, atol=0)
+
+
+def test_the_full_system_finds_the_principal_point_too() -> None:
+    seen = cameras((600.0, 640.0), c=(250.0, 300.0)).project(BOARD.points)[0].unsqueeze(0)
+    enough = torch.ones(seen.shape[:2], dtype=torch.bool)
+    f, c, solved = closed_form.intrinsics(homographies(seen), MIDDLE.expand(1, 2), 640.0, enough)
+    assert bool(solved.all())
+    torch.testing.assert_close(f, torch.tensor([[600.0, 640.0]], dtype=D), rtol=1e-6, atol=0)
+    torch.testing.assert_close(c, torch.tensor([[250.0, 300.0]], dtype=D), rtol=0, atol=1e-3)
+
+
+def test_the_division_model_is_recognised() -> None:
+    straight = cameras((600.0, 640.0)).project(BOARD.points)[0].unsqueeze(0)
+    radius = 400.0
+    for lam in (-0.25, -0.1):
+        centred = straight - MIDDLE
+        r = centred.norm(dim=-1, keepdim=True) / radius  # of r_d / (1 + lam r_d^2) = r the root that is near r
+        distorted = (1 - (1 - 4 * lam * r * r).sqrt()) / (2 * lam * r)
+        seen = MIDDLE + centred / r * distorted
+        back = closed_form.without_division(seen, MIDDLE.expand(1, 2), torch.tensor([lam], dtype=D), radius)
+        torch.testing.assert_close(back, straight)
+        used = torch.ones_like(seen[..., 0], dtype=torch.bool)
+        found, _ = closed_form.division(BOARD.points, seen, used, MIDDLE.expand(1, 2), radius)
+        assert abs(float(found) - lam) < 0.005  # measured: .0007 and .0022
+
+
+def test_poses_of_exact_homographies_and_of_none() -> None:
+    made = cameras((600.0, 640.0))
+    xy = dp.Camera(torch.eye(3, dtype=D), made.R, made.t).project(BOARD.points)[0].unsqueeze(0)
+    H = homographies(xy)
+    R, t = closed_form.poses(H, BOARD.points)
+    torch.testing.assert_close(R[0], made.R.expand(6, 3, 3), rtol=0, atol=1e-7)
+    torch.testing.assert_close(t[0], made.t.expand(6, 3), rtol=1e-7, atol=1e-4)
+    # Without a usable homography the board faces the camera on its axis, ten times its half extent away.
+    R, t = closed_form.poses(torch.full_like(H[:, :1], torch.nan), BOARD.points)
+    middle = BOARD.points.mean(0)
+    extent = (BOARD.points - middle).abs().amax()
+    torch.testing.assert_close(R[0, 0], torch.eye(3, dtype=D))
+    torch.testing.assert_close((R @ middle + t)[0, 0], 10 * extent * torch.tensor([0.0, 0.0, 1.0], dtype=D))
