@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from diffproj.calibration.entangled import DENOMINATOR
 from diffproj.calibration.fit import MAX_REJECTION_ROUNDS, normal_tensors
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.options import Options
 from diffproj.calibration.parametrisation import POSE
-from diffproj.calibration.entangled import DENOMINATOR
 from diffproj.calibration.rig_options import free_directions
 from diffproj.calibration.rig_problem import RigParameters, RigProblem
 from diffproj.calibration.rig_start import RigStart
