@@ -4,6 +4,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import mounting  # beside this file
+
 import diffproj as dp
 from diffproj import figures
 
@@ -13,6 +15,7 @@ experiment = replace(experiment, fit=replace(experiment.fit, unit="mm"))
 calibration = dp.calibrate(views, dp.Chessboard())
 pictures = {
     "fig7.png": figures.png(figures.fig7(experiment), dpi=80),
+    "mounting.png": figures.png(mounting.figure(), dpi=80),
     "accuracy.png": figures.png(figures.accuracy(dp.AccuracyMap.over_image(calibration, view=0), unit="mm"), dpi=90),
 }
 folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent

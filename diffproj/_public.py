@@ -4,9 +4,12 @@ That takes as long as PyTorch does, for which `diffproj --help` need not wait. `
 is handed on.
 """
 
+from diffproj.calibration.adjust import adjust as adjust
+from diffproj.calibration.adjustment import Adjustment as Adjustment
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning as AmbiguousPoseWarning
 from diffproj.calibration.calibrate import calibrate as calibrate
 from diffproj.calibration.comparison import LensComparison as LensComparison
+from diffproj.calibration.coplanar import Coplanar as Coplanar
 from diffproj.calibration.covariance import Covariance as Covariance
 from diffproj.calibration.locate import locate as locate
 from diffproj.calibration.losses import Cauchy as Cauchy
@@ -14,6 +17,11 @@ from diffproj.calibration.losses import Huber as Huber
 from diffproj.calibration.losses import Loss as Loss
 from diffproj.calibration.losses import SoftL1 as SoftL1
 from diffproj.calibration.mismatch import CameraMismatchWarning as CameraMismatchWarning
+from diffproj.calibration.observation import Observation as Observation
+from diffproj.calibration.observations import Heights as Heights
+from diffproj.calibration.observations import Horizon as Horizon
+from diffproj.calibration.observations import Lengths as Lengths
+from diffproj.calibration.observations import Seen as Seen
 from diffproj.calibration.options import CalibrationOptions as CalibrationOptions
 from diffproj.calibration.options import LocateOptions as LocateOptions
 from diffproj.calibration.refine import refine as refine
@@ -29,6 +37,7 @@ from diffproj.calibration.solver import Status as Status
 from diffproj.calibration.validation import CrossValidation as CrossValidation
 from diffproj.calibration.validation import bootstrap as bootstrap
 from diffproj.calibration.validation import cross_validate as cross_validate
+from diffproj.calibration.vanishing import VanishingPoints as VanishingPoints
 from diffproj.files.load import load as load
 from diffproj.files.load import load_calibration as load_calibration
 from diffproj.files.load import load_camera as load_camera
@@ -43,6 +52,7 @@ from diffproj.geometry.euler import euler_from_rotation as euler_from_rotation
 from diffproj.geometry.euler import rotation_from_euler as rotation_from_euler
 from diffproj.geometry.geodesy import degrees_from_metres as degrees_from_metres
 from diffproj.geometry.geodesy import metres_from_degrees as metres_from_degrees
+from diffproj.geometry.mounting import Mounting as Mounting
 from diffproj.geometry.plane import Plane as Plane
 from diffproj.geometry.rectification import geotransform as geotransform
 from diffproj.geometry.rectification import plane_axes as plane_axes

@@ -1,6 +1,7 @@
 """Every call of the README's table works as it is written, in an empty folder with photographs and camera files."""
 
 import doctest
+import importlib
 import io
 import re
 import shlex
@@ -113,6 +114,25 @@ def inputs(example: dict[str, Any]) -> dict[str, Any]:
         "phi": torch.tensor(0.2),
         "theta": torch.tensor(0.3),
         "R": camera.R,
+        **evidence(),
+    }
+
+
+def evidence() -> dict[str, Any]:
+    """What a camera on a mast sees."""
+    mast = dp.Camera.mounted(6.0, 20.0, heading_deg=30.0, fov_deg=70.0, size=(640, 480))
+    landmarks = torch.tensor([[8.0, 12, 0], [5, 18, 2], [14, 16, 1], [10, 25, 0]], dtype=D)
+    standing = torch.tensor([[6.0, 10, 0], [8, 14, 0]], dtype=D)
+    return {
+        "mast": mast,
+        "landmarks": landmarks,
+        "seen": mast.project(landmarks)[0],
+        "horizon": mast.project(mast.center + 1e6 * torch.tensor([[0.3, 1, 0], [0.9, 1, 0]], dtype=D))[0],
+        "feet": mast.project(standing)[0],
+        "tops": mast.project(standing + torch.tensor([0, 0, 1.75], dtype=D))[0],
+        "ends": mast.project(standing + torch.tensor([3.5, 0, 0], dtype=D))[0],
+        "meeting": mast.project(mast.center + 1e9 * torch.eye(3, dtype=D)[[1, 0]])[0],
+        "shore": landmarks[:3, :2],
     }
 
 
@@ -135,3 +155,10 @@ def test_calls_work_as_they_are_written(wish: str, names: dict[str, Any]) -> Non
             assert cli.main(shlex.split(call)[1:]) == 0
         else:
             exec(compile(call, "README.md", "exec"), names)  # noqa: S102
+
+
+def test_the_figure_of_a_mounted_camera_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / ".readme"))
+    drawn = importlib.import_module("mounting").figure()
+    assert [axes.get_title() for axes in drawn.axes] == ["from the side", "the picture", "from above"]
+    assert len(dp.figures.png(drawn, dpi=40)) > 3000

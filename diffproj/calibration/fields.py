@@ -32,6 +32,8 @@ def tensor(
         ValueError: it holds something else than finite numbers, in another shape, or smaller ones.
     """
     array = _array(name, fields[name], gaps)
+    if array.size == 0 and shape is not None and 0 in shape and None not in shape:
+        array = array.reshape(shape)  # type: ignore[arg-type]  # lists of nothing do not tell what is in them
     if shape is not None and not _fits(array.shape, shape):
         wanted = ", ".join("any" if side is None else str(side) for side in shape)
         raise ValueError(f"{name}: want shape ({wanted}), got {array.shape}")

@@ -58,5 +58,5 @@ def _times(ratio: float) -> str:
 
 def none_at_all(used: Bool[Tensor, "*batch v n"]) -> Mismatch:
     """Where nothing is known to compare with."""
-    unknown = torch.full_like(used[..., 0], torch.nan, dtype=torch.float64)
-    return Mismatch(unknown, torch.zeros_like(used[..., 0]), torch.ones_like(unknown))
+    unknown = torch.full_like(used.any(-1), torch.nan, dtype=torch.float64)
+    return Mismatch(unknown, torch.zeros_like(used.any(-1)), torch.ones_like(unknown))

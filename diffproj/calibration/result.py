@@ -186,6 +186,11 @@ class Calibration(Account, Copied, Recorded):
         return self._remarks() if self._remarks is not None else ("",) * max(1, self.status.numel())
 
     @property
+    def posed(self) -> Bool[Tensor, "*batch v"]:
+        """Which views' poses are known `(*B, V)`: of which a corner was used, or that other evidence tells."""
+        return self.used.any(-1) if self.used.shape[-1] else self.converged.unsqueeze(-1).expand(self.used.shape[:-1])
+
+    @property
     def has_covariance(self) -> bool:
         """Whether the covariance is known: not where the calibration came from a file without it."""
         return self._covariance is not None
@@ -286,7 +291,7 @@ class Calibration(Account, Copied, Recorded):
         """
         if self.lens_region is not None:
             return self.lens_region
-        own = self.knows_intrinsics or not self.has_covariance
+        own = (self.knows_intrinsics or not self.has_covariance) and self.used.shape[-1] > 0
         return covered_region(self.views.pixels, self.used) if own else None
 
 

@@ -63,7 +63,7 @@ def calibrate_rig(
         >>> pair = {"left": dp.example_views("left"), "right": dp.example_views("right")}
         >>> rig = dp.calibrate_rig(pair, dp.Chessboard())
         >>> rig
-        RigCalibration(2 cameras, 13 moments, baseline 83.2, RMS 0.1935 px, converged)
+        RigCalibration(2 cameras, 13 moments, baseline 83.2, RMS 0.1732 px, converged)
     """
     chosen = rig_options("calibrate_rig", options)
     return rig_calibrated(views_by_camera, target, distortion, moments, cameras, chosen, "calibrate_rig")

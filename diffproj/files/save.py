@@ -21,8 +21,8 @@ def save_camera(
     A file is written whole or not at all. What a format cannot hold is refused, not dropped: a pose, a batch, skew, the
     last coefficients of a lens. This package's own JSON holds all, and whole calibrations and rigs. Of a calibration,
     the other formats hold the camera alone, without the world's unit and the error bars; OpenCV's also get the poses,
-    with the unit as `world_unit`, and the RMS errors, for other programs: `load_camera` reads the camera. Of a rig, OpenCV's
-    formats hold a pair, Kalibr's a chain of cameras.
+    with the unit as `world_unit`, and the RMS errors, for other programs: `load_camera` reads the camera. Of a rig,
+    OpenCV's formats hold a pair, Kalibr's a chain of cameras.
 
     Args:
         path: the file to write; its folder must exist.

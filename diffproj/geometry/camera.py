@@ -39,6 +39,7 @@ from diffproj.geometry.exchange import Exchange
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounded_pixels
 from diffproj.geometry.grid import checked_size, inside
 from diffproj.geometry.intrinsics import check_intrinsics, pixel_to_normalized
+from diffproj.geometry.mounting import Mounted
 from diffproj.lens.protocol import Lens
 
 ROTATION_TOLERANCE = 1e-5
@@ -49,7 +50,13 @@ SQUARED = 0.45
 
 
 class Camera(
-    ChangedImages, Exchange, Batched, tensors={"K": 2, "R": 2, "t": 1}, parts=("distortion",), constants=("size",)
+    ChangedImages,
+    Exchange,
+    Mounted,
+    Batched,
+    tensors={"K": 2, "R": 2, "t": 1},
+    parts=("distortion",),
+    constants=("size",),
 ):
     """A calibrated camera, or a batch of them with batch shape `*B`; the parts broadcast to it.
 

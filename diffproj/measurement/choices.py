@@ -7,6 +7,7 @@ from torch import Tensor
 
 from diffproj._core.warn import warn_caller
 from diffproj.calibration import ambiguity, mismatch
+from diffproj.calibration.adjustment import Adjustment
 from diffproj.calibration.mismatch import CameraMismatchWarning
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.result import Calibration
@@ -95,7 +96,8 @@ def doubts(calibration: Calibration, view: int) -> str:
     if misfit:
         warn_caller(f"measure: {misfit}", CameraMismatchWarning)
     two = ambiguity.described(calibration.ambiguous[..., only], name) if calibration.has_alternatives else ""
-    return "; ".join(filter(None, [misfit, two]))
+    evidence = calibration.doubts if isinstance(calibration, Adjustment) else ""
+    return "; ".join(filter(None, [misfit, two, evidence]))
 
 
 def _are_corners(pixels: Tensor, corners: Tensor) -> bool:

@@ -170,9 +170,9 @@ def _at_view(calibration: Calibration, number: int) -> tuple[Camera, Tensor | No
 
     What is not known is `None`. The covariance is larger where the calibration does not fit the view.
     """
-    if not bool(calibration.used[..., number, :].any(-1).all()):
+    if not bool(calibration.posed[..., number].all()):
         name = calibration.views.names[number]
-        raise ValueError(f"view: want one whose pose is known, got {number} ({name}), of which no corner was used")
+        raise ValueError(f"view: want one whose pose is known, got {number} ({name}), which nothing tells")
     known, middle = None, None
     if calibration.has_covariance:
         covariance = calibration.covariance_of_kept_poses

@@ -221,6 +221,26 @@ def _geometry(t: Things) -> dict[str, Call]:
             },
         ),
         "Camera.from_kornia": Call(dp.Camera.from_kornia, {"pinhole": dp.Camera(t.K, size=(128, 96)).to_kornia()}),
+        "Camera.mounted": Call(
+            dp.Camera.mounted,
+            {
+                "height": 2.0,
+                "tilt_deg": angle * 100,
+                "roll_deg": 1.0,
+                "heading_deg": 30.0,
+                "size": (128, 96),
+                "focal": (100.0, 101.0),
+                "principal_point": [64.0, 48.0],
+                "position": [1.0, 2.0],
+                "distortion": t.lens,
+            },
+        ),
+        "Camera.mounted by millimetres": Call(
+            dp.Camera.mounted, {"height": 2.0, "tilt_deg": 20.0, "size": (128, 96), "focal_mm": 5.0, "sensor_mm": 6.0}
+        ),
+        "Camera.mounted by degrees": Call(
+            dp.Camera.mounted, {"height": 2.0, "tilt_deg": 20.0, "size": (128, 96), "fov_deg": 60.0}
+        ),
         "Camera.at": Call(c.at, {"R": t.cameras.R, "t": t.cameras.t}),
         "Camera.resized": Call(c.resized, {"size": (64, 48), "stretched": False}),
         "Camera.cropped": Call(c.cropped, {"left": 3, "top": 4.5, "width": 60, "height": 40}),
@@ -376,11 +396,69 @@ def _calibration(t: Things) -> dict[str, Call]:
         "Covariance.cross": Call(k.covariance.cross, {"view": 0}),
         "Covariance.view": Call(k.covariance.view, {"view": 1}),
         "Covariance.following": Call(k.covariance.following, {"known": k.covariance}),
+        **_evidence(),
         "run_experiment": Call(
             dp.run_experiment,
             {"fit": t.views[:3], "test": t.views[3:], "board": t.board, "distortion": "none", "strict": False},
             1,
         ),
+    }
+
+
+def _evidence() -> dict[str, Call]:
+    mast = dp.Camera.mounted(5.0, 20.0, focal=100.0, size=(128, 96))
+    points = torch.tensor([[-2.0, 10, 0], [2, 12, 0], [0, 15, 1], [4, 20, 0]], dtype=D)
+    pixels = mast.project(points)[0]
+    ground = {"pixel_sigma": 0.5, "loss": dp.Huber(2.0)}
+    pieces = [dp.Seen(points, pixels), dp.Horizon([[10.0, 11.0], [100.0, 11.0]], 2.0)]
+    return {
+        "adjust": Call(
+            dp.adjust,
+            {
+                "camera": mast,
+                "observations": pieces,
+                "priors": {"tilt": (20.0, 1.0), "focal": 5.0},
+                "fixed": ("height",),
+                "free": ("focal",),
+                "tied_focal": True,
+                "differentiable": True,
+                "max_iterations": 20,
+                "throw": False,
+            },
+            3,
+        ),
+        "Seen": Call(dp.Seen, {"landmarks": points, "pixels": pixels, "sigma": 0.1, **ground}),
+        "Horizon": Call(dp.Horizon, {"pixels": pixels, "dip_deg": 0.1, **ground}),
+        "Heights": Call(
+            dp.Heights,
+            {"feet": pixels, "tops": pixels - 5, "height": 1.7, "deviation": torch.ones(4, dtype=D), **ground},
+        ),
+        "Lengths": Call(
+            dp.Lengths,
+            {
+                "starts": pixels,
+                "ends": pixels + 5,
+                "length": 1.7,
+                "deviation": 0.1,
+                "plane": dp.Plane.z(0.0),
+                **ground,
+            },
+        ),
+        "VanishingPoints": Call(dp.VanishingPoints, {"directions": points, "pixels": pixels, **ground}),
+        "VanishingPoints of lines": Call(
+            dp.VanishingPoints, {"directions": ["x", "y"], "segments": pixels.reshape(2, 2, 2), **ground}
+        ),
+        "Coplanar": Call(dp.Coplanar, {"places": points[:, :2], "pixels": pixels, "level": 1.0, **ground}),
+        **{
+            f"{type(one).__name__}.residuals": Call(one.residuals, {"camera": mast})
+            for one in (
+                *pieces,
+                dp.Heights(pixels, pixels - 5, 1.7, 0.1),
+                dp.Lengths(pixels, pixels + 5, 1.7, 0.1),
+                dp.VanishingPoints(["x", "y"], pixels=pixels[:2]),
+                dp.Coplanar(points[:, :2], pixels),
+            )
+        },
     }
 
 
@@ -466,11 +544,13 @@ def print_nothing(*_: object) -> None:
 OTHER = {
     "Lens",  # protocols, and what they ask of users' own classes
     "Loss",
+    "Observation",
     "LensComparison",  # results that are made inside
     "Baseline",
     "RigCalibration",
     "RigCrossValidation",
     "Triangulation",
+    "Adjustment",
     "Calibration",
     "Covariance",
     "CrossValidation",
@@ -478,6 +558,7 @@ OTHER = {
     "AccuracyMap",
     "FusedMeasurement",
     "Measurement",
+    "Mounting",
     "PaperSetup",
     "Quantity",
     "Reason",
@@ -524,6 +605,7 @@ NOT_CALLED = {
     "Lens.unproject",
     "Lens.to",
     "Lens.expand",
+    "Observation.residuals",
     "Loss.value",
     "Loss.weight",
     *(

@@ -1,0 +1,87 @@
+"""The covariance of what `adjust` found: of intrinsics and pose together, and what nothing tells of them."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.adjustment import pose_covariance
+from diffproj.calibration.covariance import Covariance, zero_where_infinite
+from diffproj.calibration.descent import Found, Task, reach
+from diffproj.calibration.evidence import jacobian
+from diffproj.calibration.parametrisation import POSE
+from diffproj.calibration.result import Calibration
+from diffproj.calibration.robust import robust_factors
+from diffproj.calibration.solver import Status
+from diffproj.calibration.undetermined import Lacking, inverse, natural, undetermined, units
+
+
+def covariance_of(task: Task, found: Found, calibration: Calibration | None) -> tuple[Covariance, list[Lacking]]:
+    """The covariance of intrinsics and pose, and what nothing tells of each camera."""
+    parameters, values, T = found.parameters, found.values, found.basis
+    s, P = parameters.camera.size, len(values)
+    known = None
+    if calibration is not None and calibration.has_covariance:
+        known = calibration.covariance_of_kept_poses.shared[..., :s, :s]
+        known = zero_where_infinite(known).expand(*task.batch, s, s).reshape(P, s, s)
+    columns = sorted({*task.known.columns, *(range(s) if known is not None else ())})
+    H, M = _normal_matrices(task, found, columns)
+    precision = found.prior.precision.detach()
+    scale = natural(values, reach(task, values))
+    Hr, lost, vectors = inverse(T.mT @ (H + precision) @ T, units(T, scale))
+    C = T @ Hr @ (T.mT @ (M + precision) @ T) @ Hr @ T.mT
+    if known is not None:
+        # Intrinsics that are held err as the calibration says, and what is found follows them.
+        held = torch.tensor([at not in task.known.columns for at in range(s)], device=values.device).to(values)
+        follow = torch.nn.functional.pad(torch.diag(held), (0, 0, 0, POSE)) - T @ Hr @ (T.mT @ H[..., :s] * held)
+        C = C + follow @ known @ follow.mT
+    unknown, names = undetermined(parameters, values, T, scale, lost, vectors)
+    names = [
+        each if code != Status.DIVERGED else Lacking() for each, code in zip(names, found.status.tolist(), strict=True)
+    ]
+    camera = parameters.unpack(values, (P,), None)
+    middle = camera.center.mean(0)
+    R = camera.R
+
+    def pose(step: Tensor) -> Tensor:
+        again = parameters.unpack(torch.cat([values[:, :-POSE], values[:, -POSE:] + step], dim=-1), (P,), None)
+        turn = again.R @ R.mT
+        omega = torch.stack(
+            [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], -1
+        )
+        return torch.cat([omega / 2, (again.R @ (middle - again.center).unsqueeze(-1)).squeeze(-1)], dim=-1)
+
+    J = jacobian(pose, values.new_zeros(P, POSE))[1].permute(1, 2, 0)
+    to_pose = torch.eye(values.shape[-1], dtype=values.dtype, device=values.device).repeat(P, 1, 1)
+    to_pose[:, -POSE:, -POSE:] = J
+    C = to_pose @ C @ to_pose.mT
+    lacking = torch.cat([unknown[:, :s], unknown[:, s:].any(-1, keepdim=True)], dim=-1)
+    gone = torch.cat([lacking[:, :s], lacking[:, s:].expand(-1, POSE)], dim=-1)
+    C = torch.where(gone.unsqueeze(-1) | gone.unsqueeze(-2), 0.0, C)
+    batch = task.batch
+    joint, arm, lacking = (
+        part.reshape((*batch, *part.shape[1:]))
+        for part in ((C + C.mT) / 2, (R @ middle.unsqueeze(-1)).squeeze(-1), lacking)
+    )
+    return pose_covariance(parameters.camera.names, joint, arm, middle, lacking), names
+
+
+def _normal_matrices(task: Task, found: Found, columns: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """`H` and `M` of all parameters `(P, q, q)` without the priors: see `robust.py`."""
+    evidence = task.evidence(found.parameters, (), columns)
+    P, q = found.values.shape
+    H = found.values.new_zeros(P, q, q)
+    if not task.pieces:
+        return H, H
+    value, slopes = evidence.along(found.values)
+    rows = value.new_zeros(P, q, *value.shape[1:])
+    rows[:, list(columns)] = slopes.movedim(0, 1)
+    M, start = H, 0
+    for piece, block in zip(task.pieces, evidence.blocks(found.values), strict=True):
+        count = block.shape[1]
+        part = rows[:, :, start : start + count].flatten(-2)
+        a, b = robust_factors(getattr(piece, "loss", None), block)
+        gram = part @ part.mT
+        H, M, start = H + a[:, None, None] * gram, M + b[:, None, None] * gram, start + count
+    sound = H.isfinite().all(-1).all(-1)[:, None, None]
+    return torch.where(sound, H, 0.0), torch.where(sound, M, 0.0)
