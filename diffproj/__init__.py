@@ -25,7 +25,7 @@ Conventions, which hold everywhere:
 Glossary:
 
 * Target: what is photographed in order to calibrate, with points that are known in the world. A `Chessboard` has its
-  inner corners, those where four squares meet.
+  inner corners, those where four squares meet; `Landmarks` are points that were surveyed, wherever they are.
 * View: where one photograph shows the points of the target. `Views` holds many.
 * Intrinsics `K`: focal lengths `f_x`, `f_y` and principal point `c_x`, `c_y`, in pixels.
 * Pose, or extrinsics: rotation `R` and translation `t`, where the world lies as the camera sees it.
@@ -76,12 +76,14 @@ __all__ = [
     "Coplanar",
     "Covariance",
     "CrossValidation",
+    "Ellipses",
     "Experiment",
     "FusedMeasurement",
     "Heights",
     "Horizon",
     "Huber",
     "KannalaBrandt",
+    "Landmarks",
     "LearnableCamera",
     "LearnablePlane",
     "Lengths",
@@ -98,6 +100,7 @@ __all__ = [
     "PlaneLoss",
     "PlaneMap",
     "PlaneProjector",
+    "Positions",
     "Quantity",
     "Reason",
     "RigCalibration",

@@ -24,6 +24,7 @@ from diffproj.calibration.observations import Lengths as Lengths
 from diffproj.calibration.observations import Seen as Seen
 from diffproj.calibration.options import CalibrationOptions as CalibrationOptions
 from diffproj.calibration.options import LocateOptions as LocateOptions
+from diffproj.calibration.positions import Positions as Positions
 from diffproj.calibration.refine import refine as refine
 from diffproj.calibration.result import Calibration as Calibration
 from diffproj.calibration.result import CalibrationError as CalibrationError
@@ -64,6 +65,7 @@ from diffproj.lens.models import register_lens as register_lens
 from diffproj.lens.protocol import Lens as Lens
 from diffproj.measurement.accuracy_map import AccuracyMap as AccuracyMap
 from diffproj.measurement.choices import PixelNoiseWarning as PixelNoiseWarning
+from diffproj.measurement.ellipses import Ellipses as Ellipses
 from diffproj.measurement.fuse import CameraDisagreementWarning as CameraDisagreementWarning
 from diffproj.measurement.fuse import FusedMeasurement as FusedMeasurement
 from diffproj.measurement.fuse import fuse as fuse
@@ -86,6 +88,7 @@ from diffproj.targets.detection import BoardNotFoundError as BoardNotFoundError
 from diffproj.targets.detection import BoardNotFoundWarning as BoardNotFoundWarning
 from diffproj.targets.detection import detect as detect
 from diffproj.targets.examples import example_views as example_views
+from diffproj.targets.landmarks import Landmarks as Landmarks
 from diffproj.targets.residuals import image_residuals as image_residuals
 from diffproj.targets.residuals import plane_residuals as plane_residuals
 from diffproj.targets.views import Views as Views

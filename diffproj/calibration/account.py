@@ -42,8 +42,15 @@ class Account(Shown):
         bow: Tensor | None
         causes: tuple[str, ...]
         pixel_sigma: Tensor | None
+        degrees_of_freedom: Tensor | None
         shares: Tensor | None
         lens_region: Tensor | None
+        landmarks: tuple[str, ...] | None
+
+        @property
+        def residuals(self) -> Tensor:
+            """See `Calibration`."""
+            ...
 
         @property
         def parameters(self) -> Parametrisation:
@@ -133,6 +140,9 @@ class Account(Shown):
         if self.has_covariance:
             spread = self.covariance_of_kept_poses.shared.diagonal()[:4].sqrt()
             unsure = float(spread.amax() / self.shared[0])
+        if self.landmarks is not None:
+            spare = None if self.degrees_of_freedom is None else float(self.degrees_of_freedom)
+            return advice.of_landmarks(int(self.used.any(0).sum()), unsure, self._scatter, spare, self.remarks[0])
         return advice.verdict(
             advice.Evidence(
                 self.cameras,
@@ -140,12 +150,17 @@ class Account(Shown):
                 float((used if self.shares is None else self.shares * used).sum()),
                 self.region,
                 unsure,
-                float(self.pixel_sigma) if self.pixel_sigma is not None else float(self.rms) / math.sqrt(2),
+                self._scatter,
                 self.view_rms,
                 self.views.names,
                 self.remarks[0],
             )
         )
+
+    @property
+    def _scatter(self) -> float:
+        """The standard deviation of a corner's coordinate of one camera in px."""
+        return float(self.rms) / math.sqrt(2) if self.pixel_sigma is None else float(self.pixel_sigma)
 
     def summary(self) -> str:
         """One camera as a text for people: parameters with deviations, RMS of each view, how it ended, the verdict.
@@ -182,6 +197,9 @@ class Account(Shown):
                 remark += f"  another pose is {odds[view]:.2g} times less likely"
             text = f"{rms:.4f} px{remark}" if used[view] else f"left out: {seen[view] - len(out)} corners, 4 are needed"
             lines.append(f"  {name:<{width}}  {text}")
+        if self.landmarks is not None and len(self.views) == 1:
+            errors = zip(self.landmarks, self.residuals[0].tolist(), self.used[0].tolist(), strict=True)
+            lines += [f"    landmark {name}: {u:+.2f}, {v:+.2f} px" for name, (u, v), counts in errors if counts]
         if self.shares is not None:
             same = alike(self.points, self.views.pixels.unsqueeze(0), self.used.unsqueeze(0))[0]
             lines.append(described(same, self.views.names))

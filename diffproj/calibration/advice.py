@@ -28,6 +28,8 @@ BARE = 0.25
 """The same of each ninth of the image, below which it is named."""
 UNSURE = 0.01
 """Deviation of a focal length or the principal point, relative to the focal length, from which on it is unsure."""
+UNSURE_OF_LANDMARKS, FEW_SPARE = 0.02, 4
+"""The same of a camera calibrated on landmarks; and degrees of freedom below which its residuals tell little."""
 COARSE_PX = 0.5
 """Scatter of a corner's coordinate above that of a detector in sharp photographs, 0.05 to 0.3 px."""
 ODD = 3.0
@@ -98,6 +100,32 @@ def verdict(seen: Evidence) -> str:
     if remedies:
         text += f". {'Next' if faults else 'Better still'}: {'; '.join(remedies)}"
     return text + "."
+
+
+def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | None, remarks: str) -> str:
+    """The same of a camera that was calibrated on so many landmarks.
+
+    Args:
+        count: how many landmarks were used.
+        unsure: the largest deviation of focal length or principal point, relative to the focal length, where known.
+        sigma: of a landmark's pixel coordinate in px.
+        spare: degrees of freedom, where known.
+        remarks: what the residuals leave over, in words; empty where nothing.
+    """
+    faults, remedies = [], []
+    if unsure is not None and unsure > UNSURE_OF_LANDMARKS:
+        known = f"only to {100 * unsure:.1g} %" if math.isfinite(unsure) else "not at all"
+        faults.append(f"focal length and principal point are known {known} of the focal length")
+        remedies.append("more landmarks, near and far, in all parts of the image")
+    if spare is not None and spare < FEW_SPARE:
+        faults.append(f"{spare:.0f} more pixel coordinates than unknowns test each other")
+        remedies.append("more landmarks, near and far, in all parts of the image")
+    if OTHER_LENS in remarks:
+        faults.append("this lens model does not fit the lens")
+    if not faults:
+        known = f"; focal length and principal point are known to {100 * unsure:.1g} %" if unsure else ""
+        return f"Good: {count} landmarks are met to {sigma:.2g} px in each coordinate{known}."
+    return f"Weak: {'; '.join(faults)}." + f" Next: {'; '.join(dict.fromkeys(remedies))}." * bool(remedies)
 
 
 def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:

@@ -27,13 +27,13 @@ def calibrate(
         views: corners `(*B, V, N, 2)` seen in photographs of known size. Views may miss any corners; one with fewer
             than 4 takes no part. Views that show the board alike count as one, and at least two must differ, unless
             `fixed` or `priors` hold the principal point and the lens.
-        target: anything with `.points (N, 3)` on z = 0, such as `Chessboard`; its unit is the world's.
+        target: a board such as `Chessboard`, `Landmarks`, or anything with `.points (N, 3)`; its unit is the world's.
         distortion: which lens to fit: `"none"`, `"brown4"`, `"brown5"`, `"brown8"`, `"brown12"`, `"brown14"` or
             `"fisheye"`. Or `"auto"`, for one camera: all of them but the longest are fitted side by side and compared
             by their errors on corners held out; the simplest that is no worse than the best, as far as the views can
             tell, is returned, and `Calibration.comparison` says how they fared.
-        options: `objective`, `bow`, `skew`, `fixed`, `tied_focal`, `priors`, `weights`, `loss`, `reject_outliers`,
-            `max_iterations`, `tolerance`, `progress` and `throw`: see `CalibrationOptions`.
+        options: `objective`, `bow`, `skew`, `fixed`, `tied_focal`, `priors`, `weights`, `pixel_sigma`, `loss`,
+            `reject_outliers`, `max_iterations`, `tolerance`, `progress` and `throw`: see `CalibrationOptions`.
 
     Returns:
         The calibration, in float64.

@@ -106,6 +106,16 @@ class Covariance(Copied, Shown):
         infinite = torch.diag_embed(torch.full_like(blocks[..., 0], torch.inf))
         return torch.where(unknown, infinite if same else torch.zeros_like(blocks), blocks)
 
+    @property
+    def poses(self) -> Float[Tensor, "*batch v 6 6"]:
+        """The covariance of every pose `(*B, V, 6, 6)`; infinite on the diagonal where it is not determined."""
+        F, Q = self._follow, self._mixed
+        shared = zero_where_infinite(self.shared).unsqueeze(-3)
+        blocks = F @ shared @ F.mT - Q @ F.mT - F @ Q.mT + self._alone
+        blocks = self._turns @ blocks @ self._turns.mT
+        infinite = torch.diag_embed(torch.full_like(blocks[..., 0], torch.inf))
+        return torch.where(self.undetermined_views[..., None, None], infinite, blocks)
+
     def cross(self, view: int) -> Float[Tensor, "*batch 6 s"]:
         """The cross-covariance of a pose (rows) and the shared parameters (columns)."""
         view = self._number("view", view)

@@ -10,13 +10,17 @@ from diffproj._core.arguments import Array, tensor_of
 from diffproj._core.numerics import in_float64
 from diffproj.calibration.distinct import shares
 from diffproj.calibration.losses import SMALLEST
+from diffproj.calibration.own_frame import OwnFrame, flattened, own_frame
 from diffproj.calibration.task import Task
 from diffproj.lens.models import LensModel
+from diffproj.targets.landmarks import Landmarks
 from diffproj.targets.target import Target, points_of
 from diffproj.targets.views import Views, as_views
 
 OUTSIDE = 0.02
 """Part of the image's size by which a corner may lie outside of it, by noise or a cut-off board."""
+BOARD_SIZE = "do columns and rows of the board fit?"
+"""The remedy where a board's views have another number of corners."""
 
 
 class Data:
@@ -25,12 +29,14 @@ class Data:
     Attributes:
         views, target: as given.
         batch: `*B`.
-        middle: the centroid of the points `(3,)`, without graph: the origin of the frame that is solved in. Poses
-            turn about it, so that it does not matter how far away the world's origin is.
-        points: the board's points about their middle `(N, 3)`, without graph.
+        frame: the points' own frame, without graph, which is solved in.
+        middle: its origin `(3,)`, the centroid of the points, which poses turn about.
+        points: the target's points in their own frame `(N, 3)`, without graph; on z = 0 where they lie on a plane.
         pixels: `(P, V, N, 2)`, without graph.
         used: `(P, V, N)`: seen, in a view with at least 4 corners.
         weights: `(P, V, N)`, without graph, or `None`.
+        spread: the covariances of landmarks in their own frame `(N, 3, 3)`; `None` where they are exact.
+        known_noise: whether the weights are one over the variances, and not only proportional to them.
         given_points, given_pixels, given_weights: with graph, and with `*B` in front; points in the world.
 
     Raises:
@@ -38,7 +44,13 @@ class Data:
         ValueError: views, board and weights do not fit together, or the board is of no use.
     """
 
-    def __init__(self, views: Views, target: Target, weights: Tensor | Array | float | None) -> None:
+    def __init__(
+        self,
+        views: Views,
+        target: Target,
+        weights: Tensor | Array | float | None,
+        pixel_sigma: Tensor | Array | float | None = None,
+    ) -> None:
         if len(as_views(views)) == 0:
             raise ValueError("views: want at least one, got none")
         if 0 in views.batch_shape:
@@ -51,25 +63,22 @@ class Data:
         points = self.given_points.detach()
         count = views.pixels.shape[-2]
         if points.shape != (count, 3):
-            raise ValueError(
-                f"views: want {points.shape[0]} corners in each as the target has, got {count}; "
-                "do columns and rows of the board fit?"
-            )
+            of_landmarks = isinstance(target, Landmarks)
+            remedy = "a pixel for each, in their order, or visible=False" if of_landmarks else BOARD_SIZE
+            raise ValueError(f"views: want {points.shape[0]} corners in each as the target has, got {count}; {remedy}")
         _check_points(points)
-        self.middle = points.mean(0)
-        self.points = points - self.middle
+        self.frame = own_frame(points)
+        self.middle = self.frame.middle
+        self.points = flattened(self.frame.own(points), points)
+        self.spread = _spread(target, self.frame)
         self.pixels = self.given_pixels.detach().reshape(-1, *views.pixels.shape[-3:])
         visible = views.visible
         self.given_weights, self.weights = None, None
+        self.known_noise = pixel_sigma is not None
+        if pixel_sigma is not None:
+            weights = _weights_of(pixel_sigma, views)
         if weights is not None:
-            given = tensor_of("weights", weights)
-            if given.is_complex() or given.is_meta:
-                raise TypeError(f"weights: want real numbers, got {given.dtype} on {given.device}")
-            try:
-                given = in_float64(given.to(views.device)).expand(visible.shape)
-            except RuntimeError:
-                want, got = tuple(visible.shape), tuple(given.shape)
-                raise ValueError(f"weights: want a shape that broadcasts to {want}, got {got}") from None
+            given = _of_corners("weights", weights, views)
             counted = given.detach()[visible]
             if not bool(((counted >= 0) & counted.isfinite()).all()):
                 raise ValueError("weights: want finite numbers of at least 0, got others at corners that were seen")
@@ -87,17 +96,65 @@ class Data:
         """How much each view counts in what all views share `(P, V)`; `None` where all count fully."""
         return shares(self.points, self.pixels, self.used)
 
-    def about_middle(self, R: Tensor, t: Tensor) -> Tensor:
-        """Translations `(..., 3)` from the board's middle, of those from the world's origin."""
-        return t + R @ self.middle
+    def check_options(self, objective: str, bow: bool) -> None:
+        """Check what a target can be asked for in `calibrate` and `refine`.
 
-    def in_world(self, R: Tensor, t: Tensor) -> Tensor:
-        """Translations `(..., 3)` from the world's origin, of those from the board's middle."""
-        return t - R @ self.middle
+        Raises:
+            ValueError: it cannot.
+        """
+        level = bool((self.given_points.detach()[:, 2] == 0).all())
+        if objective == "plane" and not level:
+            raise ValueError(
+                "objective: want 'image' for points that are not all on z = 0, got 'plane', which puts corners back "
+                "there"
+            )
+        if bow and not level:
+            raise ValueError("bow: want False for points that are not all on z = 0; a bow is that of a flat board")
+        if self.spread is None:
+            return
+        if objective == "plane":
+            raise ValueError("objective: want 'image' for landmarks with a sigma, got 'plane'; or leave out the sigma")
+        if int(self.used.any(-1).sum(-1).amax()) > 1:
+            raise ValueError(
+                "target: want landmarks without sigma, or one view: several views see a landmark off in the same way, "
+                "which calibrate and refine do not carry; dp.locate does, for each view"
+            )
 
     def task(self, model: LensModel, **options: Any) -> Task:
         """What is to be minimised on these corners."""
-        return Task(self.points, self.pixels, self.used, model, weights=self.weights, **options)
+        noise = {"weights": self.weights, "known_noise": self.known_noise, "spread": self.spread}
+        return Task(self.points, self.pixels, self.used, model, **noise, **options)
+
+
+def _spread(target: Target, frame: OwnFrame) -> Tensor | None:
+    """The covariances of landmarks in their own frame; `None` where there are none."""
+    given = target.covariances if isinstance(target, Landmarks) else None
+    if given is None or not bool((given != 0).any()):
+        return None
+    given = given.detach().to(frame.middle)
+    return given if frame.axes is None else frame.axes @ given @ frame.axes.mT
+
+
+def _of_corners(name: str, value: Tensor | Array | float, views: Views) -> Tensor:
+    """A number for each corner `(*B, V, N)`."""
+    given = tensor_of(name, value)
+    if given.is_complex() or given.is_meta or given.dtype == torch.bool:
+        raise TypeError(f"{name}: want real numbers, got {given.dtype} on {given.device}")
+    try:
+        return in_float64(given.to(views.device)).expand(views.visible.shape)
+    except RuntimeError:
+        want, got = tuple(views.visible.shape), tuple(given.shape)
+        raise ValueError(f"{name}: want a shape that broadcasts to {want}, got {got}") from None
+
+
+def _weights_of(pixel_sigma: Tensor | Array | float, views: Views) -> Tensor:
+    """One over the variance of each corner."""
+    given = _of_corners("pixel_sigma", pixel_sigma, views)
+    counted = given.detach()[views.visible]
+    least, most = SMALLEST**0.5, SMALLEST**-0.5
+    if not bool(((counted >= least) & (counted <= most)).all()):
+        raise ValueError(f"pixel_sigma: want standard deviations in px from {least:g} to {most:g}, got others")
+    return torch.where(views.visible, given, 1.0).square().reciprocal()
 
 
 def _check_inside(views: Views, pixels: Tensor, used: Tensor) -> None:
@@ -115,15 +172,16 @@ def _check_inside(views: Views, pixels: Tensor, used: Tensor) -> None:
 
 
 def _check_points(points: Tensor) -> None:
-    if not bool(points.isfinite().all()) or bool((points[:, 2] != 0).any()):
-        raise ValueError("target: want finite points, all on z = 0")
+    if not bool(points.isfinite().all()):
+        raise ValueError("target: want finite points, got others")
     if len(points) < 4:
-        raise ValueError(f"target: want at least 4 points, got {len(points)}")
+        why = ", for three leave up to four poses open" if len(points) == 3 else ""
+        raise ValueError(f"target: want at least 4 points{why}, got {len(points)}")
     points = points - points.mean(0)  # far from the origin squares of coordinates cancel
     apart = torch.cdist(points, points) + torch.eye(len(points), dtype=points.dtype, device=points.device).mul(1e300)
     extent = points.abs().amax()
     if bool(apart.amin() <= 1e-9 * extent):
         i, j = divmod(int(apart.argmin()), len(points))
         raise ValueError(f"target: want points that are all distinct, got {len(points)} with {i} and {j} alike")
-    if float(torch.linalg.svdvals(points[:, :2])[1]) <= 1e-9 * float(extent):
+    if float(torch.linalg.svdvals(points)[1]) <= 1e-9 * float(extent):
         raise ValueError("target: want points that do not lie on one line")

@@ -15,11 +15,14 @@ from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.options import Progress
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.solver import Solution, select
+from diffproj.calibration.surveyed import whitening
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import found_again, settled
 
 MAX_REJECTION_ROUNDS = 10
 """Maximum number of rounds of outlier rejection."""
+WEIGHING_ROUNDS = (6, 3)
+"""How often uncertain landmarks are weighed anew: where the pixels' noise is estimated, and where it is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +50,22 @@ class Fit:
 
         return Fit(self.task.part(rows), cut(self.solution), self.rejected[rows])
 
+    @property
+    def knows_noise(self) -> bool:
+        """Whether the noise was given: a robust loss takes what was given for weights alone."""
+        return self.task.known_noise and self.task.loss is None
+
     def residual_variance(self) -> Tensor:
-        """`sum |e|^2 / (2 n - parameters)` of least squares, `(P,)`; NaN without positive degrees of freedom."""
+        """The variance of residuals of weight 1, `(P,)`: `sum |e|^2 / (2 n - parameters)` of least squares.
+
+        NaN without positive degrees of freedom; 1 where the weights say what it is.
+        """
+        if self.knows_noise:
+            return torch.ones_like(self.solution.cost)
+        return self.variance_of_residuals()
+
+    def variance_of_residuals(self) -> Tensor:
+        """The same as the residuals tell it, whether it is known or not."""
         cost = self.solution.cost
         if self.task.prior is not None:
             off = self.solution.shared.detach() - self.task.prior.mean
@@ -64,10 +81,19 @@ class Fit:
         image = replace(task, objective="image").problem.linearise(self.solution.shared.detach(), local)[:, :, -1]
         if task.loss is not None:
             return _robust_sigma(image, task.used)
+        if self.knows_noise:
+            return self._given_sigma()
         spare = self.degrees_of_freedom()
         squares = image.square().sum((2, 3))
         squares = squares if task.shares is None else squares * task.shares
         return torch.where(spare > 0, squares.sum(-1) / spare, torch.nan).sqrt()
+
+    def _given_sigma(self) -> Tensor:
+        """The root mean square of the deviations that were given, `(P,)`."""
+        weights, used = self.task.weights, self.task.used
+        each = torch.ones_like(self.task.pixels[..., 0]) if weights is None else torch.where(used, weights, 1.0)
+        variance = torch.where(used, 1 / each, 0.0).sum((1, 2))
+        return (variance / used.sum((1, 2)).clamp(min=1)).sqrt()
 
     def degrees_of_freedom(self) -> Tensor:
         """Number of residual components minus number of free parameters, `(P,)`; views count by their shares."""
@@ -110,6 +136,12 @@ def fit(
     """
     with torch.inference_mode():  # a fifth faster where call overhead dominates; derivatives are added afterwards
         found = _fit(task, shared, local, reject, max_iterations, tolerance, progress)
+        if task.spread is not None:
+            for _ in range(WEIGHING_ROUNDS[task.known_noise]):
+                state = found.solution.shared, found.solution.local
+                matrices = whitening(found.task, *state, found.residual_variance())
+                again = _fit(replace(found.task, whitening=matrices), *state, reject, max_iterations, tolerance, None)
+                found = Fit(again.task, again.solution, found.rejected | again.rejected)
     return Fit(*normal_tensors((found.task, found.solution, found.rejected)))
 
 

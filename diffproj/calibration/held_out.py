@@ -11,7 +11,7 @@ from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.options import Options
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.lens.models import LensModel
-from diffproj.targets.residuals import projected_minus_seen, put_back_minus_known
+from diffproj.targets.residuals import nearest_minus_known, projected_minus_seen, put_back_minus_known
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
@@ -92,10 +92,12 @@ def errors_of(calibration: Calibration, pixels: Tensor, evaluated: Tensor, measu
     """The errors of a calibration on corners `(k, V, N)` of its views, where `pixels` were seen."""
     cameras, pixels = calibration.cameras, pixels.to(calibration.points)
     px, seen = projected_minus_seen(cameras, calibration.board_points.unsqueeze(-3), pixels, evaluated)
-    world, landed = put_back_minus_known(cameras, calibration.points, pixels, evaluated)
+    level = bool((calibration.points[:, 2] == 0).all())
+    in_space = put_back_minus_known if level else nearest_minus_known
+    world, landed = in_space(cameras, calibration.points, pixels, evaluated)
     squared = px.square().sum(-1)
     in_px = torch.where(evaluated & ~seen, torch.inf, squared if measure is None else measure.value(squared)).sum(-1)
-    in_world = torch.where(evaluated & ~landed, torch.inf, world[..., :2].square().sum(-1)).sum(-1)
+    in_world = torch.where(evaluated & ~landed, torch.inf, world.square().sum(-1)).sum(-1)
     return Errors(in_px, in_world, evaluated.sum(-1), (evaluated & ~(seen & landed)).sum(-1))
 
 

@@ -73,11 +73,13 @@ def _costs(
     flat = shared.flatten(0, 1)
     local = tuple(z.unsqueeze(1) for z in moved(found.solution.local, step))
     cameras = task.parameters.unpack(flat, tuple(z.flatten(0, 2).unsqueeze(1) for z in local))
-    centred = data.given_points - data.middle
+    centred = data.frame.own(data.given_points)
     points = bowed(centred, flat[:, None, -2:]) if task.bow else centred.expand(len(flat), 1, -1, 3)
     seen = torch.where(task.used.unsqueeze(-1), pixels, 0.0).flatten(0, 1).unsqueeze(1)
     error = put_back_minus_known if task.objective == "plane" else projected_minus_seen
     residual, _ = error(cameras, points, seen, task.used.flatten(0, 1).unsqueeze(1))
+    if task.whitening is not None:
+        residual = (task.whitening.flatten(0, 1).unsqueeze(1) @ residual.unsqueeze(-1)).squeeze(-1)
     squared = residual[..., :2].square().sum(-1)
     value = squared if task.loss is None else task.loss.value(squared)
     if weights is not None:

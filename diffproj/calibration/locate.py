@@ -1,13 +1,14 @@
 """`locate`: where a known camera stood, from the corners of a target in each view."""
 
 import warnings
+from dataclasses import replace
 from typing import Unpack
 
 import torch
 from kornia.geometry.camera import PinholeCamera
 
 from diffproj._core.warn import warn_caller
-from diffproj.calibration import closed_form, start
+from diffproj.calibration import start
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, fit
@@ -15,8 +16,8 @@ from diffproj.calibration.mismatch import CameraMismatchWarning, described
 from diffproj.calibration.options import LocateOptions, locate_options
 from diffproj.calibration.outcome import outcome
 from diffproj.calibration.result import Calibration
-from diffproj.calibration.solver import Solution, Status, select
-from diffproj.calibration.task import Task
+from diffproj.calibration.second_look import lower_fit
+from diffproj.calibration.solver import Solution, Status
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.targets.chessboard import Chessboard, origin_doubt
 from diffproj.targets.target import Target
@@ -41,14 +42,16 @@ def locate(
     says so.
     With a calibration in the place of a camera a `CameraMismatchWarning` names the views whose corners are not where it
     sees them, as photographs of another camera, zoom or focus: see `mismatch`.
-    The board is taken to be flat, also where a calibration found a bow.
+    The board is taken to be flat, also where a calibration found a bow. `Landmarks` may lie anywhere; where they come
+    with a sigma of their own, each view's pose carries it, as if other views had other landmarks.
 
     Args:
         views: corners `(*B, V, N, 2)`.
-        target: anything with `.points (N, 3)` on z = 0.
+        target: a board, `Landmarks`, or anything with `.points (N, 3)`.
         camera: batch shape broadcasting to `*B`; its own pose does not matter. A calibration brings its uncertainty
             along, and the noise of its corners, which few corners do not tell.
-        options: `weights`, `loss`, `max_iterations`, `tolerance`, `progress` and `throw`: see `LocateOptions`.
+        options: `weights`, `pixel_sigma`, `loss`, `reject_outliers`, `max_iterations`, `tolerance`, `progress` and
+            `throw`: see `LocateOptions`.
 
     Returns:
         A calibration with the given intrinsics and the poses found, in float64; where the image is turned, with those
@@ -85,53 +88,42 @@ def located(
     if isinstance(views, Camera | PinholeCamera | Calibration):
         raise TypeError("locate: want (views, target, camera) in this order, got the camera first")
     chosen = locate_options(options)
-    loss = chosen.loss
-    data = Data(views, target, chosen.weights)
+    data = Data(views, target, chosen.weights, chosen.pixel_sigma)
     calibration = camera if isinstance(camera, Calibration) else None
     if isinstance(camera, Calibration):
         camera = camera.camera
     camera = as_camera(camera)
     skew = calibration is not None and calibration.skew
-    shared, (R, t), parameters = start.from_camera(camera, data, bow=False, skew=skew, with_poses=False)
-    # Each view is a problem of its own, with a step and an end of its own, from each of its two starts.
+    shared, _, parameters = start.from_camera(camera, data, bow=False, skew=skew, with_poses=False)
+    # Each view is a problem of its own, with a step and an end of its own, from each of its starts.
     V = len(views)
-    single = Task(
-        data.points,
-        data.pixels.flatten(0, 1).unsqueeze(1),
-        data.used.flatten(0, 1).unsqueeze(1),
-        parameters.lens,
-        skew=parameters.skew,
+    task = data.task(parameters.lens, skew=parameters.skew, loss=chosen.loss, basis=shared.new_zeros(*shared.shape, 0))
+    single = replace(
+        task,
+        pixels=data.pixels.flatten(0, 1).unsqueeze(1),
+        used=data.used.flatten(0, 1).unsqueeze(1),
         weights=None if data.weights is None else data.weights.flatten(0, 1).unsqueeze(1),
-        loss=loss,
         basis=shared.new_zeros(len(shared) * V, shared.shape[-1], 0),
     )
     held = shared.repeat_interleave(V, dim=0)
-    starts = (R, t), closed_form.other_pose(R, t, data.points)
-    one, other = (
-        fit(
-            single,
-            held,
-            tuple(z.flatten(0, 1).unsqueeze(1) for z in local),
-            max_iterations=chosen.max_iterations,
-            tolerance=chosen.tolerance,
-            progress=chosen.progress,
-        ).solution
-        for local in starts
-    )
-    better = torch.where(other.cost.isfinite(), other.cost, torch.inf) < torch.where(
-        one.cost.isfinite(), one.cost, torch.inf
-    )
-    best = select(better.numpy(force=True), other, one)
-    task = data.task(parameters.lens, skew=parameters.skew, loss=loss, basis=shared.new_zeros(*shared.shape, 0))
+    steps = {name: getattr(chosen, name) for name in ("max_iterations", "tolerance", "progress")}
+    fits = [
+        fit(single, held, tuple(z.flatten(0, 1).unsqueeze(1) for z in pose), reject=chosen.outlier_limit, **steps)
+        for pose in start.poses_from_camera(task, shared)
+    ]
+    best = fits[0]
+    for other in fits[1:]:
+        best = lower_fit(best, other, torch.arange(len(held), device=held.device), chosen.outlier_limit)
     seen = data.used.any(-1)
-    status = torch.where(seen, best.status.reshape(seen.shape), Status.CONVERGED)
-    equations = best.equations
+    used, rejected = (z.squeeze(1).unflatten(0, seen.shape) for z in (best.task.used, best.rejected))
+    status = torch.where(seen, best.solution.status.reshape(seen.shape), Status.CONVERGED)
+    equations = best.solution.equations
     joined = Solution(
         shared,
-        tuple(z.squeeze(1).unflatten(0, seen.shape) for z in best.local),
-        torch.where(seen, best.cost.reshape(seen.shape), 0.0).sum(-1),
+        tuple(z.squeeze(1).unflatten(0, seen.shape) for z in best.solution.local),
+        torch.where(seen, best.solution.cost.reshape(seen.shape), 0.0).sum(-1),
         status.amax(-1),
-        best.iterations.reshape(seen.shape).amax(-1),
+        best.solution.iterations.reshape(seen.shape).amax(-1),
         equations._replace(
             U=equations.U.unflatten(0, seen.shape).sum(1),
             E=equations.E.squeeze(1).unflatten(0, seen.shape),
@@ -141,5 +133,8 @@ def located(
             c=equations.c.reshape(seen.shape),
         ),
     )
-    found = Fit(task, joined, torch.zeros_like(data.used))
+    found = Fit(replace(task, used=used), joined, rejected)
+    if best.task.whitening is not None:
+        whole = best.task.whitening.squeeze(1).unflatten(0, seen.shape)
+        found = replace(found, task=replace(found.task, whitening=whole))
     return outcome("locate", data, found, camera.size or views.size, chosen.throw, calibration)

@@ -11,6 +11,8 @@ from diffproj.calibration.result import Calibration
 
 CONTRADICTION = 0.01
 """Chance of residuals as large as the fit's under the noise that was known, below which that does not hold here."""
+KNOWN = 1e9
+"""Degrees of freedom that stand for a noise that is known."""
 
 
 class Noise(NamedTuple):
@@ -31,7 +33,7 @@ def noise_of(calibration: Calibration, batch: Sequence[int]) -> Noise | None:
         return None
     sigma, freedom = calibration.pixel_sigma.detach(), calibration.degrees_of_freedom
     return Noise(
-        *(z.to(torch.float64).expand(tuple(batch)).reshape(-1) for z in (sigma.square(), freedom.clamp(min=1)))
+        *(z.to(torch.float64).expand(tuple(batch)).reshape(-1) for z in (sigma.square(), freedom.clamp(1, KNOWN)))
     )
 
 
@@ -42,6 +44,8 @@ def level(found: Fit, known: Noise | None = None) -> Noise:
     """
     sigma, freedom = found.pixel_sigma(), found.degrees_of_freedom()
     own = Noise(sigma.square(), freedom.to(sigma))
+    if found.knows_noise:
+        return Noise(own.variance, torch.full_like(own.freedom, torch.inf))
     if known is None or found.task.weights is not None:
         return own
     return pooled(own, known)
@@ -51,6 +55,7 @@ def own_noise(found: Fit) -> Noise:
     """That of the residuals alone; variance 0 and one degree of freedom where there is none."""
     variance = found.residual_variance().detach()
     freedom = found.degrees_of_freedom().clamp(min=1).to(variance)
+    freedom = torch.full_like(freedom, KNOWN) if found.knows_noise else freedom
     return Noise(torch.where(variance.isfinite(), variance, 0.0), freedom)
 
 

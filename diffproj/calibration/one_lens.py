@@ -1,14 +1,20 @@
 """A calibration with one lens: a start in closed form, refined, looked at twice, and kept from folding."""
 
 import torch
+from torch import Tensor
 
 from diffproj.calibration import start
 from diffproj.calibration.data import Data
+from diffproj.calibration.fit import Fit
 from diffproj.calibration.nested import Nested
 from diffproj.calibration.options import Options
 from diffproj.calibration.outcome import outcome
-from diffproj.calibration.parametrisation import Parametrisation
+from diffproj.calibration.own_frame import are_solid
+from diffproj.calibration.parametrisation import Parametrisation, Pose
 from diffproj.calibration.result import Calibration
+from diffproj.calibration.second_look import lower_fit
+from diffproj.calibration.space_start import space_starts
+from diffproj.calibration.start import Straightened
 from diffproj.lens.models import LensModel, model_named
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
@@ -19,13 +25,29 @@ def calibrated(
 ) -> Calibration:
     """What `calibrate` promises, for one lens and checked options; errors name `who` was asked."""
     model_named(distortion)
-    data = Data(views, target, chosen.weights)
+    data = Data(views, target, chosen.weights, chosen.pixel_sigma)
+    data.check_options(chosen.objective, chosen.bow)
     if views.size is None:
         raise ValueError("views: want the photographs' size, got None; give Views(..., size=(width, height))")
     parameters = Parametrisation(distortion, chosen.bow, chosen.skew)
-    shared, local, straight = start.from_nothing(data, views.size, chosen.tied_focal, parameters)
+    if are_solid(data.points):
+        starts, straight = space_starts(data, views.size, parameters)
+    else:
+        first, pose, straight = start.from_nothing(data, views.size, chosen.tied_focal, parameters)
+        starts = [(first, pose)]
+    found = _from_start(data, chosen, parameters, starts[0], straight)
+    every = torch.arange(len(data.pixels), device=data.pixels.device)
+    for other in starts[1:]:
+        found = lower_fit(found, _from_start(data, chosen, parameters, other, straight), every, chosen.outlier_limit)
+    return outcome(who, data, found, views.size, chosen.throw)
+
+
+def _from_start(
+    data: Data, chosen: Options, parameters: Parametrisation, begin: tuple[Tensor, Pose], straight: Straightened
+) -> Fit:
+    """The minimum from a start."""
+    shared, local = begin
     # The start is a guess from the corners; what is held, or known, is not.
     reference = shared.clone()
     reference[:, :2], reference[:, 4:] = torch.nan, 0.0
-    found = Nested(data, chosen, parameters, shared, local, reference, straight, views.size).richest()
-    return outcome(who, data, found, views.size, chosen.throw)
+    return Nested(data, chosen, parameters, shared, local, reference, straight, straight.size).richest()

@@ -24,7 +24,14 @@ class LocateOptions(TypedDict, total=False):
 
     Attributes:
         weights: of the corners, broadcasting to `(*B, V, N)`: one over the variance of their coordinates, in px^-2 (for
-            the plane objective in world units). A corner of weight 0 takes no part. 1 everywhere if left out.
+            the plane objective in world units), as far as it is known: the residuals tell its level. A corner of weight
+            0 takes no part. 1 everywhere if left out.
+        pixel_sigma: the standard deviation of the corners' coordinates in px where it is known, a number or
+            broadcasting to `(*B, V, N)`: the covariance then is that of this noise, whatever the residuals are, and
+            intervals are the normal distribution's. If left out, the residuals tell it. Not with `weights` or
+            `objective="plane"`; under a robust `loss` it only weighs, for wrong corners have no deviation.
+        reject_outliers: leave out corners whose residual exceeds 5 (or so many) robust standard deviations, and
+            repeat; `Calibration.rejected` and the summary name them. False if left out.
         loss: a robust loss such as `dp.Huber(0.5)`, its scale in pixels (in world units for the plane objective);
             least squares if left out.
         max_iterations: of the solver, 300 if left out.
@@ -34,6 +41,8 @@ class LocateOptions(TypedDict, total=False):
     """
 
     weights: Tensor | Array | float | None
+    pixel_sigma: Tensor | Array | float | None
+    reject_outliers: bool | float
     loss: Loss | None
     max_iterations: int
     tolerance: float
@@ -59,9 +68,7 @@ class CalibrationOptions(LocateOptions, TypedDict, total=False):
         tied_focal: `f_x : f_y` keeps the start's ratio, which is 1 in `calibrate`. False if left out.
         priors: what is known beforehand, by name or group: a standard deviation about the values that `fixed` would
             keep, or a tuple `(mean, standard deviation)`. It weighs against corners whose standard deviation is
-            `1 / sqrt(weight)` px: give weights along with it, such as `torch.tensor(25.0)` for 0.2 px.
-        reject_outliers: leave out corners whose residual exceeds 5 (or so many) robust standard deviations, and
-            repeat; `Calibration.rejected` and the summary name them. False if left out.
+            `pixel_sigma`, or `1 / sqrt(weight)` px: give one along with it.
     """
 
     objective: Objective
@@ -70,11 +77,12 @@ class CalibrationOptions(LocateOptions, TypedDict, total=False):
     fixed: Sequence[str]
     tied_focal: bool
     priors: Priors | None
-    reject_outliers: bool | float
 
 
 _LOCATE: LocateOptions = {
     "weights": None,
+    "pixel_sigma": None,
+    "reject_outliers": False,
     "loss": None,
     "max_iterations": 300,
     "tolerance": 3e-14,
@@ -89,7 +97,6 @@ _CALIBRATION: CalibrationOptions = {
     "fixed": (),
     "tied_focal": False,
     "priors": None,
-    "reject_outliers": False,
 }
 
 
@@ -136,9 +143,8 @@ def calibration_options(who: str, given: Mapping[str, Any]) -> Options:
         if not isinstance(options.priors, Mapping):
             raise TypeError(f"priors: want a mapping from names, got {called(options.priors)}")
         words("priors", tuple(options.priors), "names of parameters")
-    if not isinstance(options.reject_outliers, bool | np.bool_):
-        want = "True or a number above 0"
-        options.reject_outliers = number("reject_outliers", options.reject_outliers, want, least=0)
+    if options.pixel_sigma is not None and options.objective == "plane":
+        raise ValueError("pixel_sigma: want None with objective='plane', whose residuals are in world units")
     return options
 
 
@@ -153,4 +159,9 @@ def _with_defaults(who: str, given: Mapping[str, Any], defaults: Mapping[str, An
     if options.progress is not None:
         function("progress", options.progress, "a function of (done, total)")
     options.throw = flag("throw", options.throw)
+    if options.pixel_sigma is not None and options.weights is not None:
+        raise ValueError("pixel_sigma, weights: want one of the two, for weights are 1 / pixel_sigma^2")
+    if not isinstance(options.reject_outliers, bool | np.bool_):
+        want = "True or a number above 0"
+        options.reject_outliers = number("reject_outliers", options.reject_outliers, want, least=0)
     return options

@@ -65,7 +65,9 @@ def _other_poses(found: Fit, variance: Tensor, freedom: Tensor) -> tuple[Tensor,
         one = tuple(z[p, v].expand(len(starts), *z[p, v].shape) for z in kept)
         step = difference(one, poses, task.points.mean(0))
         apart = (step.unsqueeze(-2) @ found.solution.equations.W[p, v] @ step.unsqueeze(-1)).squeeze(-1).squeeze(-1)
-        another = (apart > APART**2 * variance[p, 0]) & _faces_alike(one, poses, task.points) & costs.isfinite()
+        another = (apart > APART**2 * variance[p, 0]) & costs.isfinite()
+        if not task.solid:
+            another &= _faces_alike(one, poses, task.points)
         lowest, chosen = torch.where(another, costs, torch.inf).min(0)
         taken = lowest.isfinite()
         p, v, chosen = p[taken], v[taken], chosen[taken]
@@ -89,13 +91,19 @@ def _improbability(task: Task, shared: Tensor, poses: Pose, variance: Tensor) ->
 
 
 def _noise(found: Fit, known: Noise | None) -> Noise:
-    """The noise of the corners, where few of them tell little with what is usual of photographs."""
+    """The noise of the corners, where few of them tell little with what is usual of photographs.
+
+    That counts even where the residuals contradict it: a pose with an error several times as large takes a noise that
+    is even less usual. (Of 1500 views of four points with a noise of 3 px, odds told of 2.2 wrong poses, and 2 were; of
+    8 px of 31, and 23 were.)
+    """
     own = own_noise(found)
     if found.task.weights is not None or found.task.objective != "image":
         return own
     if known is None:
         typical = torch.where(own.variance > SYNTHETIC_PX**2, TYPICAL_PX**2, 0.0).to(own.variance)
-        known = Noise(typical, torch.full_like(own.freedom, TYPICAL_FREEDOM))
+        freedom = own.freedom + TYPICAL_FREEDOM
+        return Noise((own.variance * own.freedom + typical * TYPICAL_FREEDOM) / freedom, freedom)
     return pooled(own, known)
 
 

@@ -23,6 +23,7 @@ from diffproj.calibration.solver import Prior, Status
 from diffproj.calibration.uncertainty import covariance_of
 from diffproj.calibration.verdict import verdicts
 from diffproj.geometry.camera import Camera
+from diffproj.targets.landmarks import Landmarks
 
 
 def minimised(
@@ -81,8 +82,7 @@ def outcome(
         return tensor.reshape((*batch, *tensor.shape[1:]))
 
     lens = cameras.distortion
-    about_middle = solution.local
-    R, t = shaped(about_middle[0]), shaped(data.in_world(*about_middle))
+    R, t = map(shaped, data.frame.world_pose(*solution.local))
     if lens is not None:
         lens = type(lens)(shaped(solution.shared[:, 4 : 4 + lens.coefficients.shape[-1]]))  # type: ignore
     camera = Camera.unchecked(shaped(cameras.K[:, 0]), R[..., 0, :, :], t[..., 0, :], lens, size).without_pose()
@@ -95,6 +95,7 @@ def outcome(
     )
 
     doubt = Entangled(found, status)
+    landmarks = data.target.names if isinstance(data.target, Landmarks) else None
     calibration = Calibration(
         camera,
         posed,
@@ -114,7 +115,8 @@ def outcome(
         lens_region=None if known is None else known.region,
         _covariance=partial(_covariance, found, data, before, known, doubt),
         _others=partial(_others, found, data, before),
-        _remarks=partial(remarks, found, status, doubt),
+        _remarks=partial(remarks, found, status, doubt, of_landmarks=landmarks is not None),
+        landmarks=landmarks,
         _mismatch=None if known is None else partial(mismatch, found, known, tuple(batch)),
     )
     if throw and bool((status != Status.CONVERGED).any()):
@@ -127,12 +129,12 @@ def _covariance(found: Fit, data: Data, noise: Noise | None, known: Calibration 
     before = None if known is None or not known.has_covariance else known.covariance_of_kept_poses
     own = covariance_of(found, noise, None if before is None else before.dispersion.expand(batch).reshape(-1))
     own = doubt.widened(own)
-    R = found.solution.local[0].detach()
+    R, _ = data.frame.world_pose(*(z.detach() for z in found.solution.local))
     own = replace(reshaped(own, batch), middle=data.middle, _arm=(R @ data.middle).reshape(*batch, -1, 3))
     return own if before is None else own.following(before)
 
 
 def _others(found: Fit, data: Data, noise: Noise | None) -> OtherPoses:
     others = other_poses(found, noise)
-    parts = others.R, data.in_world(others.R, others.t), others.ratio
+    parts = *data.frame.world_pose(others.R, others.t), others.ratio
     return OtherPoses(*(part.reshape(*data.batch, *part.shape[1:]) for part in parts))

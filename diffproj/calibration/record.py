@@ -49,6 +49,7 @@ class Recorded:
         return {
             "objective": self.objective,
             "unit": self.unit,
+            "landmarks": None if self.landmarks is None else list(self.landmarks),
             "skew": self.skew,
             "causes": list(self.causes),
             "remarks": list(self.remarks),
@@ -112,9 +113,10 @@ class Recorded:
             _later(fields, "pixel_sigma", batch),
             skew=_flag("skew", fields.get("skew", False)),
             shares=_later(fields, "shares", (*batch, V)),
-            degrees_of_freedom=_later(fields, "degrees_of_freedom", batch),
+            degrees_of_freedom=_freedom(fields, batch),
             lens_region=_region(fields),
             unit=_unit(fields.get("unit")),
+            landmarks=_landmarks(fields.get("landmarks"), N),
             _covariance=None if covariance is None else partial(_same, covariance),
             _others=None if others is None else partial(_same, others),
             _remarks=partial(_same, _texts("remarks", fields["remarks"])) if "remarks" in fields else None,
@@ -169,6 +171,12 @@ def _later(fields: dict[str, Any], name: str, shape: tuple[int, ...]) -> Tensor 
     return tensor(fields, name, shape, least=0, gaps=True) if present(fields, name) else None
 
 
+def _freedom(fields: dict[str, Any], batch: tuple[int, ...]) -> Tensor | None:
+    """Degrees of freedom, infinite where the noise was known, which a file has no number for."""
+    found = _later(fields, "degrees_of_freedom", batch)
+    return None if found is None else torch.where(found.isnan(), torch.inf, found)
+
+
 def _region(fields: dict[str, Any]) -> Tensor | None:
     if not present(fields, "lens_region"):
         return None
@@ -180,6 +188,16 @@ def _names(names: Any, count: int) -> tuple[str, ...]:
     found = _texts("names", names)
     if len(found) != count:
         raise ValueError(f"names: want {count}, one for each view, got {len(found)}")
+    return found
+
+
+def _landmarks(names: Any, count: int) -> tuple[str, ...] | None:
+    """The names of the points, where they are landmarks; files of earlier releases lack them."""
+    if names is None:
+        return None
+    found = _texts("landmarks", names)
+    if len(found) != count:
+        raise ValueError(f"landmarks: want {count} names, one for each point, got {len(found)}")
     return found
 
 

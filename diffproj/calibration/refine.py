@@ -28,7 +28,7 @@ def refine(
 
     Args:
         views: corners `(*B, V, N, 2)`.
-        target: anything with `.points (N, 3)` on z = 0.
+        target: a board, `Landmarks`, or anything with `.points (N, 3)`.
         camera: the start: its lens says which lens is fitted, and fixed parameters keep its values. With a batch shape
             that broadcasts to `*B`, poses are found from the corners; with another that broadcasts to `(*B, V)`, its
             poses are the start, and its intrinsics are those of the first view. Where its image is turned, the camera
@@ -64,7 +64,8 @@ def refine(
         )
     differentiable = flag("differentiable", differentiable)
     chosen = calibration_options("refine", options)
-    data = Data(views, target, chosen.weights)
+    data = Data(views, target, chosen.weights, chosen.pixel_sigma)
+    data.check_options(chosen.objective, chosen.bow)
     camera = as_camera(camera)
     shared, local, parameters = start.from_camera(camera, data, chosen.bow, chosen.skew)
     found, prior = minimised(data, chosen, parameters, shared, local, shared)

@@ -24,12 +24,25 @@ from diffproj.calibration.leftover import Leftover, leftover
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
 
+UNSURE = 0.1
+"""Deviation of a focal length, relative to it, from which on it is known roughly."""
+CONTRADICTION = 1e-4
+"""Chance of the residuals under the noise that was given below which they contradict it."""
+NOTABLE = 1.25
+"""Times that noise that residuals must be for a word."""
 NO_DENOMINATOR = {"brown8": "'brown5'"} | dict.fromkeys(("brown12", "brown14"), "fixed=('k4', 'k5', 'k6')")
 """What a lens with a denominator is without it."""
 
 
-def remarks(found: Fit, status: Tensor, doubt: Entangled) -> tuple[str, ...]:
-    """The remarks on each of P cameras, in one text; empty where there are none, or it did not converge."""
+def remarks(found: Fit, status: Tensor, doubt: Entangled, of_landmarks: bool = False) -> tuple[str, ...]:
+    """The remarks on each of P cameras, in one text; empty where there are none, or it did not converge.
+
+    Args:
+        found: the fit.
+        status: of each camera `(P,)`.
+        doubt: what the views hardly tell apart.
+        of_landmarks: whether the corners are landmarks, which people click and survey.
+    """
     task = found.task
     converged = status == Status.CONVERGED
     held = torch.zeros_like(converged)
@@ -48,13 +61,46 @@ def remarks(found: Fit, status: Tensor, doubt: Entangled) -> tuple[str, ...]:
             )
     for p, other in doubt.simpler.items():
         texts[p].append(_not_told(other))
+    for p in (converged & _unsure_focal(found)).nonzero().flatten().tolist():
+        texts[p].append(_unsure(found, p))
+    for p in (converged & _contradicts_noise(found)).nonzero().flatten().tolist():
+        times = float(found.variance_of_residuals()[p].sqrt())
+        texts[p].append(
+            f"the residuals are {times:.2g} times what pixel_sigma says, more than chance allows: the deviations are "
+            "too small; look for wrong landmarks or corners, or give a larger pixel_sigma"
+        )
     sigma = found.pixel_sigma().detach()
     which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
     if len(which):
         left = leftover(found, which, SIGNIFICANT)
         for i, p in enumerate(which.tolist()):
-            texts[p].extend(filter(None, [_left_over(task, left, i, p, float(sigma[p]))]))
+            texts[p].extend(filter(None, [_left_over(task, left, i, p, 0.0 if of_landmarks else float(sigma[p]))]))
     return tuple("; ".join(text) for text in texts)
+
+
+def _unsure_focal(found: Fit) -> Tensor:
+    """Which cameras have a focal length that is known roughly `(P,)`, as one view may leave it."""
+    variance = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, :2].amax(-1)
+    return variance.sqrt() > UNSURE * found.solution.shared[:, 0].detach().abs()
+
+
+def _unsure(found: Fit, p: int) -> str:
+    variance = found.plain_covariance().shared[p].diagonal()[:2].amax()
+    part = 100 * float(variance.sqrt() / found.solution.shared[p, 0].abs())
+    return (
+        f"the focal length is known only to {part:.0f} %: points put back near the target are as good as their error "
+        'bars say, others follow it; priors={"focal": (value, deviation)} or other views tilted differently tell more'
+    )
+
+
+def _contradicts_noise(found: Fit) -> Tensor:
+    """Which cameras have residuals larger than the noise that was given makes by chance `(P,)`."""
+    if not found.knows_noise:
+        return torch.zeros_like(found.solution.status, dtype=torch.bool)
+    spare = found.degrees_of_freedom().to(torch.float64)
+    squares = found.variance_of_residuals().detach().nan_to_num(0.0) * spare
+    rare = torch.special.gammaincc(spare.clamp(min=1) / 2, squares / 2) < CONTRADICTION
+    return rare & (squares > NOTABLE**2 * spare)
 
 
 def _not_told(other: Simpler) -> str:

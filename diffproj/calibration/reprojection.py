@@ -36,6 +36,7 @@ class Reprojection:
         lens: the lens that is fitted.
         bow: whether the board's bow is among the shared parameters.
         skew: whether the skew of K is.
+        whitening: what the residuals and their derivatives are multiplied by `(P, V, N, 2, 2)`; `None` for 1.
     """
 
     points: Tensor
@@ -44,6 +45,7 @@ class Reprojection:
     lens: LensModel
     bow: bool = False
     skew: bool = False
+    whitening: Tensor | None = None
     parameters: Parametrisation = field(init=False, repr=False)
     _panel: Tensor = field(init=False, repr=False)
     _plane_points: Tensor = field(init=False, repr=False)
@@ -103,7 +105,9 @@ class Reprojection:
             row.addcmul_(q[:, :, b, None], by_tau[:, :, a], value=-1)
         if self._unused is not None:
             panel.masked_fill_(self._unused[:, :, None, None], 0.0)
-        return panel
+        if self.whitening is None:
+            return panel
+        return torch.einsum("pvnij,pvrjn->pvrin", self.whitening, panel)  # a new tensor: the panel keeps constant rows
 
     def rotated(self, shared: Tensor, R: Tensor) -> Tensor:
         """`R X` for the (bowed) board's points, `(P, V, 3, N)`."""

@@ -20,6 +20,7 @@ from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.mismatch import Mismatch
 from diffproj.calibration.parametrisation import Parametrisation
+from diffproj.calibration.positions import Positions, positions
 from diffproj.calibration.record import Recorded
 from diffproj.calibration.region import covered_region
 from diffproj.calibration.solver import Status
@@ -73,6 +74,7 @@ class Calibration(Account, Copied, Recorded):
             board as it does, to within 2 px, which bring nothing new. `None` where all counted fully.
         skew: whether the skew of K is among the parameters: it was fitted, or K had some that was held.
         comparison: how the lenses fared, where `distortion="auto"` compared them.
+        landmarks: the names of the N points, where they are `Landmarks`; `None` for a board.
         unit: the world's unit, such as `"mm"`, where it is known; files keep it.
     """
 
@@ -94,6 +96,7 @@ class Calibration(Account, Copied, Recorded):
     lens_region: Float[Tensor, "*#batch directions"] | None = None
     comparison: LensComparison | None = None
     unit: str | None = None
+    landmarks: tuple[str, ...] | None = None
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
     _remarks: Callable[[], tuple[str, ...]] | None = None
@@ -229,6 +232,21 @@ class Calibration(Account, Copied, Recorded):
         if self._covariance is None:
             raise ValueError("covariance: want a calibration that was computed here, got one from a file without it")
         return self._covariance()
+
+    @cached_property
+    def positions(self) -> Positions:
+        """Where the camera stood in each view, `(*B, V, 3)` in the world, with the covariance of each.
+
+        Raises:
+            ValueError: the calibration came from a file without a covariance.
+
+        Example:
+            >>> import diffproj as dp
+            >>> calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+            >>> calibration.positions.points.shape, bool((calibration.positions.deviations < 3).all())  # millimetres
+            (torch.Size([13, 3]), True)
+        """
+        return positions(self.cameras, self.covariance, self.views.names)
 
     @property
     def has_alternatives(self) -> bool:

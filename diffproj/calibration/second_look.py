@@ -64,7 +64,8 @@ def correlation(found: Fit) -> Tensor:
     """Correlation of each corner's residual with that of its nearest neighbour on the target `(P,)`, in some views."""
     V = found.task.used.shape[1]
     some = spread_evenly(V, min(V, SAMPLE_VIEWS), found.task.used.device)
-    task = replace(found.task, pixels=found.task.pixels[:, some], used=found.task.used[:, some])
+    cut = {name: getattr(found.task, name)[:, some] for name in ("pixels", "used")}
+    task = replace(found.task, **cut, whitening=None)
     poses = tuple(z[:, some] for z in found.solution.local)
     residual = task.problem.linearise(found.solution.shared, poses)[:, :, -1]
     apart = torch.cdist(task.points, task.points).fill_diagonal_(torch.inf)
@@ -93,7 +94,7 @@ def second_look(
         tolerance: of the solver.
         long_valley: whether the last steps to any minimum are many, as with a rational lens.
     """
-    if max_iterations < SHORT_FIT:
+    if max_iterations < SHORT_FIT or found.task.solid:  # points in space have had other starts
         return found
     steps: dict[str, Any] = {"max_iterations": max_iterations, "tolerance": tolerance}
     with torch.inference_mode():
@@ -126,12 +127,12 @@ def second_look(
     best = others.part(number[0])
     for rank in range(1, len(starts)):
         rows = own[rank].nonzero().flatten()
-        best = _lower(best, others.part(number[rank, rows]), rows, reject)
+        best = lower_fit(best, others.part(number[rank, rows]), rows, reject)
     last = fit(task, best.solution.shared, best.solution.local, reject=reject, **steps)
-    found = _lower(found, last, which, reject)
+    found = lower_fit(found, last, which, reject)
     if straight.lens == "none" and (task.basis is None or bool(task.basis[:, 2:4].any())):
         start = _other_side(found.task.parameters, found.part(which).solution, straight.middle[which])
-        found = _lower(found, fit(task, *start, reject=reject, **steps), which, reject)
+        found = lower_fit(found, fit(task, *start, reject=reject, **steps), which, reject)
     return found if reject is not None else _with_views_turned_over(found, which, short, steps)
 
 
@@ -158,7 +159,7 @@ def _with_views_turned_over(found: Fit, which: Tensor, short: dict[str, Any], st
         best = tried.part(number[lower, view[lower]])
         which = which[lower]
         last = fit(found.task.part(which), best.solution.shared, best.solution.local, **steps)
-        found = _lower(found, last, which, None)
+        found = lower_fit(found, last, which, None)
     return found
 
 
@@ -203,7 +204,7 @@ def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Ten
     order = task.used.sum(-1).argsort(dim=-1, descending=True, stable=True)
     sample = order[:, spread_evenly(V, count, order.device)]
     costs = torch.stack([_profile(task, straight, grid[i].expand(P), sample) for i in range(len(grid))])
-    best = _lowest(costs)
+    best = lowest(costs)
     starts = []
     for rank in range(best.shape[0]):
         f = grid[best[rank]]
@@ -247,7 +248,7 @@ def _both_poses(task: Task, straight: Straightened, f: Tensor, views: Tensor) ->
     return torch.minimum(*costs), (R, torch.where(better[..., None], other[1], one[1]))
 
 
-def _lowest(costs: Tensor) -> Tensor:
+def lowest(costs: Tensor) -> Tensor:
     """Positions `(BEST, P)` on the grid `(G, P)` of its lowest local minima, then of its lowest nodes."""
     padded = torch.nn.functional.pad(costs, (0, 0, 1, 1), value=torch.inf)
     local = (costs <= padded[:-2]) & (costs <= padded[2:])
@@ -257,7 +258,7 @@ def _lowest(costs: Tensor) -> Tensor:
     return order.gather(0, rank.gather(0, order).argsort(dim=0, stable=True))[:BEST]
 
 
-def _lower(found: Fit, other: Fit, which: Tensor, reject: float | None) -> Fit:
+def lower_fit(found: Fit, other: Fit, which: Tensor, reject: float | None) -> Fit:
     """The fit with the minima of some cameras `(n,)` replaced where the others are lower."""
     before, now = found.solution.cost[which], other.solution.cost
     if reject is not None:

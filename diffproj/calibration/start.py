@@ -11,14 +11,16 @@ from diffproj.calibration import closed_form, given
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import normal_tensors
 from diffproj.calibration.parametrisation import Parametrisation, Pose
+from diffproj.calibration.space_poses import space_poses
 from diffproj.calibration.task import Task
+from diffproj.calibration.two_poses import posed
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import MODELS, LensModel, model_of
 
 
 def from_camera(
     camera: Camera, data: Data, bow: bool, skew: bool = False, with_poses: bool = True
-) -> tuple[Tensor, tuple[Tensor, Tensor], Parametrisation]:
+) -> tuple[Tensor, Pose, Parametrisation]:
     """Shared parameters and poses to start from, and which parameters they are.
 
     A camera whose image is turned is replaced by the one that is turned itself, and sees the same.
@@ -66,12 +68,45 @@ def from_camera(
         t = torch.where(idle, t.new_tensor([0.0, 0, 1]), t)
         given.check_poses(R, t, data.views.names)
         R, t = R.reshape(-1, V, 3, 3), t.reshape(-1, V, 3)
-        return shared, (R, data.about_middle(R, t)), parameters
-    upright = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(*data.used.shape[:2], 3, 3)
-    views = parameters.unpack(shared, (upright, torch.zeros_like(upright[..., 0])))
-    direction, valid = views.directions(data.pixels)
-    perspective = MODELS[parameters.lens].perspective
-    return shared, closed_form.poses_along(data.points, direction, data.used & valid, perspective), parameters
+        return shared, data.frame.pose(R, t), parameters
+    task = data.task(parameters.lens, bow=parameters.bow, skew=parameters.skew)
+    poses = candidate_poses(task, shared)
+    return shared, poses[0] if len(poses) == 1 else best_pose(task, shared, poses), parameters
+
+
+def poses_from_camera(task: Task, shared: Tensor) -> list[Pose]:
+    """Poses `(P, V, ...)` that may explain the corners, from shared parameters `(P, s)`: each is worth a solver's run.
+
+    A plane has two, each the mirror image of the other at the line of sight; points in space may have more.
+    """
+    poses = candidate_poses(task, shared)
+    R, t = poses[0]
+    return [*poses, closed_form.other_pose(R, t, task.points)]
+
+
+def candidate_poses(task: Task, shared: Tensor) -> list[Pose]:
+    """The pose of each view by its corners' rays; of points in space several."""
+    upright = torch.eye(3, dtype=shared.dtype, device=shared.device).expand(*task.used.shape[:2], 3, 3)
+    views = task.parameters.unpack(shared, (upright, torch.zeros_like(upright[..., 0])))
+    direction, valid = views.directions(task.pixels)
+    if task.solid:
+        return space_poses(task.points, direction, task.used & valid)
+    perspective = MODELS[task.lens].perspective
+    return [closed_form.poses_along(task.points, direction, task.used & valid, perspective)]
+
+
+def best_pose(task: Task, shared: Tensor, poses: Sequence[Pose]) -> Pose:
+    """Of several poses `(P, V, ...)` of each view the one that ends lowest, with the shared parameters held."""
+    p, v = task.used.any(-1).nonzero(as_tuple=True)
+    best = tuple(z.clone() for z in poses[0])
+    if len(p) == 0:
+        return best
+    with torch.inference_mode():
+        refined, costs = posed(task, shared, poses, p, v)
+        lowest = costs.nan_to_num(torch.inf, torch.inf).argmin(0)
+        chosen = [z[lowest, torch.arange(len(p), device=p.device)] for z in refined]
+        best = tuple(z.index_put((p, v), new) for z, new in zip(best, chosen, strict=True))
+    return normal_tensors(best)
 
 
 def _broadcasts(shape: Sequence[int], to: Sequence[int]) -> bool:

@@ -9,6 +9,7 @@ from torch import Tensor
 from diffproj.calibration.board_error import BoardError
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.options import Progress
+from diffproj.calibration.own_frame import are_solid
 from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.reprojection import Reprojection
 from diffproj.calibration.result import Objective
@@ -27,12 +28,15 @@ class Task:
     """A minimisation problem: P cameras of V views with N corners.
 
     Attributes:
-        points: the board's points `(N, 3)`.
+        points: the target's points `(N, 3)` in their own frame.
         pixels: `(P, V, N, 2)`.
         used: which corners count `(P, V, N)`.
         lens, bow, skew: the model.
         objective: residuals on the image or on the board.
         weights: of the corners `(P, V, N)`, or `None` for 1.
+        known_noise: whether the weights are one over the variances, so that the residuals need not tell their level.
+        spread: the covariances of the points in their own frame `(N, 3, 3)`; `None` where they are exact.
+        whitening: what residuals are multiplied by for it `(P, V, N, 2, 2)`: see `surveyed.py`.
         shares: how much each view counts in what all views share `(P, V)`, or `None` for 1: see `distinct.py`. A pose
             is determined by all of its view's corners, whatever the view's share.
         loss: a robust loss, or `None` for least squares.
@@ -48,10 +52,18 @@ class Task:
     skew: bool = False
     objective: Objective = "image"
     weights: Tensor | None = None
+    known_noise: bool = False
+    spread: Tensor | None = None
+    whitening: Tensor | None = None
     shares: Tensor | None = None
     loss: Loss | None = None
     prior: Prior | None = None
     basis: Tensor | None = None
+
+    @property
+    def solid(self) -> bool:
+        """Whether the points do not lie on a plane."""
+        return are_solid(self.points)
 
     @property
     def parameters(self) -> Parametrisation:
@@ -67,7 +79,7 @@ class Task:
     def problem(self) -> Reprojection:
         """Residuals and Jacobians."""
         kind = BoardError if self.objective == "plane" else Reprojection
-        return kind(self.points, self.pixels, self.used, self.lens, self.bow, self.skew)
+        return kind(self.points, self.pixels, self.used, self.lens, self.bow, self.skew, self.whitening)
 
     def holding(self, where: list[int]) -> "Task":
         """The same with some of the shared parameters held, by their positions."""
@@ -80,7 +92,7 @@ class Task:
     def part(self, where: slice | Tensor) -> "Task":
         """The task of some of the cameras."""
         cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}
-        optional = ("weights", "shares", "basis")
+        optional = ("weights", "whitening", "shares", "basis")
         cut |= {name: None if (whole := getattr(self, name)) is None else whole[where] for name in optional}
         prior = None if self.prior is None else self.prior.part(where)
         return replace(self, **cut, prior=prior)

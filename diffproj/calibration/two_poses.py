@@ -249,6 +249,7 @@ def _single(task: Task, shared: Tensor, poses: Pose, p: Tensor, v: Tensor) -> tu
         pixels=task.pixels[p, v].unsqueeze(1),
         used=task.used[p, v].unsqueeze(1),
         weights=None if task.weights is None else task.weights[p, v].unsqueeze(1),
+        whitening=None if task.whitening is None else task.whitening[p, v].unsqueeze(1),
         shares=None,
         prior=None,
         basis=shared.new_zeros(len(p), shared.shape[-1], 0),

@@ -36,7 +36,8 @@ def covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = N
         phi: and its dispersion `(P,)`; that of the fit if left out.
     """
     task = found.task
-    phi = dispersion(found) if phi is None else phi
+    if phi is None:  # a noise that was given is the whole error
+        phi = torch.ones_like(found.solution.cost) if found.knows_noise else dispersion(found)
     precision = None if task.prior is None else task.prior.precision
     common = {
         "names": task.names,

@@ -94,7 +94,7 @@ def cross_validate(
 
     Args:
         views: corners `(V, N, 2)` of one camera; view i is left out of fit i mod k.
-        target: anything with `.points (N, 3)` on z = 0.
+        target: a board, `Landmarks`, or anything with `.points (N, 3)`.
         distortion: the lens.
         folds: k.
         options: as `calibrate` takes them.
@@ -141,7 +141,7 @@ def bootstrap(
 
     Args:
         views: corners `(V, N, 2)` of one camera.
-        target: anything with `.points (N, 3)` on z = 0.
+        target: a board, `Landmarks`, or anything with `.points (N, 3)`.
         distortion: the lens.
         draws: number of refits.
         seed: of the random draws.
@@ -178,7 +178,7 @@ def bootstrap(
     counts = torch.nn.functional.one_hot(drawn, number).sum(1).to(torch.float64)[:, group]
     every = repeated(views, draws)
     hidden = (counts == 0).unsqueeze(-1).expand(every.visible.shape)
-    chosen = chosen.but(weights=counts.unsqueeze(-1), throw=False)
+    chosen = chosen.but(weights=counts.unsqueeze(-1), pixel_sigma=None, throw=False)
     found = calibrated(every.hiding(hidden), target, distortion, chosen, "bootstrap")
     kept = found.converged
     if int(kept.sum()) < max(2, draws // 2):

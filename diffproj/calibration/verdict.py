@@ -9,15 +9,21 @@ from diffproj.calibration.adequacy import LENS_WORDS, grave_remedy, gravely_inad
 from diffproj.calibration.closed_form import homographies
 from diffproj.calibration.distinct import one_view
 from diffproj.calibration.fit import Fit
+from diffproj.calibration.handedness import left_handed
+from diffproj.calibration.parametrisation import INTRINSICS
 from diffproj.calibration.reach import folds_at_corners, lost_corners
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import mean_squares
 from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.landmarks import Landmarks
 
 MAX_RELATIVE_STD = 0.1
 """Standard deviation of a focal length or principal point, relative to the focal length, above which it counts as
 undetermined."""
+MAX_OF_ONE_VIEW = 0.3
+"""The same where all views show the target alike: then it is told with its deviation, for points near the target are
+put back no worse for it, and further off the error bars hold it."""
 MAX_RELATIVE_RESIDUAL = 0.1
 """RMS residual of a view, relative to the RMS distance of its corners from their centroid, above which they do not
 match the board."""
@@ -29,6 +35,17 @@ found is arbitrary."""
 
 NEARLY_NONE, MOST = 1e-3, 0.9
 """Weight below which a robust loss leaves nearly nothing of a corner, and the share of such corners that is most."""
+
+FOCAL = INTRINSICS[:2]
+KNOWN_FOCAL = ', or give priors={"focal": (value, deviation)} where it is known roughly'
+LANDMARKS_REMEDY = (
+    "are pixels and landmarks in the same order, all coordinates in one unit, and x and y not exchanged? "
+    "reject_outliers=True finds few wrong ones among many"
+)
+LEFT_HANDED = (
+    "the corners fit the mirror image of the landmarks and not the landmarks: their coordinates are left-handed; "
+    "exchange x and y, or change the sign of one of them (with z up, x east and y north are right-handed)"
+)
 
 ONE_VIEW = (
     "one view does not tell the focal length from the principal point, the lens and the unevenness of the board: add "
@@ -54,7 +71,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     misfits = ~no_pose & used & (_relative_error(found) > MAX_RELATIVE_RESIDUAL)
     unknown = known.undetermined.clone()
     std = known.shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, :4]
-    unknown[:, :4] |= ~(std <= MAX_RELATIVE_STD * solution.shared[:, :1].abs())
+    unknown[:, :4] |= _hardly_known(task, std / solution.shared[:, :1].abs())
     none = ~used.any(-1)
     finite = solution.cost.isfinite()
     folded = finite & ~no_pose.any(-1) & folds_at_corners(task, solution.shared, solution.local)
@@ -66,7 +83,8 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     status = solution.status
     wrong_lens = finite & ~folded & gravely_inadequate(found)
     at_fault = (mirrored | misfits | no_pose).any(-1)
-    degenerate = none | at_fault | unknown.any(-1) | ~redundant | alone | folded | wrong_lens
+    handed = finite & ~no_pose.any(-1) & left_handed(task, solution, _relative_error(found))
+    degenerate = none | handed | at_fault | unknown.any(-1) | ~redundant | alone | folded | wrong_lens
     status = torch.where(degenerate & finite & (status != Status.DIVERGED), Status.DEGENERATE, status)
     causes = [""] * len(status)
     if not bool(status.any()):
@@ -93,16 +111,18 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
             causes[p] = (
                 f"the corners of {_joined_names(names, no_pose[p])} do not determine a pose: do they lie on a line?"
             )
+        elif bool(handed[p]):
+            causes[p] = LEFT_HANDED
         elif bool(folded[p]) and (held or not bool(misfits[p].any())):
             causes[p] = _folded(task, int(lost_corners(task, solution.shared, solution.local)[p].sum()))
         elif bool(wrong_lens[p]):
             sigma = f"{float(found.pixel_sigma()[p]):.1f} px in each coordinate"
             causes[p] = f"the residuals, {sigma}, {LENS_WORDS} over the image, {grave_remedy(found, p)}"
         elif bool(misfits[p].any()):
-            causes[p] = (
-                f"the corners of {_joined_names(names, misfits[p])} do not match the board: "
-                "are its columns and rows right, and are its corners in order?"
-            )
+            what, remedy = ("board", "are its columns and rows right, and are its corners in order?")
+            if isinstance(board, Landmarks):
+                what, remedy = ("landmarks", f"{LANDMARKS_REMEDY}{' and is the camera right?' * held}")
+            causes[p] = f"the corners of {_joined_names(names, misfits[p])} do not match the {what}: {remedy}"
         elif bool(mirrored[p].any()):
             causes[p] = (
                 f"{_joined_names(names, mirrored[p])} show{'s' * (int(mirrored[p].sum()) == 1)} the board mirrored: "
@@ -114,6 +134,9 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
             lacking = [name for name, lost in zip(task.names, unknown[p].tolist(), strict=True) if lost]
             seen = task.part(slice(p, p + 1))
             free = task.basis is None or bool(task.basis[p, 2:4].any())
+            if task.solid or isinstance(board, Landmarks):
+                causes[p] = _undetermined_by_landmarks(lacking, free, task.solid)
+                continue
             causes[p] = _undetermined(lacking, R[p, used[p]], _foreshortening(seen)[0, used[p]], free)
     return status, tuple(causes)
 
@@ -136,6 +159,8 @@ def _leans_on_one_view(task: Task) -> Tensor:
     if task.prior is not None:
         free = free & (task.prior.precision.diagonal(dim1=-2, dim2=-1) == 0)
     more = free[:, 2:].any(-1)
+    if task.solid:  # points in space tell even in one view
+        return torch.zeros_like(more)
     return more & one_view(task.points, task.pixels, task.used) if bool(more.any()) else more
 
 
@@ -164,6 +189,8 @@ def _mirrored(R: Tensor, t: Tensor, points: Tensor, used: Tensor, board: object)
     """Which views show the board mirrored `(P, V)`: against a `Chessboard`'s axes, or else against the majority."""
     middle = R @ points.mean(0) + t
     away = (R[..., 2] * middle).sum(-1) > 0  # the board's z points away from the camera
+    if isinstance(board, Landmarks):  # not printed on one face of anything
+        return torch.zeros_like(used)
     if isinstance(board, Chessboard):
         expected = torch.full_like(away[:, :1], board.axes == "opencv")
     else:
@@ -180,16 +207,37 @@ def _folded(task: Task, count: int) -> str:
 
 
 def _undetermined(lacking: list[str], R: Tensor, foreshortening: Tensor, free_principal_point: bool) -> str:
-    what = f"the views do not determine {', '.join(lacking)}" if lacking else "there are fewer corners than parameters"
+    what = _lacking(lacking)
     normals = R[..., 2]
     if len(normals) == 1:
         why = "the only view is seen face on" if foreshortening[0] < MIN_FORESHORTENING else "one view is not enough"
-        remedy = "add views tilted by 20 to 50 degrees about both axes"
+        remedy = f"add views tilted by 20 to 50 degrees about both axes{KNOWN_FOCAL * ('f_x' in lacking)}"
         return f"{what}: {why}; {remedy}{', or fix the principal point and the lens' * free_principal_point}"
     across = torch.linalg.cross(normals, normals[:1].expand_as(normals)).norm(dim=-1)
     if bool((across < math.sin(PARALLEL_ANGLE)).all()):
         what += ": all views are parallel"
     return f"{what}; add photographs with the board tilted by 20 to 50 degrees about both axes"
+
+
+def _lacking(names: list[str]) -> str:
+    return f"the views do not determine {', '.join(names)}" if names else "there are fewer corners than parameters"
+
+
+def _undetermined_by_landmarks(lacking: list[str], free_principal_point: bool, solid: bool) -> str:
+    remedies = ["more landmarks, near and far" + " and off their plane" * (not solid)]
+    if free_principal_point or any(name not in FOCAL for name in lacking) or not lacking:
+        remedies.append('fixed=("principal_point", "distortion"), or some of the lens such as "k3"')
+    if set(lacking) & set(FOCAL) or not lacking:
+        remedies.append('tied_focal=True, or priors={"focal": (value, deviation)} where it is known roughly')
+    return f"{_lacking(lacking)}: {'; '.join(remedies)}"
+
+
+def _hardly_known(task: Task, deviation: Tensor) -> Tensor:
+    """Which parameters have too large a deviation, relative to the focal length, to count as known `(P, 4)`."""
+    lost = ~(deviation <= MAX_RELATIVE_STD)
+    if bool((lost & (deviation <= MAX_OF_ONE_VIEW)).any()):
+        lost &= ~(one_view(task.points, task.pixels, task.used).unsqueeze(-1) & (deviation <= MAX_OF_ONE_VIEW))
+    return lost
 
 
 def _foreshortening(task: Task) -> Tensor:

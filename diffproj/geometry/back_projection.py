@@ -118,8 +118,7 @@ class PlaneMap(Copied, Shown):
         broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape)
         self.matrix = _plane_matrix(camera, plane, warn).to(camera.dtype)
         # The principal point is read at each call: that of a K that was written to since would not go with the matrix.
-        K = camera.K.clone()
-        self.camera = Camera.unchecked(K, camera.R, camera.t, camera.distortion, camera.size)
+        self.camera = Camera.unchecked(camera.K.clone(), camera.R, camera.t, camera.distortion, camera.size)
         self.is_per_point = plane.is_per_point
 
     @classmethod

@@ -179,6 +179,30 @@ class Camera(
         identity = torch.eye(3, dtype=self.dtype, device=self.device)
         return self._with(R=identity, t=torch.zeros_like(identity[0]))
 
+    def shifted(self, offset: Float[Tensor, "*#batch 3"] | Array) -> "Camera":
+        """The same camera in a world whose origin is at `offset`: points there are those of before minus the offset.
+
+        UTM and earth-centred coordinates have more digits than float32 holds; about an origin near the scene it does.
+        Shift in float64, then convert: `camera.shifted(origin).to(torch.float32)`.
+
+        Args:
+            offset: the new origin in the old world `(*B, 3)`.
+
+        Raises:
+            TypeError: no floating-point tensor, or another dtype than the camera's.
+            ValueError: wrong shape or device.
+
+        Example:
+            >>> far = torch.tensor([[642734.0, 8304296.0, 12.0]], dtype=torch.float64)
+            >>> camera = Camera(torch.eye(3, dtype=torch.float64), t=-far[0] + torch.tensor([0.0, 0, 8]))
+            >>> near = camera.shifted(far[0])
+            >>> near.t.tolist(), torch.equal(near.project(far - far[0])[0], camera.project(far)[0])
+            ([0.0, 0.0, 8.0], True)
+        """
+        offset = check_tensor("offset", offset, 3, like=self.K)
+        check_same_kind(camera=self.K, offset=offset)
+        return self._with(t=self.t + dot(self.R, offset.unsqueeze(-2)))
+
     # ------------------------------------------------------------------------------------------- points and pixels
 
     def in_image(self, pixels: Float[Tensor, "*shape 2"] | Array) -> Bool[Tensor, "*shape"]:

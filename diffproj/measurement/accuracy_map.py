@@ -22,6 +22,7 @@ from diffproj._core.shown import Shown, number
 from diffproj.calibration.region import in_region
 from diffproj.calibration.result import Calibration, as_calibration
 from diffproj.geometry.back_projection import ground_resolution
+from diffproj.geometry.camera import Camera
 from diffproj.geometry.grid import pixel_grid
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.measurement.choices import chosen_view
@@ -73,7 +74,7 @@ class AccuracyMap(Shown):
     @classmethod
     def over_image(
         cls,
-        calibration: Calibration,
+        calibration: Calibration | Camera,
         plane: Plane | None = None,
         view: int | str | None = None,
         step: float = 8.0,
@@ -82,7 +83,8 @@ class AccuracyMap(Shown):
         """The map over the whole image.
 
         Args:
-            calibration: of one camera, with its covariance.
+            calibration: of one camera, with its covariance; or a camera at its pose, which counts as exact, with a
+                number for `pixel_sigma`.
             plane: in the frame of the board that the view saw; the board's own, z = 0, if left out.
             view: the number or the name of the view whose pose holds; may be left out where there is one only.
             step: about how far apart the places are in px; the first and the last row and column lie on the image's
@@ -101,20 +103,21 @@ class AccuracyMap(Shown):
             >>> accuracy.deviation.shape, bool(accuracy.covered[6, 8])
             (torch.Size([13, 17]), True)
         """
-        size = as_calibration(calibration).camera.size
-        if calibration.views.batch_shape or size is None:
+        camera = _one_camera(calibration, view)
+        size = camera.size
+        if size is None:
             raise ValueError("calibration: want one camera of known size; index the views, or give them a size")
         step = arguments.number("step", step, "a positive distance in px", above=0)
         if (size[0] / step) * (size[1] / step) > MOST_PLACES:
             raise ValueError(f"step: want a positive distance in px that gives at most 10^8 places, got {step:g}")
         columns, rows = (math.ceil((side - 1) / step) + 1 for side in size)
-        pixels = _grid(rows, columns, (0.0, 0.0, size[0] - 1.0, size[1] - 1.0), calibration.points)
-        return _mapped(pixels, calibration, _single(plane, calibration.points), view, pixel_sigma)
+        pixels = _grid(rows, columns, (0.0, 0.0, size[0] - 1.0, size[1] - 1.0), camera.K)
+        return _mapped(pixels, calibration, camera, _single(plane, camera.K), view, pixel_sigma)
 
     @classmethod
     def over_plane(
         cls,
-        calibration: Calibration,
+        calibration: Calibration | Camera,
         extent: Sequence[float],
         plane: Plane | None = None,
         view: int | str | None = None,
@@ -124,7 +127,8 @@ class AccuracyMap(Shown):
         """The map over a rectangle of the board's x and y, on a plane that is a height over them.
 
         Args:
-            calibration: of one camera, with its covariance.
+            calibration: of one camera, with its covariance; or a camera at its pose, which counts as exact, with a
+                number for `pixel_sigma`.
             extent: `(x_min, y_min, x_max, y_max)` in world units of the board's frame.
             plane: in that frame, not at right angles to the board; the board's own, z = 0, if left out.
             view: the number or the name of the view whose pose holds; may be left out where there is one only.
@@ -143,25 +147,23 @@ class AccuracyMap(Shown):
             >>> bool(accuracy.valid.all()), bool((accuracy.deviation < 0.2).all())  # millimetres
             (True, True)
         """
-        if as_calibration(calibration).views.batch_shape:
-            raise ValueError(f"calibration: want one camera, got batch shape {tuple(calibration.views.batch_shape)}")
+        camera = _one_camera(calibration, view)
         want = "finite (x_min, y_min, x_max, y_max) with room between"
         x_min, y_min, x_max, y_max = numbers("extent", extent, want, 4)
         if not (x_max > x_min and y_max > y_min):
             raise ValueError(f"extent: want {want}, got {tuple(extent)}")
-        plane = _single(plane, calibration.points)
+        plane = _single(plane, camera.K)
         if abs(float(plane.unit_normal[2])) < UPRIGHT:
             raise ValueError("plane: want one that is a height over the board's x and y, got an upright one")
         rows, columns = _checked_shape(shape)
-        xy = _grid(rows, columns, (x_min, y_min, x_max, y_max), calibration.points)
+        xy = _grid(rows, columns, (x_min, y_min, x_max, y_max), camera.K)
         z = (plane.offset - (plane.normal[:2] * xy).sum(-1)) / plane.normal[2]
         points = torch.cat([xy, z.unsqueeze(-1)], dim=-1)
-        camera = calibration.cameras[view_number(chosen_view(calibration, view), calibration.views.names)]
         pixels, seen = camera.project(points.flatten(0, 1))
         if camera.size is not None:
             seen = seen & camera.in_image(pixels)
         pixels = torch.where(seen.unsqueeze(-1), pixels, torch.nan).reshape(*points.shape[:2], 2)
-        return replace(_mapped(pixels, calibration, plane, view, pixel_sigma), points=points)
+        return replace(_mapped(pixels, calibration, camera, plane, view, pixel_sigma), points=points)
 
 
 UPRIGHT = 1e-9
@@ -178,6 +180,22 @@ def _checked_shape(shape: Sequence[int]) -> tuple[int, int]:
     if rows * columns > MOST_PLACES:
         raise ValueError(f"shape: want at most 10^8 places, got {rows} x {columns}")
     return rows, columns
+
+
+def _one_camera(calibration: Calibration | Camera, view: int | str | None) -> Camera:
+    """The camera at the pose of a view, in float64."""
+    if isinstance(calibration, Camera):
+        camera = calibration
+    else:
+        known = as_calibration(calibration)
+        if known.views.batch_shape:
+            raise ValueError(f"calibration: want one camera, got batch shape {tuple(known.views.batch_shape)}")
+        camera = known.cameras[view_number(chosen_view(known, view), known.views.names)]
+    if camera.batch_shape:
+        raise ValueError(f"calibration: want one camera, got batch shape {tuple(camera.batch_shape)}; index it")
+    if camera.K.is_meta:
+        raise ValueError("calibration: want a camera with values, got one on the device meta")
+    return camera.to(torch.float64)
 
 
 def _single(plane: Plane | None, points: Tensor) -> Plane:
@@ -199,7 +217,8 @@ def _grid(rows: int, columns: int, extent: tuple[float, float, float, float], li
 
 def _mapped(
     pixels: Tensor,
-    calibration: Calibration,
+    calibration: Calibration | Camera,
+    camera: Camera,
     plane: Plane,
     view: int | str | None,
     pixel_sigma: float | Literal["detector"],
@@ -208,8 +227,7 @@ def _mapped(
     shape = pixels.shape[:2]
     flat = pixels.flatten(0, 1)
     measured = measure(flat, calibration, plane, view, pixel_sigma)
-    seen_in = view_number(chosen_view(calibration, view), calibration.views.names)
-    resolution, valid = ground_resolution(flat, calibration.cameras[seen_in], plane)
+    resolution, valid = ground_resolution(flat, camera, plane)
 
     def shown(values: Tensor) -> Tensor:
         return torch.where(valid, values, torch.nan).reshape(shape)
@@ -224,9 +242,9 @@ def _mapped(
     )
 
 
-def _covered(pixels: Tensor, calibration: Calibration) -> Tensor:
+def _covered(pixels: Tensor, calibration: Calibration | Camera) -> Tensor:
     """Which pixels `(N, 2)` the calibration's corners surround; all where the corners are not known."""
-    region = calibration.region
+    region = calibration.region if isinstance(calibration, Calibration) else None
     return torch.ones_like(pixels[:, 0], dtype=torch.bool) if region is None else in_region(pixels, region)
 
 

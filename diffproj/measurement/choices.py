@@ -1,10 +1,13 @@
 """What whoever measures has to say, for nothing else tells it: which view the pixels are in, and how good they are."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from diffproj._core.arguments import Array
+from diffproj._core.numerics import check_tensor
 from diffproj._core.warn import warn_caller
 from diffproj.calibration import ambiguity, mismatch
 from diffproj.calibration.adjustment import Adjustment
@@ -12,8 +15,9 @@ from diffproj.calibration.mismatch import CameraMismatchWarning
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.result import Calibration
 
-PixelSigma = float | Tensor | Literal["detector"] | None
-"""A number of pixels, one for each pixel, `"detector"` for that of the calibration's corners; `None` was not said."""
+PixelSigma = float | Tensor | Array | Literal["detector"] | None
+"""A number of pixels, one or two or a covariance for each pixel; `"detector"` stands for that of the calibration's
+corners, and `None` was not said."""
 
 HAND_PX = 0.5
 """Standard deviation of a coordinate that a hand picked on a screen."""
@@ -59,7 +63,7 @@ def detector_noise(calibration: Calibration, view: int) -> Tensor | None:
 
 def pixel_noise(
     pixels: Tensor, pixel_sigma: PixelSigma, calibration: Calibration | None, view: int
-) -> tuple[float | Tensor, bool]:
+) -> tuple[float | Tensor | Array, bool]:
     """The standard deviation of the pixels' coordinates, and whether the calibration's residuals told it.
 
     Where nothing was said, a warning says what was taken, unless the pixels are corners that the view was given with.
@@ -106,3 +110,61 @@ def _are_corners(pixels: Tensor, corners: Tensor) -> bool:
         return False
     same = (pixels.detach().unsqueeze(-2) == corners.detach().to(pixels).unsqueeze(-3)).all(-1)
     return bool(same.any(-1).all())
+
+
+def deviation_matrices(pixel_sigma: float | Tensor | Array, points: Tensor) -> Tensor:
+    """A matrix L `(*B, N, 2, 2)` for each pixel, whose error is L times two independent ones of deviation 1.
+
+    Args:
+        pixel_sigma: a number, `(*B, N)` or `(*B, N, 2)` deviations, or `(*B, N, 2, 2)` covariances.
+        points: `(*B, N, 3)`, whose shape counts. What fits one deviation for each pixel is that, not two.
+
+    Raises:
+        TypeError: no numbers.
+        ValueError: a shape that does not fit, or what is no deviation and no covariance.
+    """
+    given = check_tensor("pixel_sigma", pixel_sigma, like=points)
+    if given.is_meta:
+        raise ValueError("pixel_sigma: want values, got a tensor on the device meta")
+    given = given.to(points)
+    *batch, N = points.shape[:-1]
+    if _expands(given.shape, (*batch, N)):
+        _check_deviations(given.detach())
+        each = given.expand(*batch, N)
+        return torch.diag_embed(torch.stack([each, each], dim=-1))
+    if given.shape[-2:] == (N, 2) and _expands(given.shape, (*batch, N, 2)):
+        _check_deviations(given.detach())
+        return torch.diag_embed(given.expand(*batch, N, 2))
+    if given.shape[-2:] == (2, 2) and given.ndim >= 3 and _expands(given.shape, (*batch, N, 2, 2)):
+        return _root2(given).expand(*batch, N, 2, 2)
+    want = (*batch, N)
+    raise ValueError(
+        f"pixel_sigma: want a number or a shape that broadcasts to {want}, (*{want}, 2) or (*{want}, 2, 2), got "
+        f"{tuple(given.shape)}"
+    )
+
+
+def _expands(shape: Sequence[int], to: Sequence[int]) -> bool:
+    pairs = zip(reversed(shape), reversed(to), strict=False)
+    return len(shape) <= len(to) and all(mine in (1, theirs) for mine, theirs in pairs)
+
+
+def _check_deviations(given: Tensor) -> None:
+    if not bool(((given >= 0) & given.isfinite()).all()):
+        raise ValueError("pixel_sigma: want finite standard deviations of at least 0, got others")
+
+
+def _root2(covariance: Tensor) -> Tensor:
+    """Lower triangular matrices L `(*, 2, 2)` with `L L^T` the covariance, with slopes."""
+    seen = covariance.detach()
+    size = seen.abs().amax((-2, -1))
+    a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    even = seen.isfinite().all() and bool(((seen - seen.mT).abs().amax((-2, -1)) <= 1e-6 * size).all())
+    if not even or bool(((a < 0) | (c < 0) | (a * c - b * b < -1e-6 * size.square())).any()):
+        raise ValueError("pixel_sigma: want symmetric covariances without negative eigenvalues, got others")
+    first = torch.where(a > 0, torch.where(a > 0, a, 1.0).sqrt(), 0.0)
+    across = torch.where(a > 0, b / torch.where(a > 0, first, 1.0), 0.0)
+    rest = c - across.square()
+    second = torch.where(rest > 0, torch.where(rest > 0, rest, 1.0).sqrt(), 0.0)
+    rows = [torch.stack([first, torch.zeros_like(first)], dim=-1), torch.stack([across, second], dim=-1)]
+    return torch.stack(rows, dim=-2)

@@ -142,7 +142,12 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
     common = torch.where(there[..., None, None], common, 0.0)
     unit = torch.eye(2 * N, dtype=y.dtype, device=y.device).expand(*batch, 2 * N, 2 * N)
     noise = Noise(
-        Straight(placed.detach(), there, common), common, unit, common[..., :2] * 0, freedom.amin(-1), pixels_too=False
+        Straight(placed.detach(), there, common, plane),
+        common,
+        unit,
+        common[..., :2] * 0,
+        freedom.amin(-1),
+        pixels_too=False,
     )
     doubts = _doubts(names, disagrees)
     if doubts:

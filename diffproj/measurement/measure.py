@@ -7,13 +7,14 @@ the pose of its view. With T a basis of the plane's two directions, `J = d uv / 
 
 so that the covariance of all points together is
 
-    C_ij = G_i Sigma G_j^T  +  [i = j] sigma_i^2 D_i D_i^T
+    C_ij = G_i Sigma G_j^T  +  [i = j] D_i S_i D_i^T
 
-with `D = dX / d uv`, G the derivative by theta and by the plane, and Sigma their joint covariance: the calibration's,
-with its correlations between intrinsics and pose, and the plane's where one is given. A quantity of some of the points
-has the variance `g^T C g`, g its gradient. This is first order: sampling agrees as long as standard deviations are
-small beside the distance. Beyond, `interval` follows the curve, and `lens_reach` tells how much less is known where the
-lens is extrapolated. The covariance of all pairs of points is computed only where it is asked for (`joint`).
+with `D = dX / d uv`, S the covariance of a pixel, G the derivative by theta and by the plane, and Sigma their joint
+covariance: the calibration's, with its correlations between intrinsics and pose, and the plane's where one is given. A
+quantity of some of the points has the variance `g^T C g`, g its gradient. This is first order: sampling agrees as long
+as standard deviations are small beside the distance. Beyond, `interval` follows the curve, and `lens_reach` tells how
+much less is known where the lens is extrapolated. The covariance of all pairs of points is computed only where it is
+asked for (`joint`).
 
 Where a view's pose may be the wrong one of two, the other is too far away for that: see `doubt.py`.
 """
@@ -38,7 +39,7 @@ from diffproj.geometry.plane import Plane, as_plane
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.slopes import by_direction
 from diffproj.measurement import lens_reach
-from diffproj.measurement.choices import PixelSigma, chosen_view, doubts, pixel_noise
+from diffproj.measurement.choices import PixelSigma, chosen_view, deviation_matrices, doubts, pixel_noise
 from diffproj.measurement.doubt import of_the_pose
 from diffproj.measurement.measurement import Measurement
 from diffproj.measurement.propagation import Noise
@@ -63,10 +64,11 @@ def measure(
         plane: in the frame of the board that the view saw.
         view: the number or the name of the view whose pose holds, in whose photograph the pixels are; may be left out
             where there is one only.
-        pixel_sigma: standard deviation of each coordinate of the measured pixels in px, a number or `(*B, N)`: about
-            0.5 for points that a hand picked. `"detector"` stands for that of the calibration's corners, as its
-            residuals tell it. It is that if left out, too, with a `PixelNoiseWarning` unless the pixels are corners of
-            that view.
+        pixel_sigma: how far off the measured pixels are, in px: the standard deviation of both coordinates, a number or
+            `(*B, N)`, that of u and v `(*B, N, 2)`, or their covariance in squared px `(*B, N, 2, 2)`. About 0.5 for
+            points that a hand picked; for the foot of a detector's box a share of its width and height. `"detector"`
+            stands for that of the calibration's corners, as its residuals tell it. It is that if left out, too, with a
+            `PixelNoiseWarning` unless the pixels are corners of that view.
         plane_covariance: of the plane's normal and offset as they are given, `(*B, 4, 4)`; exact if left out.
 
     Returns:
@@ -90,10 +92,11 @@ def measure(
         199.9 ± 0.2 mm
     """
     pixels, plane = in_float64(check_tensor("pixels", pixels, "N", 2)), as_plane(plane)
-    known, middle, doubtful, number = None, None, "", 0
+    known, middle, doubtful, number, posed = None, None, "", 0, None
     if isinstance(calibration, Calibration):
         number = view_number(chosen_view(calibration, view), calibration.views.names)
         camera, known, middle = _at_view(calibration, number)
+        posed = calibration.posed[..., number]
         parameters = replace(calibration.parameters, bow=False)
         doubtful = doubts(calibration, number)
     else:
@@ -114,8 +117,11 @@ def measure(
         many = broadcast_batches(pixels=pixels.shape[:-2], plane_covariance=plane_covariance.shape[:-2])
         pixels = pixels.expand(*many, *pixels.shape[-2:])
     points, valid = back_project(pixels, camera, plane)
+    if posed is not None:
+        valid = valid & posed.unsqueeze(-1)
+        points = torch.where(valid.unsqueeze(-1), points, 0.0)
     batch = points.shape[:-2]
-    sigma = _expanded(noise, like=points)
+    sigma = deviation_matrices(noise, points)
     by_theta, by_point = _projection_derivatives(pixels, points, valid, camera, parameters, known, middle)
     tangents = plane.tangents()
     T = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)  # (*B, N, 3, 2)
@@ -151,7 +157,7 @@ def measure(
         sight,
         common,
         _block_diagonal(covariances, batch),
-        sigma[..., None, None] * D,
+        D @ sigma,
         _degrees_of_freedom(calibration, like=points),
         pixels_too=estimated,
     )
@@ -168,9 +174,10 @@ def _degrees_of_freedom(calibration: Calibration | Camera | PinholeCamera, like:
 def _at_view(calibration: Calibration, number: int) -> tuple[Camera, Tensor | None, Tensor | None]:
     """The camera at the pose of a view, the covariance of both, and the point `(3,)` that the pose turns about in it.
 
-    What is not known is `None`. The covariance is larger where the calibration does not fit the view.
+    Of many cameras some may have no pose, for they used no corner of the view. What is not known is `None`. The
+    covariance is larger where the calibration does not fit the view.
     """
-    if not bool(calibration.posed[..., number].all()):
+    if not bool(calibration.posed[..., number].any()):
         name = calibration.views.names[number]
         raise ValueError(f"view: want one whose pose is known, got {number} ({name}), which nothing tells")
     known, middle = None, None
@@ -179,22 +186,6 @@ def _at_view(calibration: Calibration, number: int) -> tuple[Camera, Tensor | No
         known, middle = covariance.about_middle.view(number), covariance.middle
         known = calibration.mismatch.scale[..., number, None, None].square() * known
     return calibration.cameras[..., number], known, middle
-
-
-def _expanded(pixel_sigma: float | Tensor | Array | None, like: Tensor) -> Tensor:
-    """The standard deviation of each pixel `(*B, N)`, for points `(*B, N, 3)`."""
-    sigma = check_tensor("pixel_sigma", pixel_sigma, like=like)
-    if sigma.is_meta:
-        raise ValueError("pixel_sigma: want values, got a tensor on the device meta")
-    sigma = sigma.to(like)
-    try:
-        sigma = sigma.expand(like.shape[:-1])
-    except RuntimeError:
-        want, got = tuple(like.shape[:-1]), tuple(sigma.shape)
-        raise ValueError(f"pixel_sigma: want a number or a shape that broadcasts to {want}, got {got}") from None
-    if not bool(((sigma.detach() >= 0) & sigma.detach().isfinite()).all()):
-        raise ValueError("pixel_sigma: want finite standard deviations of at least 0, got others")
-    return sigma
 
 
 def _check_covariance(given: Tensor) -> None:

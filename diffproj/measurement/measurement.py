@@ -1,6 +1,5 @@
 """`Measurement`: points on a plane with their joint covariance, and what follows from them with error bars."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -16,12 +15,14 @@ from diffproj._core.shown import Shown, counted, rounded
 from diffproj.calibration.covariance import zero_where_infinite
 from diffproj.calibration.region import in_region
 from diffproj.geometry.back_projection import Reason, explain
+from diffproj.measurement.ellipses import Ellipses, plane_ellipses
 from diffproj.measurement.folded import longest_first, norm_variance
 from diffproj.measurement.intervals import angle_interval, curved_interval, norm_interval
-from diffproj.measurement.propagation import Noise, Propagated, kink_variance
-from diffproj.measurement.quantity import Bounds, Quantity
+from diffproj.measurement.propagation import Noise, Propagated, kink_variance, without_unknown
+from diffproj.measurement.quantity import Bounds, Quantity, described
 from diffproj.measurement.shapes import area_vector, difference, length, turn
 from diffproj.measurement.sight import Sight
+from diffproj.measurement.student import check_level
 
 EXTRAPOLATED = (
     "Extrapolated: outside of the region that the calibration's corners covered. Only the lens model tells the lens "
@@ -71,7 +72,7 @@ class Measurement(Copied, Shown):
         """The covariance of each point `(*B, N, 3, 3)` in squared world units; infinite where it is not determined."""
         noise = self._noise
         C = noise.common @ zero_where_infinite(noise.sigma).unsqueeze(-3) @ noise.common.mT + noise.own @ noise.own.mT
-        return torch.where(self.valid[..., None, None], _without(C, noise.unknown(noise.common)), torch.nan)
+        return torch.where(self.valid[..., None, None], without_unknown(C, noise.unknown(noise.common)), torch.nan)
 
     @property
     def deviations(self) -> Float[Tensor, "*batch n 3"]:
@@ -88,7 +89,7 @@ class Measurement(Copied, Shown):
         N = own.shape[-3]
         apart = torch.eye(N, dtype=own.dtype, device=own.device)[:, None, :, None]
         blocks = (own.unsqueeze(-2) * apart).flatten(-2).flatten(-3, -2)
-        C = _without(G @ zero_where_infinite(noise.sigma) @ G.mT + blocks, noise.unknown(G))
+        C = without_unknown(G @ zero_where_infinite(noise.sigma) @ G.mT + blocks, noise.unknown(G))
         valid = self.valid.repeat_interleave(3, dim=-1)
         return torch.where(valid.unsqueeze(-1) & valid.unsqueeze(-2), C, torch.nan)
 
@@ -115,6 +116,25 @@ class Measurement(Copied, Shown):
         bounds = [coordinate.interval(level) for coordinate in self._coordinates]
         low, high = (torch.stack(side, dim=-1) for side in zip(*bounds, strict=True))
         return low, high
+
+    def ellipses(self, level: float = 0.95) -> Ellipses:
+        """An ellipse on the plane around each point that holds the truth with that probability, to first order.
+
+        It is larger where the noise was estimated from few residuals (Fisher's F).
+
+        Raises:
+            ValueError: the level is not between 0 and 1.
+
+        Example:
+            >>> import diffproj as dp
+            >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+            >>> down = dp.Camera(K, t=torch.tensor([0.0, 0, 10], dtype=torch.float64))  # 10 m over the plane
+            >>> pixel = torch.tensor([[320.0, 240.0]], dtype=torch.float64)
+            >>> measured = dp.measure(pixel, down, dp.Plane.z(0.0), pixel_sigma=[[2.0, 1.0]])
+            >>> measured.ellipses(0.95).half_axes  # 2.4477 deviations of 4 and 2 cm
+            tensor([[0.0979, 0.0490]], dtype=torch.float64)
+        """
+        return plane_ellipses(self._noise, self.points, self.covariance, check_level(level))
 
     @cached_property
     def nonlinear(self) -> Bool[Tensor, "*batch n"]:
@@ -225,7 +245,7 @@ class Measurement(Copied, Shown):
             lines.append(f"point {n:<3} {'  '.join(texts) + notes if valid[n] else 'not on the plane'}")
         if len(lines) > 1:
             found = self.lengths()
-            lines += [f"{n} to {n + 1:<4} {text}" for n, text in enumerate(_lines(found))]
+            lines += [f"{n} to {n + 1:<4} {text}" for n, text in enumerate(described(found))]
             bent = [*bent, *found.nonlinear.tolist()]
         if any(beyond[n] for n in range(len(valid)) if valid[n]):
             lines.append(EXTRAPOLATED)
@@ -375,23 +395,3 @@ class Measurement(Copied, Shown):
 
 def _coordinate(axis: int, points: Tensor) -> Tensor:
     return points[0, axis]
-
-
-def _without(C: Tensor, unknown: Tensor) -> Tensor:
-    """The covariance with infinite variances, and no covariances, where a coordinate `(..., r, 1)` is not known."""
-    kept = torch.where(unknown | unknown.mT, 0.0, C)
-    return kept + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(C).squeeze(-1))
-
-
-def _lines(found: Quantity) -> list[str]:
-    """Lengths with their deviations, and with their intervals where the deviations mislead."""
-    columns = (found.value, found.deviation, *found.interval(), found.nonlinear, found.significant)
-    lines = []
-    for value, deviation, low, high, bent, significant in zip(*(column.tolist() for column in columns), strict=True):
-        if math.isnan(value):
-            lines.append("not both points are on the plane")
-            continue
-        note = f"  nonlinear, 95 %: {low:.3f} to {high:.3f}" * bent
-        note += "" if significant else "  less than three deviations from 0"
-        lines.append(f"{value:10.3f} ± {deviation:.3f}{note}")
-    return lines

@@ -182,3 +182,9 @@ def root(sigma: Tensor) -> Tensor:
     unit = torch.where(scale > 0, scale, 1.0)
     values, vectors = torch.linalg.eigh(sigma / unit.unsqueeze(-1) / unit.unsqueeze(-2))
     return scale.unsqueeze(-1) * vectors * values.clamp(min=0).sqrt().unsqueeze(-2)
+
+
+def without_unknown(C: Tensor, unknown: Tensor) -> Tensor:
+    """The covariance with infinite variances, and no covariances, where a coordinate `(..., r, 1)` is not known."""
+    kept = torch.where(unknown | unknown.mT, 0.0, C)
+    return kept + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(C).squeeze(-1))

@@ -1,5 +1,6 @@
 """`Quantity`: measured values, their standard deviations, and the intervals in which the truth lies."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -104,3 +105,17 @@ class Quantity(Copied, Shown):
         if self.degrees_of_freedom is None:
             return torch.full_like(self.value, normal_reach(level))
         return student_reach(level, self.degrees_of_freedom)
+
+
+def described(found: Quantity) -> list[str]:
+    """Lengths with their deviations, and with their intervals where the deviations mislead."""
+    columns = (found.value, found.deviation, *found.interval(), found.nonlinear, found.significant)
+    lines = []
+    for value, deviation, low, high, bent, significant in zip(*(column.tolist() for column in columns), strict=True):
+        if math.isnan(value):
+            lines.append("not both points are on the plane")
+            continue
+        note = f"  nonlinear, 95 %: {low:.3f} to {high:.3f}" * bent
+        note += "" if significant else "  less than three deviations from 0"
+        lines.append(f"{value:10.3f} ± {deviation:.3f}{note}")
+    return lines

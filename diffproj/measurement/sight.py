@@ -20,7 +20,7 @@ class Sight:
 
     Attributes:
         pixels: `(*B, N, 2)`.
-        noise: the standard deviation of their coordinates `(*B, N)`.
+        noise: their errors by two independent ones of deviation 1 `(*B, N, 2, 2)`.
         camera: at its pose.
         plane: what they lie on.
         by_theta: the derivative of the points' pixels by camera and pose `(*B, N, 2, q)`.
@@ -48,7 +48,8 @@ class Sight:
         M, k = index.shape
         q = self.by_theta.shape[-1]
         seen_from = (self.by_theta[..., index, :, :] @ theta[..., :q, None].unsqueeze(-3)).squeeze(-1)
-        moved = self.pixels[..., index, :] + self.noise[..., index, None] * noise - seen_from
+        shaken = (self.noise[..., index, :, :] @ noise.unsqueeze(-1)).squeeze(-1)
+        moved = self.pixels[..., index, :] + shaken - seen_from
         last = theta.shape[-1] - self.away.shape[-1]
         points, valid = back_project(moved.flatten(-3, -2), self.camera, self._plane(index, theta[..., q:last]))
         beside = (self.away[..., index, :, :] @ theta[..., last:, None].unsqueeze(-3)).squeeze(-1)
@@ -76,11 +77,13 @@ class Straight:
         at: the points `(*B, N, 3)`.
         valid: which of them somebody measured `(*B, N)`.
         by_theta: their derivative by their q errors `(*B, N, 3, q)`.
+        plane: what they lie on.
     """
 
     at: Tensor
     valid: Tensor
     by_theta: Tensor
+    plane: Plane
 
     def points(self, index: Tensor, theta: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """As `Sight.points` gives them; there are no pixels with a noise of their own."""

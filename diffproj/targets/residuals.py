@@ -59,7 +59,7 @@ def plane_residuals(
 
     Raises:
         TypeError: not a camera, views and a target in this order.
-        ValueError: other numbers of poses or corners than the views have.
+        ValueError: other numbers of poses or corners than the views have, or points that are not on z = 0.
 
     Example:
         >>> import diffproj as dp
@@ -69,6 +69,8 @@ def plane_residuals(
         (True, True)
     """
     camera, points = _posed(camera, views, target)
+    if not points.is_meta and bool((points.detach()[:, 2] != 0).any()):
+        raise ValueError("target: want points on z = 0, got others; image_residuals takes them wherever they are")
     return put_back_minus_known(camera, points.to(camera.K), views.pixels.to(camera.K), views.visible)
 
 
@@ -107,6 +109,23 @@ def put_back_minus_known(
     landed, valid = back_project(pixels, camera, Plane.z(0.0))
     valid = valid & counts
     return torch.where(valid.unsqueeze(-1), landed - points, 0.0), valid
+
+
+def nearest_minus_known(
+    camera: Camera,
+    points: Float[Tensor, "*#batch n 3"],
+    pixels: Float[Tensor, "*#batch n 2"],
+    counts: Bool[Tensor, "*#batch n"],
+) -> tuple[Float[Tensor, "*out n 3"], Bool[Tensor, "*out n"]]:
+    """How far from a pixel's ray its point lies: the nearest place on the ray, minus the point, in world units.
+
+    For points in space, which no plane holds. Args and returns are those of `projected_minus_seen`.
+    """
+    origin, direction, valid = camera.rays(pixels)
+    offset = points - origin
+    along = (offset * direction).sum(-1, keepdim=True)
+    valid = valid & counts & (along.squeeze(-1) > 0)
+    return torch.where(valid.unsqueeze(-1), along * direction - offset, 0.0), valid
 
 
 def _posed(camera: Camera | PinholeCamera, views: Views, target: Target) -> tuple[Camera, Tensor]:

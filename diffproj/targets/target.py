@@ -11,10 +11,7 @@ from diffproj._core.numerics import check_tensor
 
 @runtime_checkable
 class Target(Protocol):
-    """Anything with world points, such as `Chessboard`.
-
-    Calibration asks for points on the plane z = 0.
-    """
+    """Anything with world points, such as `Chessboard` and `Landmarks`."""
 
     @property
     def points(self) -> Float[Tensor, "n 3"]:
@@ -29,7 +26,7 @@ def points_of(target: Target) -> Float[Tensor, "n 3"]:
         TypeError: it has none, or they are no floating-point tensor.
         ValueError: they are not of shape `(N, 3)`.
     """
-    instance("target", target, Target, "dp.Chessboard or anything with .points (N, 3)")
+    instance("target", target, Target, "dp.Chessboard, dp.Landmarks or anything with .points (N, 3)")
     if isinstance(target, type) and isinstance(target.points, property):
         raise TypeError(f"target: want an instance, as dp.Chessboard(), got the class {target.__name__}")
     points = check_tensor("target.points", target.points, "N", 3)

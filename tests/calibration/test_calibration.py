@@ -814,7 +814,11 @@ def test_bad_input_is_refused_by_name() -> None:
         (ValueError, "views: want 40 corners .* got 54", lambda: dp.calibrate(views, dp.Chessboard(8, 5))),
         (ValueError, "views: want at least one, got none", lambda: dp.locate(views[[]], board, truth[0])),
         (ValueError, "views: want the photographs' size", lambda: dp.calibrate(dp.Views(views.pixels), board)),
-        (ValueError, "target: want finite points, all on z = 0", lambda: dp.calibrate(views, target(board.points + 1))),
+        (
+            ValueError,
+            "target: want finite points, got others",
+            lambda: dp.calibrate(views, target(board.points + torch.nan)),
+        ),
         (ValueError, "all distinct, got 54 with 3 and 7 alike", lambda: dp.calibrate(views, target(same))),
         (ValueError, "do not lie on one line", lambda: dp.calibrate(views, target(line))),
         (

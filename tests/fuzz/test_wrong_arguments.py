@@ -242,6 +242,7 @@ def _geometry(t: Things) -> dict[str, Call]:
             dp.Camera.mounted, {"height": 2.0, "tilt_deg": 20.0, "size": (128, 96), "fov_deg": 60.0}
         ),
         "Camera.at": Call(c.at, {"R": t.cameras.R, "t": t.cameras.t}),
+        "Camera.shifted": Call(c.shifted, {"offset": torch.ones(3, dtype=D)}),
         "Camera.resized": Call(c.resized, {"size": (64, 48), "stretched": False}),
         "Camera.cropped": Call(c.cropped, {"left": 3, "top": 4.5, "width": 60, "height": 40}),
         "Camera.warped": Call(c.warped, {"matrix": warp, "size": (96, 128)}),
@@ -292,6 +293,9 @@ def _targets(t: Things) -> dict[str, Call]:
     v, b = t.views, t.board
     return {
         "Chessboard": Call(dp.Chessboard, {"columns": 4, "rows": 3, "square": 10.0, "axes": "paper"}),
+        "Landmarks": Call(
+            dp.Landmarks, {"points": b.points, "names": [str(n) for n in range(len(b))], "sigma": 0.1}, 3
+        ),
         "Views": Call(
             dp.Views, {"pixels": v.pixels, "visible": v.visible, "names": ["a", "b", "c", "d"], "size": (128, 96)}, 20
         ),
@@ -347,7 +351,18 @@ def _calibration(t: Things) -> dict[str, Call]:
     return {
         "calibrate": Call(dp.calibrate, {**on, "distortion": "none", **options, **more}, 6),
         "refine": Call(dp.refine, {**on, "camera": rough, "differentiable": True, **options, **more}, 6),
-        "locate": Call(dp.locate, {**on, "camera": k, **options}, 4),
+        "locate": Call(dp.locate, {**on, "camera": k, **options, "reject_outliers": 5.0}, 4),
+        "locate landmarks": Call(
+            dp.locate,
+            {
+                "views": t.views,
+                "target": dp.Landmarks(t.board.points),
+                "camera": rough,
+                "pixel_sigma": 0.2,
+                "throw": False,
+            },
+            4,
+        ),
         "calibrate_rig": Call(
             dp.calibrate_rig,
             {
@@ -477,6 +492,8 @@ def _measurement(t: Things) -> dict[str, Call]:
         "measure located": Call(dp.measure, {"pixels": t.pixels, "calibration": t.located, **on}, 3),
         "fuse": Call(dp.fuse, {"measurements": [m, m]}, 3),
         "Measurement.interval": Call(m.interval, {"level": 0.9}, 2),
+        "Measurement.ellipses": Call(m.ellipses, {"level": 0.9}, 2),
+        "Ellipses.outline": Call(m.ellipses().outline, {"count": 8}),
         "Measurement.quantity": Call(m.quantity, {"function": lambda p: p.square().sum(), "which": [[0, 1], [1, 2]]}),
         "Measurement.lengths": Call(m.lengths, {"pairs": [[0, 1]]}),
         "Measurement.angles": Call(m.angles, {"triples": [[0, 1, 2]]}),
@@ -563,6 +580,8 @@ OTHER = {
     "Quantity",
     "Reason",
     "Status",
+    "Ellipses",
+    "Positions",
 }
 """Classes that users do not build by hand."""
 
