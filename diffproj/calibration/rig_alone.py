@@ -159,7 +159,7 @@ def _located(
     shared = found.shared.detach()
     if fixed:  # what is held stays as it was given
         shared = held_at(shared.unsqueeze(0), shared.unsqueeze(0), found.parameters, fixed)[0]
-    seen = Seen(shared, R, data.about_middle(R, t), found.used)
+    seen = Seen(shared, *data.frame.pose(R, t), found.used)
     return Alone(found.parameters, seen, float(found.rms), str, partial(_others, found))
 
 
@@ -191,8 +191,7 @@ def _calibrated(
         R, t = found.cameras.R[i, :count].detach(), found.cameras.t[i, :count].detach()
         seen = Seen(
             found.shared[i].detach(),
-            R,
-            own[i].about_middle(R, t),
+            *own[i].frame.pose(R, t),
             found.used[i, :count],
         )
         alone[name] = Alone(

@@ -41,7 +41,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
         where = views.where[name]
         R_v = R[c] @ found.local[0][0, where]
         t_v = (R[c] @ found.local[1][0, where].unsqueeze(-1)).squeeze(-1) + t[c]
-        posed = kind.unpack(own, (R_v, data.in_world(R_v, t_v)))
+        posed = kind.unpack(own, data.frame.world_pose(R_v, t_v))
         size = data.views.size
         one = kind.unpack(own, (R[c], t[c]))
         cameras[name] = Camera.unchecked(one.K, one.R, one.t, one.distortion, size)
@@ -70,14 +70,14 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
                 "coefficients, or 'fisheye'"
             ),
         )
-    R_m, t_m = found.local[0][0], found.local[1][0]
+    R_m, t_m = views.frame.world_pose(found.local[0][0], found.local[1][0])
     return RigCalibration(
         cameras,
         calibrations,
         views.moments,
         {name: views.where[name] for name in names},
         R_m,
-        t_m - R_m @ views.middle,
+        t_m,
         status,
         found.iterations,
         cause,

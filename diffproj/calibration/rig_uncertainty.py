@@ -100,7 +100,8 @@ def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
         H, found.parameters.names, torch.ones_like(phi), basis=found.basis, scores=scores, dispersion=phi
     )
     middle = found.views.middle
-    return replace(reshaped(found_one, ()), middle=middle, _arm=found.local[0][0] @ middle)
+    R, _ = found.views.frame.world_pose(found.local[0][0], found.local[1][0])
+    return replace(reshaped(found_one, ()), middle=middle, _arm=R @ middle)
 
 
 def _dispersion(found: RigFit, H: Equations, M: Equations) -> Tensor:
@@ -167,5 +168,5 @@ def of_camera(found: RigFit, joint: Covariance, camera: int) -> Covariance:
         mixed[..., rows],
         alone,
         middle,
-        (R_c @ R_m) @ middle,
+        (R_c @ views.frame.world_pose(R_m, t_m)[0]) @ middle,
     )

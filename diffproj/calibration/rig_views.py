@@ -10,6 +10,7 @@ from torch import Tensor
 
 from diffproj._core.arguments import called, number
 from diffproj.calibration.data import Data
+from diffproj.calibration.own_frame import OwnFrame
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views, as_views
 
@@ -37,6 +38,11 @@ class RigViews:
     def points(self) -> Tensor:
         """The target's points `(N, 3)` about their middle."""
         return self.data[self.names[0]].points
+
+    @property
+    def frame(self) -> OwnFrame:
+        """The target's own frame, which is solved in."""
+        return self.data[self.names[0]].frame
 
     @property
     def middle(self) -> Tensor:
@@ -92,6 +98,8 @@ def rig_views(
             told = said.replace("views:", f"{label}:", 1) if said.startswith("views:") else said
             told = told.replace("weights:", f"weights[{name!r}]:", 1) if told.startswith("weights:") else told
             raise type(error)(told) from None
+    if any(one.spread is not None for one in data.values()):
+        raise ValueError("target: want landmarks without sigma, which a rig does not carry; leave out the sigma")
     labels = _labels(views_by_camera, moments, who)
     order = list(dict.fromkeys(label for name in names for label in labels[name]))
     places = {label: i for i, label in enumerate(order)}
