@@ -28,6 +28,12 @@ from diffproj.calibration.positions import Positions as Positions
 from diffproj.calibration.refine import refine as refine
 from diffproj.calibration.result import Calibration as Calibration
 from diffproj.calibration.result import CalibrationError as CalibrationError
+from diffproj.calibration.rig import calibrate_rig as calibrate_rig
+from diffproj.calibration.rig_result import Baseline as Baseline
+from diffproj.calibration.rig_result import RigCalibration as RigCalibration
+from diffproj.calibration.rig_triangulation import Triangulation as Triangulation
+from diffproj.calibration.rig_validation import RigCrossValidation as RigCrossValidation
+from diffproj.calibration.rig_validation import cross_validate_rig as cross_validate_rig
 from diffproj.calibration.solver import Status as Status
 from diffproj.calibration.validation import CrossValidation as CrossValidation
 from diffproj.calibration.validation import bootstrap as bootstrap

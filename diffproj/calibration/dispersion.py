@@ -25,6 +25,7 @@ everything leaves of independent errors there,
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -59,20 +60,32 @@ def dispersion(found: Fit) -> Tensor:
     few_views = FEW_VIEWS if not task.free else FEW_VIEWS_OF_A_SHAPE
     with torch.inference_mode():
         if task.free:
-            phi, spare, views = _moved_intrinsics(found, shared, local)
+            contradicting = _moved_intrinsics(found, shared, local)
         else:
-            phi, spare, views = _between_over_within(task, shared, local, found.degrees_of_freedom())
-        excess = (phi - 1).clamp(min=0) * spare.square() / (spare.square() + BELIEF**2)
-        excess = excess.pow(3) / (excess.square() + 2 / spare)  # 2 / spare: phi's own variance for independent corners
-        factor = 1 + excess * (1 + few_views / (views - 1).clamp(min=1))
-        factor = torch.where((spare >= 1) & factor.isfinite(), factor, 1.0)
+            contradicting = _between_over_within(task, shared, local, found.degrees_of_freedom())
+        factor = believed(contradicting, few_views)
     return factor.clone()
 
 
-def _between_over_within(
-    task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Phi `(P,)`, its degrees of freedom, and how many views say something; `redundant (P,)` are those of the fit."""
+class Contradiction(NamedTuple):
+    """How much views contradict each other: phi `(P,)`, its degrees of freedom, and how many views say something."""
+
+    phi: Tensor
+    spare: Tensor
+    views: Tensor
+
+
+def believed(found: Contradiction, few_views: float = FEW_VIEWS) -> Tensor:
+    """The factor on the covariance that phi is taken for; larger where there are few views."""
+    phi, spare, views = found
+    excess = (phi - 1).clamp(min=0) * spare.square() / (spare.square() + BELIEF**2)
+    excess = excess.pow(3) / (excess.square() + 2 / spare)  # 2 / spare: phi's own variance for independent corners
+    factor = 1 + excess * (1 + few_views / (views - 1).clamp(min=1))
+    return torch.where((spare >= 1) & factor.isfinite(), factor, 1.0)
+
+
+def _between_over_within(task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor) -> Contradiction:
+    """How much the views contradict each other; `redundant (P,)` are the degrees of freedom of the fit."""
     rows, residual, pull_weight, variance = _weighted(task, shared, local, redundant)
     s = shared.shape[-1]
     if task.basis is not None:
@@ -103,6 +116,21 @@ def _between_over_within(
         Q, off = task.prior.precision, (task.prior.precision @ (shared - task.prior.mean).unsqueeze(-1)).squeeze(-1)
         T = torch.eye(len(Q[0]), dtype=Q.dtype, device=Q.device) if task.basis is None else task.basis
         total, pull = total + T.mT @ Q @ T, pull + (T.mT @ off.unsqueeze(-1)).squeeze(-1)
+    return contradiction(u, S, K, share, total, pull)
+
+
+def contradiction(u: Tensor, S: Tensor, K: Tensor, share: Tensor, total: Tensor, pull: Tensor) -> Contradiction:
+    """How much views contradict each other, whose poses are eliminated.
+
+    Args:
+        u: their pulls `(P, V, q)`.
+        S: their part of the normal matrix `(P, V, q, q)`.
+        K: the covariance of their pulls if corners err independently `(P, V, q, q)`.
+        share: how much each counts `(P, V)`.
+        total: the normal matrix `(P, q, q)`, with a prior's.
+        pull: the sum of the pulls `(P, q)`, with a prior's.
+    """
+    data = (share[..., None, None] * S).sum(1)
     inverse = torch.linalg.pinv(total, hermitian=True)
     u = u - (S @ (inverse @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
     spent = (inverse * data.mT).sum((-2, -1))
@@ -114,10 +142,10 @@ def _between_over_within(
     squares = torch.where(told, along.square() / torch.where(told, values, 1.0), 0.0).sum(-1)
     squares, told = (share * squares).sum(-1), share.unsqueeze(-1) * told
     spare = (told.sum((-2, -1)) - spent).clamp(min=1e-9)
-    return squares / spare, spare, told.amax(-1).sum(-1)
+    return Contradiction(squares / spare, spare, told.amax(-1).sum(-1))
 
 
-def _moved_intrinsics(found: Fit, shared: Tensor, local: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:
+def _moved_intrinsics(found: Fit, shared: Tensor, local: tuple[Tensor, ...]) -> Contradiction:
     """Phi `(P,)` where points are free, its degrees of freedom, and how many views say something."""
     task, few = found.task, found.task.parameters.few
     share = torch.ones_like(local[1][..., 0]) if task.shares is None else task.shares
@@ -157,7 +185,7 @@ def _moved_intrinsics(found: Fit, shared: Tensor, local: tuple[Tensor, ...]) -> 
     views = task.used.any(-1).sum(-1)
     phi = ratio.sum(-1) / free.sum(-1).clamp(min=1)
     counted = (share * task.used.any(-1)).sum(-1)
-    return phi, torch.where(free.any(-1), 2 * (counted - 1), 0.0), views
+    return Contradiction(phi, torch.where(free.any(-1), 2 * (counted - 1), 0.0), views)
 
 
 def _weighted(

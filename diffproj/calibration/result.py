@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -37,10 +37,10 @@ class CalibrationError(RuntimeError):
     """The corners do not determine the camera, or the solver did not converge; the message says which and why.
 
     Attributes:
-        calibration: where it ended, or `None` where there is nothing to show.
+        calibration: where it ended, a `Calibration` or a `RigCalibration`, or `None` where there is nothing to show.
     """
 
-    def __init__(self, message: str, calibration: "Calibration | None" = None) -> None:
+    def __init__(self, message: str, calibration: Any = None) -> None:
         super().__init__(message)
         self.calibration = calibration
 

@@ -79,6 +79,22 @@ class Bordered(Problem, Protocol):
         ...
 
 
+@runtime_checkable
+class Summed(Protocol):
+    """A problem that adds up its normal equations itself, where most of the panel would be zeros.
+
+    Its residuals' weights are its own.
+    """
+
+    def equations(self, shared: Tensor, local: LocalState, loss: Loss | None) -> "tuple[Tensor, Equations]":
+        """The cost `(P,)` and the undamped normal equations, without a prior; not finite where a residual is not."""
+        ...
+
+    def retract(self, local: LocalState, step: Tensor) -> LocalState:
+        """Move the local blocks by tangent vectors `(P, V, l)`."""
+        ...
+
+
 class Prior(NamedTuple):
     """`1/2 (x - mean)^T precision (x - mean)`: mean `(P, s)`, precision `(P, s, s)`.
 
@@ -163,7 +179,7 @@ def equations_at(
 
 @np.errstate(all="ignore")  # infinite and NaN reductions are handled without warnings
 def solve(
-    problem: Problem,
+    problem: Problem | Summed,
     shared: Float[Tensor, "p s"],
     local: LocalState,
     *,
@@ -274,7 +290,7 @@ class _Terms:
 
     def __init__(
         self,
-        problem: Problem,
+        problem: Problem | Summed,
         local_size: int,
         weights: Tensor | None,
         loss: Loss | None,
@@ -285,7 +301,20 @@ class _Terms:
         self.border = problem.bordered if every and isinstance(problem, Bordered) else None
 
     def at(self, shared: Tensor, local: LocalState) -> tuple[Tensor, Equations]:
-        panel = self.problem.linearise(shared, local)
+        if isinstance(self.problem, Problem):
+            cost, equations = self._products(self.problem.linearise(shared, local), local)
+        else:
+            cost, equations = self.problem.equations(shared, local, self.loss)
+        if self.prior is not None:
+            off = shared - self.prior.mean
+            pull = _times(self.prior.precision, off)
+            if self.prior.root is not None:
+                pull = pull + _times(self.prior.root, _times(self.prior.root.mT, off))
+            cost = cost + (off * pull).sum(-1) / 2
+            equations = equations._replace(U=equations.U + self.prior.whole, g=equations.g + pull)
+        return cost, equations
+
+    def _products(self, panel: Tensor, local: LocalState) -> tuple[Tensor, Equations]:
         robust = None
         if self.weights is not None or self.loss is not None:
             squared = panel[..., -1, :, :].square().sum(-2)
@@ -299,17 +328,10 @@ class _Terms:
         s = rows.shape[-2] - self.local_size - 1
         totals = gram[..., :s, :].sum(1)
         c = gram[..., -1, -1] / 2
-        cost = c.sum(-1) if robust is None else robust
         U, E, g = totals[..., :s], gram[..., :s, s:-1], totals[..., -1]
         if self.border is not None:
             U, E, g = self.border(panel, local, U, E, g)
-        if self.prior is not None:
-            off = shared - self.prior.mean
-            pull = _times(self.prior.precision, off)
-            cost, U, g = cost + (off * pull).sum(-1) / 2, U + self.prior.whole, g + pull
-            if self.prior.root is not None:
-                along = _times(self.prior.root.mT, off)
-                cost, g = cost + along.square().sum(-1) / 2, g + _times(self.prior.root, along)
+        cost = c.sum(-1) if robust is None else robust
         return cost, Equations(U, E, gram[..., s:-1, s:-1], g, gram[..., s:-1, -1], c)
 
 

@@ -9,6 +9,7 @@ import torch
 
 from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.calibration.rig_result import RigCalibration
 from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import progress_bars
 from diffproj.cli.units import Length, agreed, heading
@@ -125,6 +126,11 @@ def new_photograph(options: argparse.Namespace) -> Scene:
 def _loaded(path: Path) -> tuple[Camera, Calibration | None]:
     """The one camera in a file, and the calibration where the file holds one."""
     found = load(path)
+    if isinstance(found, RigCalibration):
+        raise ValueError(  # noqa: TRY004
+            f"--camera: want one camera, got a rig of {', '.join(found.names)} in {path}; diffproj convert "
+            "--camera NAME takes one of them out"
+        )
     camera, calibration = (found.camera, found) if isinstance(found, Calibration) else (found, None)
     if camera.batch_shape:
         raise ValueError(f"--camera: want one camera, got {camera.batch_shape.numel()} side by side in {path}")

@@ -61,6 +61,9 @@ class Things(NamedTuple):
     accuracy: dp.AccuracyMap
     experiment: dp.Experiment
     photograph: torch.Tensor
+    pair: dict[str, dp.Views]
+    rig: dp.RigCalibration
+    triangulated: dp.Triangulation
 
 
 @functools.cache
@@ -80,6 +83,13 @@ def things() -> Things:
     plane = dp.Plane.z(0.0)
     measured = dp.measure(views.pixels[0, :5], calibration, plane, view=0)
     accuracy = dp.AccuracyMap.over_image(calibration, view=0, step=40)
+    beside = dp.Camera(
+        K, dp.rotation_from_euler(0.05, 0.1, 0.02), torch.tensor([-20.0, 1, 2], dtype=D), lens, (128, 96)
+    )
+    second = beside.at(beside.R @ cameras.R, (beside.R @ cameras.t.unsqueeze(-1)).squeeze(-1) + beside.t)
+    pair = {"one": views, "two": dp.synthetic.corner_views(second, board, noise_px=0.05, seed=1)}
+    known = {"one": plain.without_pose(), "two": beside}
+    rig = dp.calibrate_rig(pair, board, cameras=known, fixed=("intrinsics",), throw=False)
     return Things(
         K,
         plain,
@@ -99,6 +109,9 @@ def things() -> Things:
         accuracy,
         dp.run_experiment(views[:3], views[3:], board, "none"),
         torch.tensor(np.kron(np.indices((6, 7)).sum(0) % 2, np.ones((12, 12))) * 200, dtype=torch.uint8),
+        pair,
+        rig,
+        rig.triangulate({name: one.pixels[0] for name, one in pair.items()}, 0.1),
     )
 
 
@@ -359,6 +372,48 @@ def _calibration(t: Things) -> dict[str, Call]:
             },
             4,
         ),
+        "calibrate_rig": Call(
+            dp.calibrate_rig,
+            {
+                "views_by_camera": t.pair,
+                "target": t.board,
+                "distortion": "none",
+                "moments": {"one": [1, 2, 3, 4], "two": [1, 2, 3, 4]},
+                "cameras": t.rig,
+                **options,
+                "weights": {"one": 1.0, "two": torch.ones(12, dtype=D)},
+                "fixed": ("intrinsics",),
+                "reject_outliers": 5.0,
+            },
+            3,
+        ),
+        "cross_validate_rig": Call(
+            dp.cross_validate_rig,
+            {
+                "views_by_camera": t.pair,
+                "target": t.board,
+                "distortion": "none",
+                "folds": 2,
+                "moments": None,
+                "cameras": t.rig,
+                "fixed": ("intrinsics",),
+                "throw": False,
+            },
+            0.2,
+        ),
+        "RigCalibration.baseline": Call(t.rig.baseline, {"one": "one", "other": "two"}),
+        "RigCalibration.place_covariance": Call(t.rig.place_covariance, {"name": "two"}),
+        "RigCalibration.parameters_of": Call(t.rig.parameters_of, {"name": "two"}),
+        "RigCalibration.triangulate": Call(
+            t.rig.triangulate,
+            {
+                "pixels_by_camera": {name: one.pixels[0] for name, one in t.pair.items()},
+                "pixel_sigma": {"one": 0.1, "two": 0.2},
+            },
+        ),
+        "RigCalibration[]": Call(t.rig.__getitem__, {"name": "one"}),
+        "Triangulation.between": Call(t.triangulated.between, {"i": 0, "j": 1}),
+        "Triangulation.length": Call(t.triangulated.length, {"i": 0, "j": 1}),
         "cross_validate": Call(dp.cross_validate, {**on, "distortion": "none", "folds": 2, **held}, 1),
         "bootstrap": Call(dp.bootstrap, {**on, "distortion": "none", "draws": 3, "seed": 0, "fixed": held["fixed"]}, 1),
         "Covariance.between": Call(k.covariance.between, {"view": 0, "other": 1}),
@@ -532,6 +587,10 @@ OTHER = {
     "Loss",
     "Observation",
     "LensComparison",  # results that are made inside
+    "Baseline",
+    "RigCalibration",
+    "RigCrossValidation",
+    "Triangulation",
     "Adjustment",
     "Calibration",
     "Covariance",
@@ -576,6 +635,7 @@ NOT_CALLED = {
     "PlaneMap.quietly",  # as the constructor
     "Camera.warped_by",
     "Covariance.from_fields",  # of files
+    "RigCalibration.from_fields",
     "SoftL1.value",  # as Huber's and Cauchy's
     "SoftL1.weight",
     "Cauchy.value",
