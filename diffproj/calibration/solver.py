@@ -308,9 +308,10 @@ class _Terms:
         if self.prior is not None:
             off = shared - self.prior.mean
             pull = _times(self.prior.precision, off)
-            if self.prior.root is not None:
-                pull = pull + _times(self.prior.root, _times(self.prior.root.mT, off))
             cost = cost + (off * pull).sum(-1) / 2
+            if self.prior.root is not None:
+                along = _times(self.prior.root.mT, off)
+                cost, pull = cost + along.square().sum(-1) / 2, pull + _times(self.prior.root, along)
             equations = equations._replace(U=equations.U + self.prior.whole, g=equations.g + pull)
         return cost, equations
 
