@@ -246,7 +246,7 @@ def _inliers(task: Task, solution: Solution, limit: float) -> Tensor:
 
 
 def _robust_sigma(residual: Tensor, used: Tensor, shares: Tensor | None) -> Tensor:
-    """Robust std `(P,)`: 1.4826 times the median absolute component of residuals `(P, V, 2, N)`, copies counted once."""
+    """Robust std `(P,)`: 1.4826 times the median size of residuals' components `(P, V, 2, N)`, copies counted once."""
     size = torch.where(used.unsqueeze(2), residual.abs(), torch.nan)
     if shares is None:
         return 1.4826 * size.flatten(1).nanmedian(-1).values
