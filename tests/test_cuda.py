@@ -103,6 +103,47 @@ def maps(scene: Scene) -> list[Any]:
     return [found.points, found.deviation]
 
 
+def surveyed(scene: Scene) -> list[Any]:
+    """Landmarks in space: the pose, from a camera that is known, and the focal length too."""
+    points = torch.rand(12, 3, dtype=D, generator=torch.Generator().manual_seed(0))
+    points = (points * torch.tensor([200.0, 125, -80], dtype=D)).to(scene.device)
+    camera = dp.Camera(scene.camera.K, scene.camera.R, scene.camera.t, size=(640, 480))
+    views = dp.Views(camera.project(points)[0].unsqueeze(0), size=(640, 480))
+    found = dp.locate(views, dp.Landmarks(points), camera, pixel_sigma=0.5)
+    held = ("principal_point", "distortion")
+    both = dp.calibrate(views, dp.Landmarks(points), "none", fixed=held[:1], pixel_sigma=0.5)
+    ellipses = dp.measure(scene.pixels[::9], found, scene.plane, pixel_sigma=0.5).ellipses(0.95)
+    return [*found.cameras.tensors(), found.covariance.full(), both.camera.K, ellipses.half_axes]
+
+
+def mounted(scene: Scene) -> list[Any]:
+    """A camera on a mast, and what is seen of it."""
+    mast = dp.Camera.mounted(6.0, 20.0, heading_deg=30.0, fov_deg=70.0, size=(640, 480)).to(scene.device)
+    standing = torch.tensor([[6.0, 10, 0], [8, 14, 0], [5, 12, 0]], dtype=D, device=scene.device)
+    top = standing + torch.tensor([0, 0, 1.75], dtype=D, device=scene.device)
+    mast = mast.to(D)
+    heights = dp.Heights(mast.project(standing)[0], mast.project(top)[0], 1.75, 0.03)
+    far = mast.center + 1e6 * torch.tensor([[0.3, 1, 0], [0.9, 1, 0]], dtype=D, device=scene.device)
+    horizon = dp.Horizon(mast.project(far)[0], 2.0)
+    found = dp.adjust(mast, [heights, horizon], fixed=("heading", "position"))
+    return [*found.camera.tensors(), mast.mounting().tilt]
+
+
+def rig(scene: Scene) -> list[Any]:
+    """Two cameras of one rig, and points from both."""
+    views = {side: dp.example_views(side)[:6].to(scene.device) for side in ("left", "right")}
+    found = dp.calibrate_rig(views, BOARD)
+    spots = found.triangulate({side: one.pixels[0] for side, one in views.items()})
+    return [found.cameras["right"].t, spots.points, spots.deviations]
+
+
+def joined(scene: Scene) -> list[Any]:
+    """Two measurements of the same points."""
+    one, other = (dp.measure(scene.pixels[::9] + d, scene.camera, scene.plane, pixel_sigma=0.5) for d in (0.0, 0.1))
+    found = dp.fuse([one, other])
+    return [found.points, found.covariance]
+
+
 CALLS: dict[str, Callable[[Scene], list[Any]]] = {
     "cameras": through_cameras,
     "gradients": gradients,
@@ -116,6 +157,14 @@ CALLS: dict[str, Callable[[Scene], list[Any]]] = {
     "cross_validate": lambda s: dp.cross_validate(s.views, BOARD, "brown4", folds=2).to_dict()["held_out_px"],
     "measure": measured,
     "learning": learning,
+    "calibrate a free shape": lambda s: fitted(dp.calibrate(s.views, BOARD, "brown4", shape="free")),
+    "landmarks": surveyed,
+    "mounted": mounted,
+    "rig": rig,
+    "fuse": joined,
+    "one sample": lambda s: [
+        dp.rectify(s.image, s.camera.resized((64, 48)), s.plane, EXTENT, 5.0, samples=1, north_up=True)
+    ],
     "pictures": pictures,
     "maps": maps,
     "out of torch": out_of_torch,
