@@ -252,15 +252,7 @@ def measured(
         >>> [text.get_text() for text in figure.axes[0].texts]
         ['x', 'y', 'z', '200 ± 0.5 mm', 'A', 'B']
     """
-    size = calibration.views.size or calibration.camera.size
-    if photograph is not None:
-        size = photograph.shape[1], photograph.shape[0]
-    if size is None:
-        raise ValueError("photograph: want one, for the calibration does not tell the image's size, got none")
-    figure = Figure(figsize=_beside(size, 1), layout="constrained")
-    axes = figure.add_subplot()
-    if photograph is not None:
-        axes.imshow(photograph, cmap="gray", vmin=0, vmax=255)
+    figure, axes, size = _over_photograph(calibration, photograph)
     used = calibration.used[view].cpu()
     axes.plot(*calibration.views.pixels[view].cpu()[used].T, ".", color=APPROXIMATED, markersize=3)
     _draw_axes(axes, calibration, view)
@@ -298,6 +290,45 @@ def measured(
     return figure
 
 
+def landmarks(
+    calibration: Calibration, view: int, photograph: Shaped[np.ndarray, "h w"] | None = None, title: str = ""
+) -> Figure:
+    """A photograph with its landmarks: crosses where they were seen, circles where the camera sees them.
+
+    Args:
+        calibration: of one camera, found from `Landmarks`; its size is known, or the photograph given.
+        view: the number of the photograph's view.
+        photograph: its grey values; white where there is none.
+        title: over the picture.
+
+    Raises:
+        ValueError: neither a size nor a photograph is known.
+
+    Example:
+        >>> import diffproj as dp
+        >>> views, board = dp.example_views("left")[:1], dp.Landmarks(dp.Chessboard().points)
+        >>> camera = dp.calibrate(dp.example_views("left"), dp.Chessboard()).camera
+        >>> figure = landmarks(dp.locate(views, board, camera), 0, title="left01")
+        >>> [text.get_text() for text in figure.axes[0].texts][:3]
+        ['1', '2', '3']
+    """
+    figure, axes, size = _over_photograph(calibration, photograph)
+    projected, valid = calibration.cameras[view].project(calibration.points)
+    seen, rejected = calibration.views.visible[view].cpu(), calibration.rejected[view].cpu()
+    pixels, projected = calibration.views.pixels[view].cpu(), projected.detach().cpu()
+    axes.plot(*projected[valid.cpu()].T, "o", color=APPROXIMATED, markersize=10, markerfacecolor="none")
+    for mask, colour in ((seen & ~rejected, ERROR), (rejected, REJECTED)):
+        axes.plot(*pixels[mask].T, "+", color=colour, markersize=9, markeredgewidth=1.5, path_effects=OUTLINE)
+    names = calibration.landmarks or tuple(str(number + 1) for number in range(len(pixels)))
+    style = {"textcoords": "offset points", "color": ERROR, "fontsize": 9, "path_effects": OUTLINE}
+    for name, place, shown in zip(names, pixels.tolist(), seen.tolist(), strict=True):
+        if shown:
+            axes.annotate(name, place, (6, 6), parse_math=False, **style)
+    _as_image(axes, size)
+    axes.set_title(title, fontsize=10, parse_math=False)
+    return figure
+
+
 def png(figure: Figure, dpi: int = 150) -> bytes:
     """The figure as the content of a PNG file."""
     return content(figure, "png", dpi)
@@ -308,6 +339,22 @@ def content(figure: Figure, format: str = "png", dpi: int = 150) -> bytes:  # no
     written = io.BytesIO()
     figure.savefig(written, format=format, dpi=dpi)
     return written.getvalue()
+
+
+def _over_photograph(
+    calibration: Calibration, photograph: Shaped[np.ndarray, "h w"] | None
+) -> tuple[Figure, Axes, tuple[int, int]]:
+    """A figure with the photograph in it, its axes and its size."""
+    size = calibration.views.size or calibration.camera.size
+    if photograph is not None:
+        size = photograph.shape[1], photograph.shape[0]
+    if size is None:
+        raise ValueError("photograph: want one, for the calibration does not tell the image's size, got none")
+    figure = Figure(figsize=_beside(size, 1), layout="constrained")
+    axes = figure.add_subplot()
+    if photograph is not None:
+        axes.imshow(photograph, cmap="gray", vmin=0, vmax=255)
+    return figure, axes, size
 
 
 def _draw_axes(axes: Axes, calibration: Calibration, view: int) -> None:

@@ -18,6 +18,7 @@ from diffproj import __version__
 COMMANDS = {
     "calibrate": "find a camera from photographs of a chessboard, and write a camera file",
     "measure": "measure points, lengths and an area on a plane in a photograph, with error bars",
+    "locate": "find where a camera stood from surveyed landmarks that a photograph shows",
     "convert": "turn a camera file of one program into that of another",
     "info": "tell what is in a camera file, and whether it can be right",
     "experiment": "calibrate, put corners back on the board, and print the errors (the paper's Table 1 and Fig. 7)",
