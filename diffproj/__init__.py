@@ -38,6 +38,8 @@ Glossary:
 * Residual: projected minus measured pixels, or found minus true points of the plane; the docstring says which.
 * Deviation: standard deviation, one sigma. Covariance: deviations of many quantities with their correlations.
 * Ground resolution: how many world units a pixel covers on a plane. It does not tell how well a point is measured.
+* Rig: cameras that stand still to each other. Its frame is that of its first camera. A moment is when several of them
+  photograph the target in one place.
 * Bow: how far a board is from flat, as a paraboloid. Held out: not used to calibrate, so that it can test.
 
 The names of this page stay. They live in rooms, whose own pages say more: `diffproj.lens` and `diffproj.geometry` for
@@ -58,6 +60,8 @@ __all__ = [
     "AccuracyMap",
     "Adjustment",
     "AmbiguousPoseWarning",
+    "AprilGrid",
+    "Baseline",
     "BoardNotFoundError",
     "BoardNotFoundWarning",
     "BrownConrady",
@@ -69,7 +73,9 @@ __all__ = [
     "CameraDisagreementWarning",
     "CameraMismatchWarning",
     "Cauchy",
+    "CharucoBoard",
     "Chessboard",
+    "CircleGrid",
     "Coplanar",
     "Covariance",
     "CrossValidation",
@@ -100,18 +106,24 @@ __all__ = [
     "Positions",
     "Quantity",
     "Reason",
+    "RigCalibration",
+    "RigCrossValidation",
     "Seen",
     "SoftL1",
     "Status",
+    "Triangulation",
     "VanishingPoints",
     "Views",
     "adjust",
     "back_project",
     "bootstrap",
     "calibrate",
+    "calibrate_rig",
     "cross_validate",
+    "cross_validate_rig",
     "degrees_from_metres",
     "detect",
+    "draw_target",
     "euler_from_rotation",
     "example_views",
     "explain",

@@ -1,6 +1,7 @@
 """Figures, drawn with matplotlib without a display.
 
-The paper's Fig. 7, accuracy over the image, what a calibration saw, and what was measured in a photograph.
+The paper's Fig. 7, accuracy over the image, what a calibration saw, the shape of its target, and what was measured in
+a photograph.
 """
 
 import io
@@ -19,8 +20,10 @@ from matplotlib.patheffects import withStroke
 
 from diffproj._core.arguments import instance, number
 from diffproj.calibration.result import Calibration, as_calibration
+from diffproj.landmarks_figure import landmarks as landmarks
 from diffproj.measurement.accuracy_map import AccuracyMap
 from diffproj.paper.experiment import Experiment
+from diffproj.shape_figure import target_shape as target_shape
 
 EXACT, APPROXIMATED, ERROR = "#8a8f98", "#0b6bcb", "#d6336c"
 HATCH = (1.0, 1.0, 1.0, 0.45)
@@ -252,7 +255,15 @@ def measured(
         >>> [text.get_text() for text in figure.axes[0].texts]
         ['x', 'y', 'z', '200 ± 0.5 mm', 'A', 'B']
     """
-    figure, axes, size = _over_photograph(calibration, photograph)
+    size = calibration.views.size or calibration.camera.size
+    if photograph is not None:
+        size = photograph.shape[1], photograph.shape[0]
+    if size is None:
+        raise ValueError("photograph: want one, for the calibration does not tell the image's size, got none")
+    figure = Figure(figsize=_beside(size, 1), layout="constrained")
+    axes = figure.add_subplot()
+    if photograph is not None:
+        axes.imshow(photograph, cmap="gray", vmin=0, vmax=255)
     used = calibration.used[view].cpu()
     axes.plot(*calibration.views.pixels[view].cpu()[used].T, ".", color=APPROXIMATED, markersize=3)
     _draw_axes(axes, calibration, view)
@@ -290,45 +301,6 @@ def measured(
     return figure
 
 
-def landmarks(
-    calibration: Calibration, view: int, photograph: Shaped[np.ndarray, "h w"] | None = None, title: str = ""
-) -> Figure:
-    """A photograph with its landmarks: crosses where they were seen, circles where the camera sees them.
-
-    Args:
-        calibration: of one camera, found from `Landmarks`; its size is known, or the photograph given.
-        view: the number of the photograph's view.
-        photograph: its grey values; white where there is none.
-        title: over the picture.
-
-    Raises:
-        ValueError: neither a size nor a photograph is known.
-
-    Example:
-        >>> import diffproj as dp
-        >>> views, board = dp.example_views("left")[:1], dp.Landmarks(dp.Chessboard().points)
-        >>> camera = dp.calibrate(dp.example_views("left"), dp.Chessboard()).camera
-        >>> figure = landmarks(dp.locate(views, board, camera), 0, title="left01")
-        >>> [text.get_text() for text in figure.axes[0].texts][:3]
-        ['1', '2', '3']
-    """
-    figure, axes, size = _over_photograph(calibration, photograph)
-    projected, valid = calibration.cameras[view].project(calibration.points)
-    seen, rejected = calibration.views.visible[view].cpu(), calibration.rejected[view].cpu()
-    pixels, projected = calibration.views.pixels[view].cpu(), projected.detach().cpu()
-    axes.plot(*projected[valid.cpu()].T, "o", color=APPROXIMATED, markersize=10, markerfacecolor="none")
-    for mask, colour in ((seen & ~rejected, ERROR), (rejected, REJECTED)):
-        axes.plot(*pixels[mask].T, "+", color=colour, markersize=9, markeredgewidth=1.5, path_effects=OUTLINE)
-    names = calibration.landmarks or tuple(str(number + 1) for number in range(len(pixels)))
-    style = {"textcoords": "offset points", "color": ERROR, "fontsize": 9, "path_effects": OUTLINE}
-    for name, place, shown in zip(names, pixels.tolist(), seen.tolist(), strict=True):
-        if shown:
-            axes.annotate(name, place, (6, 6), parse_math=False, **style)
-    _as_image(axes, size)
-    axes.set_title(title, fontsize=10, parse_math=False)
-    return figure
-
-
 def png(figure: Figure, dpi: int = 150) -> bytes:
     """The figure as the content of a PNG file."""
     return content(figure, "png", dpi)
@@ -339,22 +311,6 @@ def content(figure: Figure, format: str = "png", dpi: int = 150) -> bytes:  # no
     written = io.BytesIO()
     figure.savefig(written, format=format, dpi=dpi)
     return written.getvalue()
-
-
-def _over_photograph(
-    calibration: Calibration, photograph: Shaped[np.ndarray, "h w"] | None
-) -> tuple[Figure, Axes, tuple[int, int]]:
-    """A figure with the photograph in it, its axes and its size."""
-    size = calibration.views.size or calibration.camera.size
-    if photograph is not None:
-        size = photograph.shape[1], photograph.shape[0]
-    if size is None:
-        raise ValueError("photograph: want one, for the calibration does not tell the image's size, got none")
-    figure = Figure(figsize=_beside(size, 1), layout="constrained")
-    axes = figure.add_subplot()
-    if photograph is not None:
-        axes.imshow(photograph, cmap="gray", vmin=0, vmax=255)
-    return figure, axes, size
 
 
 def _draw_axes(axes: Axes, calibration: Calibration, view: int) -> None:

@@ -72,6 +72,8 @@ def inputs(example: dict[str, Any]) -> dict[str, Any]:
     augment = RandomHorizontalFlip(p=1.0)
     augment(image)
     undistorted = dp.Camera(camera.K, camera.R, camera.t, size=camera.size)
+    pair = {"left": example["views"], "right": right}
+    rig = dp.calibrate_rig(pair, example["board"])
     return {
         **{name: example[name] for name in ("torch", "dp", "board", "views", "calibration", "camera", "pixels")},
         **{name: example[name] for name in ("points", "valid")},
@@ -83,6 +85,11 @@ def inputs(example: dict[str, Any]) -> dict[str, Any]:
         "h": 480,
         "corners": torch.stack([calibration.views.pixels, right.pixels]),
         "visible": torch.stack([calibration.views.visible, right.visible]),
+        "left_views": example["views"],
+        "right_views": right,
+        "views_by_camera": pair,
+        "rig": rig,
+        "known": rig,
         "plane": plane,
         "located": dp.locate(example["views"], example["board"], calibration),
         "measured": dp.measure(example["pixels"].detach(), calibration, plane, view=0, pixel_sigma=0.5),

@@ -15,6 +15,7 @@ from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.distinct import alike, described
 from diffproj.calibration.parametrisation import BOW, SKEW, Parametrisation
+from diffproj.calibration.shape import AXES
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
 from diffproj.targets.views import Views
@@ -35,11 +36,12 @@ class Account(Shown):
         camera: Camera
         cameras: Camera
         views: Views
-        points: Tensor
         used: Tensor
         rejected: Tensor
         status: Tensor
         bow: Tensor | None
+        displacements: Tensor | None
+        nominal: Tensor
         causes: tuple[str, ...]
         pixel_sigma: Tensor | None
         degrees_of_freedom: Tensor | None
@@ -59,6 +61,11 @@ class Account(Shown):
 
         @property
         def shared(self) -> Tensor:
+            """See `Calibration`."""
+            ...
+
+        @property
+        def points_deviation(self) -> Tensor:
             """See `Calibration`."""
             ...
 
@@ -143,7 +150,7 @@ class Account(Shown):
         if self.landmarks is not None:
             spare = None if self.degrees_of_freedom is None else float(self.degrees_of_freedom)
             return advice.of_landmarks(int(self.used.any(0).sum()), unsure, self._scatter, spare, self.remarks[0])
-        return advice.verdict(
+        text = advice.verdict(
             advice.Evidence(
                 self.cameras,
                 used,
@@ -156,6 +163,10 @@ class Account(Shown):
                 self.remarks[0],
             )
         )
+        if self.displacements is None:
+            return text
+        off = float(self.displacements.square().sum(-1).mean().sqrt())
+        return f"{text} As printed, the target's points lie {off:.2g} world units (RMS) off their nominal places."
 
     @property
     def _scatter(self) -> float:
@@ -186,6 +197,8 @@ class Account(Shown):
             lines.append(line("skew", (SKEW,), "10.3f", " px"))
         if self.bow is not None:
             lines.append(line("bow along x, y", BOW, "10.4f", " world units"))
+        if self.displacements is not None:
+            lines.append(self._shape())
         lines.append(f"{'RMS':<16}{self.rms.item():10.4f} px over {int(self.used.sum())} corners")
         width = max(map(len, self.views.names), default=0)
         seen, used = self.views.visible.sum(-1).tolist(), self.used.sum(-1).tolist()
@@ -201,7 +214,7 @@ class Account(Shown):
             errors = zip(self.landmarks, self.residuals[0].tolist(), self.used[0].tolist(), strict=True)
             lines += [f"    landmark {name}: {u:+.2f}, {v:+.2f} px" for name, (u, v), counts in errors if counts]
         if self.shares is not None:
-            same = alike(self.points, self.views.pixels.unsqueeze(0), self.used.unsqueeze(0))[0]
+            same = alike(self.nominal, self.views.pixels.unsqueeze(0), self.used.unsqueeze(0))[0]
             lines.append(described(same, self.views.names))
         if self.camera.size is not None and (share := float(border_with_rays(self.camera, self.camera.size))) < 1:
             lines.append(
@@ -209,6 +222,19 @@ class Account(Shown):
             )
         remarks = [*self.remarks[0].split("; "), "" if self.status else self.doubts]
         return "\n".join([*lines, self._ends()[0], *filter(None, remarks), self.verdict])
+
+    def _shape(self) -> str:
+        """How far a target of free points is off its nominal places."""
+        moves = torch.zeros_like(self.nominal) if self.displacements is None else self.displacements
+        spread = self.points_deviation if self.has_covariance else torch.full_like(moves, torch.nan)
+        told = spread.isfinite().all(-1) if self.has_covariance else torch.ones_like(moves[..., 0]) > 0
+        off = moves[told].square().mean(0).sqrt().tolist()
+        texts = [f"{value:10.4f}" for value in off]
+        if self.has_covariance:
+            sure = spread[told].square().mean(0).sqrt().tolist()
+            texts = [f"{text} ± {value:.4f}" for text, value in zip(texts, sure, strict=True)]
+        held = "" if bool(told.all()) else f"; {int((~told).sum())} points are not told by the views"
+        return f"{'points off by':<16}{'  '.join(texts)} world units in x, y, z (RMS){held}"
 
     def _ends(self) -> list[str]:
         """How each camera ended, in a sentence."""
@@ -238,10 +264,13 @@ class Account(Shown):
         if self.pixel_sigma is not None:
             found["pixel_sigma"] = plain(self.pixel_sigma)
         deviations = self.covariance.deviations if self.has_covariance else {}
-        for name, values in zip(self.parameters.names, self.shared.unbind(-1), strict=True):
+        for name, values in zip(self.parameters.few_names, self.shared.unbind(-1), strict=False):
             found[name] = plain(values)
             if name in deviations:
                 found[f"{name}_deviation"] = plain(deviations[name].expand(self.views.batch_shape))
+        if self.displacements is not None:
+            off = self.displacements.square().mean(-2).sqrt()
+            found |= {f"points_{axis}_rms": plain(off[..., i]) for i, axis in enumerate(AXES)}
         return found
 
     def _facts(self) -> list[str]:
@@ -253,6 +282,7 @@ class Account(Shown):
             f"{len(self.views)} views of {self.views.pixels.shape[-2]} corners",
             f"f {number(focal[..., 0])}, {number(focal[..., 1])} px",
             lens,
+            *([] if self.displacements is None else ["free points"]),
             f"RMS {number(self.rms, '.4f')} px",
             " or ".join(sorted(names)),
         ]
@@ -262,7 +292,7 @@ class Account(Shown):
             found = self.to_dict()
             return {name: found[name] for name in ("status", "rms", "f_x", "f_y", "c_x", "c_y")}
         found = self.to_dict()
-        names = self.parameters.names
+        names = self.parameters.few_names
         pairs = [rounded(found[name], found.get(f"{name}_deviation", math.nan)) for name in names]
         values, deviations = zip(*pairs, strict=True)
         return {"parameter": names, "value": values, "standard deviation": deviations}

@@ -6,6 +6,7 @@ A start in closed form is refined by the solver. It works for one camera, views 
 
 from typing import Literal, Unpack
 
+from diffproj.calibration.circle_centres import with_true_centres
 from diffproj.calibration.lens_choice import chosen_lens
 from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.options import CalibrationOptions, calibration_options
@@ -28,6 +29,7 @@ def calibrate(
             than 4 takes no part. Views that show the board alike count as one, and at least two must differ, unless
             `fixed` or `priors` hold the principal point and the lens.
         target: a board such as `Chessboard`, `Landmarks`, or anything with `.points (N, 3)`; its unit is the world's.
+            Of a `CircleGrid`, `Calibration.views` holds where the centres are seen, not their images' middles.
         distortion: which lens to fit: `"none"`, `"brown4"`, `"brown5"`, `"brown8"`, `"brown12"`, `"brown14"` or
             `"fisheye"`. Or `"auto"`, for one camera: all of them but the longest are fitted side by side and compared
             by their errors on corners held out; the simplest that is no worse than the best, as far as the views can
@@ -51,6 +53,10 @@ def calibrate(
     """
     chosen = calibration_options("calibrate", options)
     as_views(views)
-    if isinstance(distortion, str) and distortion == "auto":
-        return chosen_lens(views, target, chosen)
-    return calibrated(views, target, distortion, chosen)
+
+    def fit(views: Views) -> Calibration:
+        if isinstance(distortion, str) and distortion == "auto":
+            return chosen_lens(views, target, chosen)
+        return calibrated(views, target, distortion, chosen)
+
+    return with_true_centres(fit, views, target)

@@ -104,7 +104,7 @@ def _derivatives(found: Fit) -> tuple[Tensor, Tensor, Tensor]:
     if task.loss is not None:
         panel = panel * task.loss.weight(panel[:, :, -1].square().sum(2)).sqrt()[:, :, None, None]
     panel = panel.flatten(-2)
-    s = len(task.names)
+    s = task.parameters.few
     return panel[:, :, :s], panel[:, :, s:-1], panel[:, :, -1:]
 
 

@@ -1,7 +1,7 @@
 """The shared parameters by name: which are fixed, tied or known beforehand.
 
 Names are those of the summary (`f_x f_y c_x c_y k1 k2 p1 p2 k3 ... bow_x bow_y`) or of groups: `focal`,
-`principal_point`, `distortion`, `bow`.
+`principal_point`, `distortion`, `bow`, and for free points `points`, `points_x`, `points_y` and `points_z`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -87,6 +87,49 @@ def make_prior(
         chosen[:, where] = 1.0
         precision = precision * (1 - chosen) + chosen / deviation.square()
     return Prior(torch.where(precision > 0, mean, 0.0), torch.diag_embed(precision))
+
+
+def of_points(name: str) -> tuple[int, ...]:
+    """The axes of the free points' displacements that a group stands for; none if it is one of other parameters."""
+    return {"points": (0, 1, 2), "points_x": (0,), "points_y": (1,), "points_z": (2,)}.get(name, ())
+
+
+def of_camera(priors: Priors | None) -> Priors | None:
+    """The priors but for those of free points."""
+    return priors and {name: value for name, value in priors.items() if not of_points(name)}
+
+
+def printing_precision(priors: Priors | None, batch: Sequence[int], points: Tensor) -> Tensor | None:
+    """The precision `(P, 3 N)` of free points' displacements, in world units; `None` where nothing is known.
+
+    Raises:
+        ValueError: a shape that does not fit, or a deviation that is not positive.
+    """
+    precision, known = points.new_zeros(*batch, *points.shape), False
+    for name, value in (priors or {}).items():
+        axes = list(of_points(name))
+        if not axes:
+            continue
+        if isinstance(value, tuple):
+            raise ValueError(  # noqa: TRY004
+                f"priors: want a standard deviation about the target's own points for {name!r}, got a tuple; where "
+                "they are known better, give them as the target"
+            )
+        deviation = tensor_of(f"priors[{name!r}]", value)
+        if deviation.is_complex() or deviation.is_meta:
+            raise TypeError(f"priors: want real numbers for {name!r}, got {deviation.dtype} on {deviation.device}")
+        if not bool((deviation > 0).all()):
+            raise ValueError(f"priors: want a positive standard deviation for {name!r}, got {value}")
+        want = (*batch, len(points), len(axes)) if len(axes) > 1 else (*batch, len(points))
+        try:
+            deviation = deviation.detach().to(points).expand(want)
+        except RuntimeError:
+            got = tuple(deviation.shape)
+            raise ValueError(f"priors: want {name!r} to broadcast to {want}, got {got}") from None
+        own = deviation.unsqueeze(-1) if len(axes) == 1 else deviation
+        precision[..., axes] = own.square().reciprocal()
+        known = True
+    return precision.reshape(-1, points.numel()) if known else None
 
 
 def _written(into: Tensor, where: list[int], value: Any, name: str, batch: Sequence[int]) -> Tensor:

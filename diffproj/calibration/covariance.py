@@ -33,6 +33,7 @@ from diffproj._core.copying import Copied
 from diffproj._core.numerics import broadcast_batches
 from diffproj._core.shown import Shown, counted, number
 from diffproj.calibration.fields import mask, tensor
+from diffproj.calibration.shape import names_of
 from diffproj.calibration.solver import Equations
 
 SINGULAR = 2e-15
@@ -48,7 +49,7 @@ class Covariance(Copied, Shown):
     nearly cancel; `about_middle` has poses that turn about the target instead.
 
     Attributes:
-        names: of the s shared parameters: `f_x f_y c_x c_y`, then those of the lens and of the bow.
+        names: of the s shared parameters: `f_x f_y c_x c_y`, then those of the lens and of the target's shape.
         shared: their covariance `(*B, s, s)`; rows of fixed parameters are 0.
         undetermined: which shared parameters the corners do not determine `(*B, s)`.
         undetermined_views: which poses they do not determine `(*B, V)`.
@@ -79,6 +80,15 @@ class Covariance(Copied, Shown):
         """The standard deviation of each shared parameter, by name."""
         spread = self.shared.diagonal(dim1=-2, dim2=-1).sqrt()
         return dict(zip(self.names, spread.unbind(-1), strict=True))
+
+    @property
+    def points(self) -> Float[Tensor, "*batch coordinates coordinates"]:
+        """That of the coordinates of all points of a target whose points were free, x y z of each in turn `(3 N, 3 N)`.
+
+        Empty where their places were known.
+        """
+        first = next((place for place, name in enumerate(self.names) if name == names_of(1)[0]), len(self.names))
+        return self.shared[..., first:, first:]
 
     def _facts(self) -> list[str]:
         return [
@@ -266,6 +276,9 @@ def covariance(
     scores: Scores | None = None,
     dispersion: Tensor | None = None,
     shares: Tensor | None = None,
+    frame: Tensor | None = None,
+    printed: Tensor | None = None,
+    unseen: Tensor | None = None,
 ) -> Covariance:
     """The covariance of P calibrations, from their normal equations.
 
@@ -278,25 +291,29 @@ def covariance(
         scores: covariance of the scores, for the sandwich form.
         dispersion: factor on the covariance of the scores `(P,)`; 1 if left out.
         shares: how much each view counts `(P, V)`; 1 if left out. U holds them, the blocks of the views do not.
+        frame: that part of U which is no measurement but a choice, of the frame of free points `(P, s, s)`.
+        printed: that part of U which says how well the target was printed, in the unit of the weights `(P, s, s)`.
+        unseen: shared parameters that nothing tells `(P, s)`, held by the frame.
     """
     dispersion = torch.ones_like(equations.U[:, 0, 0]) if dispersion is None else dispersion
     phi = dispersion[:, None, None]
-    U, E, W = equations.U, equations.E, equations.W
+    S, F, inverse_W, unknown_views = reduced(equations, basis, shares)
+    size = equations.U.diagonal(dim1=-2, dim2=-1)
     if basis is not None:
         T = basis.mT
-        U, E = T @ U @ basis, T.unsqueeze(1) @ E
-        precision = None if precision is None else T @ precision @ basis
+        size = (T @ equations.U @ basis).diagonal(dim1=-2, dim2=-1)
+        precision, frame = (None if part is None else T @ part @ basis for part in (precision, frame))
+        printed = None if printed is None else T @ printed @ basis
         if scores is not None:
             scores = Scores(T.unsqueeze(1) @ scores.U @ basis.unsqueeze(1), T.unsqueeze(1) @ scores.E, scores.W)
-    inverse_W, unknown_views = local_inverse(W)
-    F = E @ inverse_W  # (P, V, q, 6)
-    share = torch.ones_like(E[..., :1, :1]) if shares is None else shares[..., None, None]
-    S = U - (share * (F @ E.mT)).sum(1)
-    inverse_S, unknown = _inverse(S, U.diagonal(dim1=-2, dim2=-1))
+    share = torch.ones_like(F[..., :1, :1]) if shares is None else shares[..., None, None]
+    inverse_S, unknown = _inverse(S, size)
     prior = torch.zeros_like(S) if precision is None else precision
     if scores is None:
         v = variance[:, None, None] * phi
         middle = v * (S - prior) + prior
+        if frame is not None and printed is not None:
+            middle = middle - v * (frame + printed) + variance[:, None, None] * printed
         mixed = torch.zeros_like(F.mT)
         alone = v.unsqueeze(1) * inverse_W
     else:
@@ -312,10 +329,27 @@ def covariance(
         follow = inverse_W @ equations.E.mT
         shared, mixed = basis @ shared @ basis.mT, mixed @ basis.mT.unsqueeze(1)
         unknown = (basis.abs() @ unknown.to(basis).unsqueeze(-1)).squeeze(-1) > 0
+        unseen = None if unseen is None else unseen & (basis != 0).any(-1)
+    unknown = unknown if unseen is None else unknown | unseen
     shared = (shared + shared.mT) / 2
     shared = torch.where(unknown.unsqueeze(-1) | unknown.unsqueeze(-2), 0.0, shared)
     shared = shared + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(shared))
     return Covariance(tuple(names), shared, unknown, unknown_views, dispersion, follow, mixed, (alone + alone.mT) / 2)
+
+
+def reduced(equations: Equations, basis: Tensor | None, shares: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The normal matrix S of the free shared parameters `(P, q, q)` with all poses eliminated.
+
+    With it F `(P, V, q, 6)`, the inverses of the poses' blocks, and which of these are singular.
+    """
+    U, E, W = equations.U, equations.E, equations.W
+    if basis is not None:
+        U, E = basis.mT @ U @ basis, basis.mT.unsqueeze(1) @ E
+    inverse_W, unknown_views = local_inverse(W)
+    F = E @ inverse_W
+    counted = F if shares is None else F * shares[..., None, None]
+    S = U - counted.movedim(1, 2).flatten(2) @ E.movedim(1, 2).flatten(2).mT
+    return S, F, inverse_W, unknown_views
 
 
 def reshaped(covariance: Covariance, batch: Sequence[int]) -> Covariance:

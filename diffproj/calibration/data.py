@@ -96,7 +96,7 @@ class Data:
         """How much each view counts in what all views share `(P, V)`; `None` where all count fully."""
         return shares(self.points, self.pixels, self.used)
 
-    def check_options(self, objective: str, bow: bool) -> None:
+    def check_options(self, objective: str, bow: bool, shape: str) -> None:
         """Check what a target can be asked for in `calibrate` and `refine`.
 
         Raises:
@@ -110,6 +110,10 @@ class Data:
             )
         if bow and not level:
             raise ValueError("bow: want False for points that are not all on z = 0; a bow is that of a flat board")
+        if shape == "free" and not level:
+            raise ValueError(
+                "shape: want 'flat' for points that are not all on z = 0, got 'free'; give Landmarks a sigma instead"
+            )
         if self.spread is None:
             return
         if objective == "plane":

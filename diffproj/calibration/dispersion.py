@@ -15,20 +15,32 @@ the variances of the parameters are too small if not. What it exceeds 1 by is ta
 of chance, and shrunk where it does not; and it counts more where few views tell it, for it is an average over all
 directions of the parameters, of which one may be far worse: on random subsets of real sets of views, errors then are
 what they are said to be.
+
+Where the points of the target are free they follow what the views want, and these pull less. What is compared then is
+how far each view moves the focal lengths and the principal point, to first order, with how far it would if corners
+erred independently: with w_v the derivative of such a parameter by the residuals r_v of a view, and M_v what the fit of
+everything leaves of independent errors there,
+
+    phi = mean over the parameters of  sum (w_v^T r_v)^2 / (s^2 sum w_v^T M_v w_v)
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from diffproj.calibration.covariance import local_inverse
+from diffproj.calibration.covariance import local_inverse, reduced
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.losses import slope_and_bend
+from diffproj.calibration.parametrisation import INTRINSICS
+from diffproj.calibration.shape import by_displacement
 from diffproj.calibration.task import Task
 
 FEW_VIEWS = 2.5
 """The excess counts `1 + FEW_VIEWS / (views - 1)` fold."""
+FEW_VIEWS_OF_A_SHAPE = 6.0
+"""The same where the target's points are free: what these take from few views is not seen in their residuals."""
 BELIEF = 4.0
 """Degrees of freedom below which phi counts little: what one or two of them say is mostly chance."""
 SINGULAR = 1e-9
@@ -45,19 +57,35 @@ def dispersion(found: Fit) -> Tensor:
     free = shared.shape[-1] if task.basis is None else task.basis.shape[-1]
     if free == 0 or task.used.shape[1] < 2:
         return torch.ones_like(shared[:, 0])
+    few_views = FEW_VIEWS if not task.free else FEW_VIEWS_OF_A_SHAPE
     with torch.inference_mode():
-        phi, spare, views = _between_over_within(task, shared, local, found.degrees_of_freedom())
-        excess = (phi - 1).clamp(min=0) * spare.square() / (spare.square() + BELIEF**2)
-        excess = excess.pow(3) / (excess.square() + 2 / spare)  # 2 / spare: phi's own variance for independent corners
-        factor = 1 + excess * (1 + FEW_VIEWS / (views - 1).clamp(min=1))
-        factor = torch.where((spare >= 1) & factor.isfinite(), factor, 1.0)
+        if task.free:
+            contradicting = _moved_intrinsics(found, shared, local)
+        else:
+            contradicting = _between_over_within(task, shared, local, found.degrees_of_freedom())
+        factor = believed(contradicting, few_views)
     return factor.clone()
 
 
-def _between_over_within(
-    task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Phi `(P,)`, its degrees of freedom, and how many views say something; `redundant (P,)` are those of the fit."""
+class Contradiction(NamedTuple):
+    """How much views contradict each other: phi `(P,)`, its degrees of freedom, and how many views say something."""
+
+    phi: Tensor
+    spare: Tensor
+    views: Tensor
+
+
+def believed(found: Contradiction, few_views: float = FEW_VIEWS) -> Tensor:
+    """The factor on the covariance that phi is taken for; larger where there are few views."""
+    phi, spare, views = found
+    excess = (phi - 1).clamp(min=0) * spare.square() / (spare.square() + BELIEF**2)
+    excess = excess.pow(3) / (excess.square() + 2 / spare)  # 2 / spare: phi's own variance for independent corners
+    factor = 1 + excess * (1 + few_views / (views - 1).clamp(min=1))
+    return torch.where((spare >= 1) & factor.isfinite(), factor, 1.0)
+
+
+def _between_over_within(task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor) -> Contradiction:
+    """How much the views contradict each other; `redundant (P,)` are the degrees of freedom of the fit."""
     rows, residual, pull_weight, variance = _weighted(task, shared, local, redundant)
     s = shared.shape[-1]
     if task.basis is not None:
@@ -88,6 +116,21 @@ def _between_over_within(
         Q, off = task.prior.precision, (task.prior.precision @ (shared - task.prior.mean).unsqueeze(-1)).squeeze(-1)
         T = torch.eye(len(Q[0]), dtype=Q.dtype, device=Q.device) if task.basis is None else task.basis
         total, pull = total + T.mT @ Q @ T, pull + (T.mT @ off.unsqueeze(-1)).squeeze(-1)
+    return contradiction(u, S, K, share, total, pull)
+
+
+def contradiction(u: Tensor, S: Tensor, K: Tensor, share: Tensor, total: Tensor, pull: Tensor) -> Contradiction:
+    """How much views contradict each other, whose poses are eliminated.
+
+    Args:
+        u: their pulls `(P, V, q)`.
+        S: their part of the normal matrix `(P, V, q, q)`.
+        K: the covariance of their pulls if corners err independently `(P, V, q, q)`.
+        share: how much each counts `(P, V)`.
+        total: the normal matrix `(P, q, q)`, with a prior's.
+        pull: the sum of the pulls `(P, q)`, with a prior's.
+    """
+    data = (share[..., None, None] * S).sum(1)
     inverse = torch.linalg.pinv(total, hermitian=True)
     u = u - (S @ (inverse @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
     spent = (inverse * data.mT).sum((-2, -1))
@@ -99,7 +142,50 @@ def _between_over_within(
     squares = torch.where(told, along.square() / torch.where(told, values, 1.0), 0.0).sum(-1)
     squares, told = (share * squares).sum(-1), share.unsqueeze(-1) * told
     spare = (told.sum((-2, -1)) - spent).clamp(min=1e-9)
-    return squares / spare, spare, told.amax(-1).sum(-1)
+    return Contradiction(squares / spare, spare, told.amax(-1).sum(-1))
+
+
+def _moved_intrinsics(found: Fit, shared: Tensor, local: tuple[Tensor, ...]) -> Contradiction:
+    """Phi `(P,)` where points are free, its degrees of freedom, and how many views say something."""
+    task, few = found.task, found.task.parameters.few
+    share = torch.ones_like(local[1][..., 0]) if task.shares is None else task.shares
+    rows, residual, slope, variance = _weighted(task, shared, local, found.degrees_of_freedom())
+    weight = torch.ones_like(slope) if task.weights is None else task.weights
+    inverse_weight = torch.where(weight > 0, 1 / torch.where(weight > 0, weight, 1.0), 0.0)
+    level = (variance * inverse_weight).amax((1, 2))
+    root = weight.sqrt()[:, :, None]
+    residual, rows = residual * (slope * inverse_weight).unsqueeze(2) * root, rows * root.unsqueeze(3)
+    by_point = by_displacement(rows[:, :, -3:], local[0])
+    # How a parameter follows each residual: a row of the inverse of the normal matrix, times the derivatives.
+    S = reduced(found.solution.equations, task.basis, task.shares)[0].detach()
+    basis = task.basis
+    columns = torch.eye(shared.shape[-1], dtype=S.dtype, device=S.device)[:, : len(INTRINSICS)].expand(len(S), -1, -1)
+    columns = columns if basis is None else basis.mT @ columns
+    scale = S.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt().unsqueeze(-1)
+    inverse = torch.linalg.pinv((S * scale * scale.mT).nan_to_num(0.0, 0.0, 0.0), hermitian=True) * scale * scale.mT
+    follow = inverse @ columns
+    follow = follow if basis is None else basis @ follow  # (P, s, 4)
+    moves = follow[:, few:].unflatten(1, (-1, 3))
+    w = torch.einsum("psi,pvskn->pvikn", follow[:, :few], rows[:, :, :few])
+    w = w + torch.einsum("pnji,pvjkn->pvikn", moves, by_point)
+    pose = rows[:, :, few:].flatten(-2)
+    inverse_W = local_inverse(pose @ pose.mT)[0]
+    flat = w.flatten(-2)
+    flat = flat - flat @ pose.mT @ inverse_W @ pose
+    w = flat.unflatten(-1, w.shape[-2:])
+    pull = (flat @ residual.flatten(-2).unsqueeze(-1)).squeeze(-1)
+    told = torch.einsum("pvikn,pvskn->pvis", w, rows[:, :, :few])
+    told = torch.cat([told, torch.einsum("pvikn,pvjkn->pvinj", w, by_point).flatten(-2)], dim=-1)
+    told = told if basis is None else told @ basis.unsqueeze(1)
+    expected = flat.square().sum(-1) - ((told @ inverse.unsqueeze(1)) * told).sum(-1)
+    squares = (share.unsqueeze(-1) * pull.square()).sum(1)
+    expected = level.unsqueeze(-1) * (share.unsqueeze(-1) * expected.clamp(min=0)).sum(1)
+    free = (follow[:, : len(INTRINSICS)].diagonal(dim1=-2, dim2=-1) > 0) & (expected > 0)
+    ratio = torch.where(free, squares / torch.where(free, expected, 1.0), 0.0)
+    views = task.used.any(-1).sum(-1)
+    phi = ratio.sum(-1) / free.sum(-1).clamp(min=1)
+    counted = (share * task.used.any(-1)).sum(-1)
+    return Contradiction(phi, torch.where(free.any(-1), 2 * (counted - 1), 0.0), views)
 
 
 def _weighted(

@@ -5,6 +5,7 @@ Everything here works on a batch of P cameras, with batch axes flattened. `Task`
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -70,6 +71,9 @@ class Fit:
         if self.task.prior is not None:
             off = self.solution.shared.detach() - self.task.prior.mean
             cost = cost - (off.unsqueeze(-2) @ self.task.prior.precision @ off.unsqueeze(-1)).flatten() / 2
+        if self.task.restraint is not None:
+            moves = self.displacements().flatten(1)
+            cost = cost - (self.task.restraint.printed * moves.square()).sum(-1) / 2
         spare = self.degrees_of_freedom()
         return torch.where(spare > 0, 2 * cost / spare, torch.nan)
 
@@ -100,7 +104,29 @@ class Fit:
         used = self.task.used
         shared = self.task.names if self.task.basis is None else range(self.task.basis.shape[-1])
         spare = 2 * used.sum(-1) - POSE * used.any(-1)
-        return (spare if self.task.shares is None else spare * self.task.shares).sum(-1) - len(shared)
+        spare = (spare if self.task.shares is None else spare * self.task.shares).sum(-1) - len(shared)
+        return spare if self.task.restraint is None else spare + self.restrained
+
+    def displacements(self) -> Tensor:
+        """How far free points are from their nominal places `(P, N, 3)`."""
+        return self.solution.shared.detach()[:, self.task.parameters.few :].unflatten(-1, (-1, 3))
+
+    @cached_property
+    def restrained(self) -> Tensor:
+        """How many of the free points' coordinates the frame and the prior tell, and not the corners `(P,)`.
+
+        Of a coordinate that both tell, the part that the prior does: the trace of its precision over all precision.
+        """
+        few, basis, restraint = self.task.parameters.few, self.task.basis, self.task.restraint
+        S = covariances.reduced(self.solution.equations, basis, self.task.shares)[0]
+        if restraint is None:
+            return torch.zeros_like(S[:, 0, 0])
+        told = torch.nn.functional.pad(restraint.precision, (few, 0, few, 0))
+        told = told if basis is None else basis.mT @ told @ basis
+        scale = S.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt().unsqueeze(-1)
+        L, failed = torch.linalg.cholesky_ex(S * scale * scale.mT)
+        part = torch.cholesky_solve(told * scale * scale.mT, L).diagonal(dim1=-2, dim2=-1).sum(-1)
+        return torch.where(failed == 0, part, 0.0)
 
     def plain_covariance(self) -> Covariance:
         """The covariance for least squares, whatever the loss and the objective: what verdicts go by."""
@@ -111,7 +137,18 @@ class Fit:
             basis=self.task.basis,
             precision=self.measured_precision(),
             shares=self.task.shares,
+            **self.frame(),
         )
+
+    def frame(self) -> dict[str, Any]:
+        """What `covariance` is to know of free points: what fixes their frame, and which of them nothing tells."""
+        if self.task.restraint is None:
+            return {}
+        few = self.task.parameters.few
+        unknown = torch.nn.functional.pad(self.task.restraint.unknown, (few, 0))
+        parts = {"frame": self.task.restraint.frame, "printed": torch.diag_embed(self.task.restraint.printed)}
+        wide = {name: torch.nn.functional.pad(part, (few, 0, few, 0)) for name, part in parts.items()}
+        return {**wide, "unseen": unknown}
 
     def measured_precision(self) -> Tensor | None:
         """That part of the prior's precision which stands for a measurement `(P, s, s)`; the rest only restrains."""

@@ -10,6 +10,8 @@ from diffproj.calibration.losses import Loss
 from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.options import Options
 from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.geometry.back_projection import back_project
+from diffproj.geometry.plane import Plane
 from diffproj.lens.models import LensModel
 from diffproj.targets.residuals import nearest_minus_known, projected_minus_seen, put_back_minus_known
 from diffproj.targets.target import Target
@@ -69,7 +71,7 @@ def without_views(
     errors = []
     posing: dict[str, Any] = {"loss": chosen.loss if chosen.objective == "image" else None, "throw": False}
     for hidden in (second, ~second):
-        located = located_without_warning(held_out.hiding(hidden), target, fits.camera, **posing)
+        located = located_without_warning(held_out.hiding(hidden), target, fits.camera, fits, **posing)
         if bool((located.covariance.undetermined_views & located.used.any(-1)).any()):
             raise CalibrationError(f"{who}: a view that was held out has no pose: {located.message}", located)
         posed = located.used.any(-1, keepdim=True)
@@ -90,11 +92,17 @@ def without_corners(
 
 def errors_of(calibration: Calibration, pixels: Tensor, evaluated: Tensor, measure: Loss | None = None) -> Errors:
     """The errors of a calibration on corners `(k, V, N)` of its views, where `pixels` were seen."""
-    cameras, pixels = calibration.cameras, pixels.to(calibration.points)
-    px, seen = projected_minus_seen(cameras, calibration.board_points.unsqueeze(-3), pixels, evaluated)
-    level = bool((calibration.points[:, 2] == 0).all())
-    in_space = put_back_minus_known if level else nearest_minus_known
-    world, landed = in_space(cameras, calibration.points, pixels, evaluated)
+    cameras, pixels = calibration.cameras, pixels.to(calibration.nominal)
+    points = calibration.board_points.unsqueeze(-3)
+    px, seen = projected_minus_seen(cameras, points, pixels, evaluated)
+    if calibration.shape != "flat":  # each corner on a plane through its own place
+        put_back, valid = back_project(pixels, cameras, Plane.per_point([0.0, 0.0, 1.0], points[..., 2]))
+        landed = valid & evaluated
+        world = torch.where(landed.unsqueeze(-1), put_back - points, 0.0)
+    else:
+        level = bool((calibration.nominal[:, 2] == 0).all())
+        in_space = put_back_minus_known if level else nearest_minus_known
+        world, landed = in_space(cameras, points, pixels, evaluated)
     squared = px.square().sum(-1)
     in_px = torch.where(evaluated & ~seen, torch.inf, squared if measure is None else measure.value(squared)).sum(-1)
     in_world = torch.where(evaluated & ~landed, torch.inf, world.square().sum(-1)).sum(-1)

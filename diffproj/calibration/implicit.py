@@ -32,17 +32,25 @@ def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
     weights = None if data.given_weights is None else data.given_weights.reshape(task.used.shape)
     with torch.enable_grad():
         # Each view has its own copy of the shared parameters: one backward pass gives a row of every view's block.
-        theta = solution.shared.new_zeros(P, V, s + POSE, requires_grad=True)
-        cost = _costs(task, solution.shared.unsqueeze(1) + theta[..., :s], theta[..., s:], pixels, data, weights, found)
-        gradient = torch.autograd.grad(cost.sum(), theta, create_graph=True)[0]
-        H = torch.stack(
-            [torch.autograd.grad(gradient[..., i].sum(), theta, retain_graph=True)[0] for i in range(s + POSE)], dim=-2
-        ).detach()
+        few, count = task.parameters.few, task.parameters.points
+        theta = solution.shared.new_zeros(P, V, few + POSE, requires_grad=True)
+        moves = solution.shared.new_zeros(P, V, count, 3, requires_grad=True)
+        shared = solution.shared.unsqueeze(1) + torch.cat([theta[..., :few], moves.flatten(2)], dim=-1)
+        cost = _costs(task, shared, theta[..., few:], pixels, data, weights, found)
+        gradient, pulls = torch.autograd.grad(
+            cost.sum(), (theta, moves), create_graph=True, allow_unused=True, materialize_grads=True
+        )
+        H, own = _second(gradient, pulls, theta, moves)
         share = torch.ones_like(H[..., :1, :1]) if task.shares is None else task.shares[..., None, None]
+        gradient = torch.cat([gradient[..., :few], pulls.flatten(2), gradient[..., few:]], dim=-1)
         U, g = (share * H[..., :s, :s]).sum(1), (share.squeeze(-1) * gradient[..., :s]).sum(1)
+        U[:, few:, few:] = _block_diagonal((share.unsqueeze(-1) * own).sum(1))
         if prior is not None:
             U = U + prior.precision.detach()
             g = g + (prior.precision @ (solution.shared - prior.mean).unsqueeze(-1)).squeeze(-1)
+        if task.restraint is not None:
+            U = U + torch.nn.functional.pad(task.restraint.precision, (few, 0, few, 0))
+            g = g + torch.nn.functional.pad(_restraining(task, data.given_points - data.middle, found), (few, 0))
         E, W, h = H[..., :s, s:], H[..., s:, s:], gradient[..., s:]
         if task.basis is not None:
             T = task.basis.mT
@@ -61,6 +69,49 @@ def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
     return Fit(task, solution._replace(shared=shared, local=local), found.rejected)
 
 
+def _second(gradient: Tensor, pulls: Tensor, theta: Tensor, moves: Tensor) -> tuple[Tensor, Tensor]:
+    """Second derivatives of each view's cost, from the first by `theta (P, V, few + 6)` and `moves (P, V, N, 3)`.
+
+    Returns:
+        `(P, V, s + 6, s + 6)`, displacements between the few shared parameters and the pose, without the block of the
+        displacements themselves; and that, `(P, V, N, 3, 3)`, for no two points share a residual.
+    """
+
+    def rows(of: Tensor) -> tuple[Tensor, Tensor]:
+        parts = [
+            torch.autograd.grad(
+                of[..., i].sum(), (theta, moves), retain_graph=True, allow_unused=True, materialize_grads=True
+            )
+            for i in range(of.shape[-1])
+        ]
+        return torch.stack([by_theta for by_theta, _ in parts], dim=-2), torch.stack([by for _, by in parts], dim=2)
+
+    H, cross = (part.detach() for part in rows(gradient))
+    cross, few = cross.flatten(3), theta.shape[-1] - POSE  # (P, V, few + 6, 3 N)
+    nothing = cross.new_zeros(*cross.shape[:2], cross.shape[-1], cross.shape[-1])
+    upper = torch.cat([H[..., :few, :few], cross[..., :few, :], H[..., :few, few:]], dim=-1)
+    middle = torch.cat([cross[..., :few, :].mT, nothing, cross[..., few:, :].mT], dim=-1)
+    lower = torch.cat([H[..., few:, :few], cross[..., few:, :], H[..., few:, few:]], dim=-1)
+    own = rows(pulls)[1].detach().movedim(2, 3) if moves.numel() else moves.detach().unsqueeze(-1)
+    return torch.cat([upper, middle, lower], dim=-2), own
+
+
+def _block_diagonal(blocks: Tensor) -> Tensor:
+    """A matrix `(P, 3 N, 3 N)` of the blocks `(P, N, 3, 3)`; of none, an empty one."""
+    P, N = blocks.shape[:2]
+    whole = blocks.new_zeros(P, N, 3, N, 3)
+    number = torch.arange(N, device=blocks.device)
+    whole[:, number, :, number] = blocks.movedim(0, 1) if N else whole[:, number, :, number]
+    return whole.flatten(3).flatten(1, 2)
+
+
+def _restraining(task: Task, points: Tensor, found: Fit) -> Tensor:
+    """The gradient `(P, 3 N)` of what restrains free points, whose frame follows the target's points `(N, 3)`."""
+    held = task.restraint_at(points)
+    moves = found.displacements().flatten(1)
+    return (held.frame @ moves.unsqueeze(-1)).squeeze(-1) + held.printed * moves
+
+
 def _gradient_only(step: Tensor) -> Tensor:
     """Zero, with the derivative of the step: the solver's minimum keeps its value to the bit."""
     return step - step.detach()
@@ -74,7 +125,10 @@ def _costs(
     local = tuple(z.unsqueeze(1) for z in moved(found.solution.local, step))
     cameras = task.parameters.unpack(flat, tuple(z.flatten(0, 2).unsqueeze(1) for z in local))
     centred = data.frame.own(data.given_points)
-    points = bowed(centred, flat[:, None, -2:]) if task.bow else centred.expand(len(flat), 1, -1, 3)
+    few = task.parameters.few
+    points = bowed(centred, flat[:, None, few - 2 : few]) if task.bow else centred.expand(len(flat), 1, -1, 3)
+    if task.free:
+        points = points + flat[:, few:].unflatten(-1, (1, -1, 3))
     seen = torch.where(task.used.unsqueeze(-1), pixels, 0.0).flatten(0, 1).unsqueeze(1)
     error = put_back_minus_known if task.objective == "plane" else projected_minus_seen
     residual, _ = error(cameras, points, seen, task.used.flatten(0, 1).unsqueeze(1))

@@ -93,7 +93,8 @@ class _Scores:
         task, solution = replace(found.task.part(which), objective="image"), found.solution
         self.task = task
         shared, poses = solution.shared.detach()[which], tuple(z.detach()[which] for z in solution.local)
-        panel = task.problem.linearise(shared, poses)
+        problem = task.problem
+        panel = problem.every_row(problem.linearise(shared, poses), poses)
         squared = panel[:, :, -1].square().sum(2)
         weight = task.used.to(squared) if task.weights is None else torch.where(task.used, task.weights, 0.0)
         if task.loss is not None:
@@ -106,6 +107,8 @@ class _Scores:
         if task.basis is not None:
             self.shared = torch.einsum("psq,pvskn->pvqkn", task.basis, self.shared)
         self.count = 2 * task.used.sum((1, 2)) - self.shared.shape[2] - POSE * task.used.any(-1).sum(-1)
+        if task.restraint is not None:
+            self.count = self.count + found.restrained[which]
         # Fields are those of the projected corners: of the seen ones they would know the noise.
         cameras = task.parameters.unpack(shared, poses)
         seen, valid = cameras.project(task.points)
@@ -114,6 +117,8 @@ class _Scores:
 
     def leftover(self, shape_deviations: float) -> Leftover:
         explained, points, moves = self._moved_points()
+        if self.task.free:  # they are where the residuals want them
+            explained, points, moves = explained * 0, points * 0, moves * 0
         shape = effect(explained, points, _total(self.residual), self.count)
         rest = self.residual - torch.einsum("pvikn,pni->pvkn", self.by_point, moves)
         rings = self._radial()
@@ -169,8 +174,9 @@ class _Scores:
         unused = ~self.task.used.any(-1)[..., None, None] * torch.eye(POSE, dtype=W.dtype, device=W.device)
         F = torch.linalg.solve_ex((W + unused).mT, E.mT)[0].mT
         S, g = U - (F @ E.mT).sum(1), g - (F @ h).sum(1)
-        if self.task.prior is not None:
-            precision = self.task.prior.precision
+        prior = self.task.whole_prior
+        if prior is not None:
+            precision = prior.whole
             if self.task.basis is not None:
                 precision = self.task.basis.mT @ precision @ self.task.basis
             S = S + torch.nn.functional.pad(precision, (0, k - first, 0, k - first))

@@ -16,6 +16,7 @@ from torch import Tensor
 from diffproj._core.arguments import tensor_of
 from diffproj.calibration.adequacy import LENS_WORDS
 from diffproj.calibration.comparison import LensComparison
+from diffproj.calibration.constraints import of_points
 from diffproj.calibration.held_out import Errors, folds_of, without_corners, without_views
 from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.options import Options
@@ -64,7 +65,7 @@ def chosen_lens(views: Views, target: Target, chosen: Options) -> Calibration:
     if "distortion" in chosen.fixed:
         raise ValueError("distortion: want the name of a lens that is held by fixed=('distortion',), got 'auto'")
     _check_names(chosen)
-    by_views = len(views) >= MANY_VIEWS and not chosen.bow
+    by_views = len(views) >= MANY_VIEWS
     fits = _fits(views, target, COMMON, chosen)
     candidates = _compared(views, target, fits, chosen, by_views)
     if by_views and not any(_judged(c) for c in candidates):
@@ -187,7 +188,7 @@ def _comparison(candidates: list[_Candidate], taken: _Candidate, by_views: bool)
 
 
 def _known(name: str, model: LensModel) -> bool:
-    return name in (
+    return bool(of_points(name)) or name in (
         "focal",
         "principal_point",
         "distortion",

@@ -2,27 +2,35 @@
 
 import warnings
 from dataclasses import replace
-from typing import Unpack
+from typing import Any, Unpack
 
 import torch
 from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
 
+from diffproj._core.arguments import flag
 from diffproj._core.warn import warn_caller
 from diffproj.calibration import start
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning
+from diffproj.calibration.circle_centres import with_true_centres
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.mismatch import CameraMismatchWarning, described
 from diffproj.calibration.options import LocateOptions, locate_options
 from diffproj.calibration.outcome import outcome
+from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.second_look import lower_fit
-from diffproj.calibration.solver import Solution, Status
+from diffproj.calibration.solver import Equations, Solution, Status, equations_at
 from diffproj.geometry.camera import Camera, as_camera
-from diffproj.targets.chessboard import Chessboard, origin_doubt
+from diffproj.targets.boards import origin_doubt
+from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
+SAME = 1e-9
+"""Part of the target's size by which the points of two may differ and still be one target's."""
 REMEDY = (
     "see alternatives and likelihood_ratio. A target that is larger in the image, more tilted, or with more corners "
     "tells them apart; a calibration in place of a camera brings the noise along, which few corners do not tell"
@@ -31,7 +39,12 @@ REMEDY = (
 
 
 def locate(
-    views: Views, target: Target, camera: Camera | PinholeCamera | Calibration, **options: Unpack[LocateOptions]
+    views: Views,
+    target: Target,
+    camera: Camera | PinholeCamera | Calibration,
+    *,
+    same_target: bool = True,
+    **options: Unpack[LocateOptions],
 ) -> Calibration:
     """Find the pose of each view with intrinsics and lens held, from at least 4 corners a view.
 
@@ -42,14 +55,18 @@ def locate(
     says so.
     With a calibration in the place of a camera a `CameraMismatchWarning` names the views whose corners are not where it
     sees them, as photographs of another camera, zoom or focus: see `mismatch`.
-    The board is taken to be flat, also where a calibration found a bow. `Landmarks` may lie anywhere; where they come
-    with a sigma of their own, each view's pose carries it, as if other views had other landmarks.
+    A calibration that fitted the target's shape brings that along, too, for the same target. `Landmarks` may lie
+    anywhere; where they come with a sigma of their own, each view's pose carries it, as if other views had other
+    landmarks.
 
     Args:
         views: corners `(*B, V, N, 2)`.
         target: a board, `Landmarks`, or anything with `.points (N, 3)`.
         camera: batch shape broadcasting to `*B`; its own pose does not matter. A calibration brings its uncertainty
             along, and the noise of its corners, which few corners do not tell.
+        same_target: whether the views show the very target whose shape the calibration fitted, if it did and `target`
+            has the same points: its corners then are where the calibration has them, as surely as it knows. Say False
+            for another print of it.
         options: `weights`, `pixel_sigma`, `loss`, `reject_outliers`, `max_iterations`, `tolerance`, `progress` and
             `throw`: see `LocateOptions`.
 
@@ -71,8 +88,9 @@ def locate(
         >>> print(f"{dp.locate(views[8:], board, camera).rms:.2f}")
         0.16
     """
-    found = located(views, target, camera, **options)
-    if isinstance(target, Chessboard) and target.turns > 1:
+    shaped = camera if flag("same_target", same_target) else None
+    found = with_true_centres(lambda moved: located(moved, target, camera, shaped, **options), views, target)
+    if isinstance(target, Chessboard | CircleGrid) and target.turns > 1:
         warn_caller(f"locate: {origin_doubt(target)}")
     if bool(found.ambiguous.any()):
         warnings.warn(f"locate: {found.ambiguity}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
@@ -82,9 +100,13 @@ def locate(
 
 
 def located(
-    views: Views, target: Target, camera: Camera | PinholeCamera | Calibration, **options: Unpack[LocateOptions]
+    views: Views,
+    target: Target,
+    camera: Camera | PinholeCamera | Calibration,
+    shaped: object = None,
+    **options: Unpack[LocateOptions],
 ) -> Calibration:
-    """The same without a warning."""
+    """The same without a warning; `shaped` may be a calibration that fitted the shape of this target."""
     if isinstance(views, Camera | PinholeCamera | Calibration):
         raise TypeError("locate: want (views, target, camera) in this order, got the camera first")
     chosen = locate_options(options)
@@ -95,9 +117,12 @@ def located(
     camera = as_camera(camera)
     skew = calibration is not None and calibration.skew
     shared, _, parameters = start.from_camera(camera, data, bow=False, skew=skew, with_poses=False)
+    if isinstance(shaped, Calibration):
+        shared, parameters = _with_shape(shared, parameters, data, shaped)
+    model: dict[str, Any] = {"bow": parameters.bow, "skew": parameters.skew, "free": parameters.points > 0}
     # Each view is a problem of its own, with a step and an end of its own, from each of its starts.
     V = len(views)
-    task = data.task(parameters.lens, skew=parameters.skew, loss=chosen.loss, basis=shared.new_zeros(*shared.shape, 0))
+    task = data.task(parameters.lens, **model, loss=chosen.loss, basis=shared.new_zeros(*shared.shape, 0))
     single = replace(
         task,
         pixels=data.pixels.flatten(0, 1).unsqueeze(1),
@@ -116,25 +141,49 @@ def located(
         best = lower_fit(best, other, torch.arange(len(held), device=held.device), chosen.outlier_limit)
     seen = data.used.any(-1)
     used, rejected = (z.squeeze(1).unflatten(0, seen.shape) for z in (best.task.used, best.rejected))
+    task = replace(task, used=used)
+    if best.task.whitening is not None:
+        task = replace(task, whitening=best.task.whitening.squeeze(1).unflatten(0, seen.shape))
+    poses = tuple(z.squeeze(1).unflatten(0, seen.shape) for z in best.solution.local)
     status = torch.where(seen, best.solution.status.reshape(seen.shape), Status.CONVERGED)
-    equations = best.solution.equations
+    equations = _joined(best.solution.equations, seen)
+    if parameters.points:
+        with torch.no_grad():
+            equations = equations_at(task.problem, shared, poses, POSE, task.weights, chosen.loss)
     joined = Solution(
         shared,
-        tuple(z.squeeze(1).unflatten(0, seen.shape) for z in best.solution.local),
+        poses,
         torch.where(seen, best.solution.cost.reshape(seen.shape), 0.0).sum(-1),
         status.amax(-1),
         best.solution.iterations.reshape(seen.shape).amax(-1),
-        equations._replace(
-            U=equations.U.unflatten(0, seen.shape).sum(1),
-            E=equations.E.squeeze(1).unflatten(0, seen.shape),
-            W=equations.W.squeeze(1).unflatten(0, seen.shape),
-            g=equations.g.unflatten(0, seen.shape).sum(1),
-            h=equations.h.squeeze(1).unflatten(0, seen.shape),
-            c=equations.c.reshape(seen.shape),
-        ),
+        equations,
     )
-    found = Fit(replace(task, used=used), joined, rejected)
-    if best.task.whitening is not None:
-        whole = best.task.whitening.squeeze(1).unflatten(0, seen.shape)
-        found = replace(found, task=replace(found.task, whitening=whole))
+    found = Fit(task, joined, rejected)
     return outcome("locate", data, found, camera.size or views.size, chosen.throw, calibration)
+
+
+def _joined(equations: Equations, seen: Tensor) -> Equations:
+    """The equations of cameras with views `(P, V)`, from those of their views one by one."""
+    return Equations(
+        U=equations.U.unflatten(0, seen.shape).sum(1),
+        E=equations.E.squeeze(1).unflatten(0, seen.shape),
+        W=equations.W.squeeze(1).unflatten(0, seen.shape),
+        g=equations.g.unflatten(0, seen.shape).sum(1),
+        h=equations.h.squeeze(1).unflatten(0, seen.shape),
+        c=equations.c.reshape(seen.shape),
+    )
+
+
+def _with_shape(
+    shared: Tensor, parameters: Parametrisation, data: Data, known: Calibration
+) -> tuple[Tensor, Parametrisation]:
+    """Shared parameters with the shape of the target that a calibration found, where it is that target's."""
+    same = known.nominal.shape == data.given_points.shape and bool(
+        (known.nominal.to(data.points) - data.given_points.detach()).abs().amax() <= SAME * data.points.abs().amax()
+    )
+    if known.shape == "flat" or not same:
+        return shared, parameters
+    parts = known.bow if known.displacements is None else known.displacements.flatten(-2)
+    parts = parts.detach().to(shared).expand(*data.batch, -1).reshape(len(shared), -1)  # type: ignore[union-attr]
+    points = len(data.points) if known.shape == "free" else 0
+    return torch.cat([shared, parts], dim=-1), replace(parameters, bow=known.shape == "bow", points=points)

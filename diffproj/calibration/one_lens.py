@@ -1,4 +1,4 @@
-"""A calibration with one lens: a start in closed form, refined, looked at twice, and kept from folding."""
+"""A calibration with one lens: a start in closed form, refined, looked at twice, kept from folding, points freed."""
 
 import torch
 from torch import Tensor
@@ -6,6 +6,7 @@ from torch import Tensor
 from diffproj.calibration import start
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit
+from diffproj.calibration.free_points import with_free_points
 from diffproj.calibration.nested import Nested
 from diffproj.calibration.options import Options
 from diffproj.calibration.outcome import outcome
@@ -26,7 +27,7 @@ def calibrated(
     """What `calibrate` promises, for one lens and checked options; errors name `who` was asked."""
     model_named(distortion)
     data = Data(views, target, chosen.weights, chosen.pixel_sigma)
-    data.check_options(chosen.objective, chosen.bow)
+    data.check_options(chosen.objective, chosen.bow, chosen.shape)
     if views.size is None:
         raise ValueError("views: want the photographs' size, got None; give Views(..., size=(width, height))")
     parameters = Parametrisation(distortion, chosen.bow, chosen.skew)
@@ -39,6 +40,7 @@ def calibrated(
     every = torch.arange(len(data.pixels), device=data.pixels.device)
     for other in starts[1:]:
         found = lower_fit(found, _from_start(data, chosen, parameters, other, straight), every, chosen.outlier_limit)
+    found, _ = with_free_points(found, data, chosen, None)
     return outcome(who, data, found, views.size, chosen.throw)
 
 

@@ -8,9 +8,11 @@ import numpy as np
 from torch import Tensor
 
 from diffproj._core.arguments import Array, called, choice, flag, function, number, whole_number, words
-from diffproj.calibration.constraints import Priors
+from diffproj._core.warn import warn_caller
+from diffproj.calibration.constraints import Priors, of_points
 from diffproj.calibration.losses import Loss, check_loss
 from diffproj.calibration.result import Objective
+from diffproj.calibration.shape import Shape
 
 OUTLIER_LIMIT = 5.0
 """Robust standard deviations beyond which a corner is an outlier: of Gaussian residuals, 4 in a million."""
@@ -58,8 +60,14 @@ class CalibrationOptions(LocateOptions, TypedDict, total=False):
             the distance on the target in world units, through `back_project`. It lowers that on the corners it is
             given; on others it was no better in trials on real views. Take it where the loss that matters is in world
             units.
-        bow: fit the board's bow too, a paraboloid of two parameters. Not with the plane objective, for a bowed board
-            has no plane. False if left out.
+        shape: of the target. `"flat"`, the default, has its points where the target says, all on one plane. `"bow"`
+            fits the board's bow too, a paraboloid of two parameters. `"free"` fits the place of every point, in the
+            plane and out of it: `Calibration.points` then is the target as it was printed, with its covariance. Its
+            origin, axes and size as a whole stay the target's, in the sense of least squares. That takes more views
+            (six and more), or a word on how well the target was printed: `priors={"points": 0.1}` has a standard
+            deviation of 0.1 world units for each coordinate. `fixed=["points_z"]` keeps the points in the plane. Not
+            with the plane objective, for only a flat target has one plane.
+        bow: `True` is `shape="bow"`, as it was called before.
         skew: fit the skew of K too, `K[0, 1]`, for sensors whose rows and columns are not at right angles. False if
             left out: it stays what it is, 0 in `calibrate`.
         fixed: names of parameters or groups (`"principal_point"`, `"distortion"`, `"k3"`, ...) that keep their starting
@@ -68,10 +76,13 @@ class CalibrationOptions(LocateOptions, TypedDict, total=False):
         tied_focal: `f_x : f_y` keeps the start's ratio, which is 1 in `calibrate`. False if left out.
         priors: what is known beforehand, by name or group: a standard deviation about the values that `fixed` would
             keep, or a tuple `(mean, standard deviation)`. It weighs against corners whose standard deviation is
-            `pixel_sigma`, or `1 / sqrt(weight)` px: give one along with it.
+            `pixel_sigma`, or `1 / sqrt(weight)` px: give one along with it. Under `"points"`, the standard deviation of
+            the coordinates of free points about their nominal places: a number, or one for each axis, `(3,)`, or
+            coordinate, `(N, 3)`; where neither is given, it weighs against the noise that the residuals tell.
     """
 
     objective: Objective
+    shape: Shape
     bow: bool
     skew: bool
     fixed: Sequence[str]
@@ -92,6 +103,7 @@ _LOCATE: LocateOptions = {
 _CALIBRATION: CalibrationOptions = {
     **_LOCATE,
     "objective": "image",
+    "shape": "flat",
     "bow": False,
     "skew": False,
     "fixed": (),
@@ -134,17 +146,30 @@ def calibration_options(who: str, given: Mapping[str, Any]) -> Options:
     """
     options = _with_defaults(who, given, _CALIBRATION)
     choice("objective", options.objective, get_args(Objective))
-    options.bow, options.skew = flag("bow", options.bow), flag("skew", options.skew)
+    choice("shape", options.shape, get_args(Shape))
+    options.skew = flag("skew", options.skew)
+    if flag("bow", options.bow):
+        if given.get("shape", "bow") != "bow":
+            raise ValueError(f"bow: want it left out beside shape={options.shape!r}, got True")
+        warn_caller(f"{who}: bow=True is now shape='bow'", DeprecationWarning)
+        options.shape = "bow"
+    options.bow = options.shape == "bow"
     options.tied_focal = flag("tied_focal", options.tied_focal)
     options.fixed = words("fixed", options.fixed, "several names")
-    if options.bow and options.objective == "plane":
-        raise ValueError("bow: want False with objective='plane', for a bowed board has no plane")
+    if options.shape != "flat" and options.objective == "plane":
+        raise ValueError(
+            f"shape: want 'flat' with objective='plane', got {options.shape!r}; only a flat target has one plane"
+        )
     if options.priors is not None:
         if not isinstance(options.priors, Mapping):
             raise TypeError(f"priors: want a mapping from names, got {called(options.priors)}")
         words("priors", tuple(options.priors), "names of parameters")
     if options.pixel_sigma is not None and options.objective == "plane":
         raise ValueError("pixel_sigma: want None with objective='plane', whose residuals are in world units")
+    for option, names in (("fixed", options.fixed), ("priors", options.priors or ())):
+        points = [name for name in names if of_points(name)]
+        if points and options.shape != "free":
+            raise ValueError(f"{option}: want {points[0]!r} with shape='free' only, got shape={options.shape!r}")
     return options
 
 

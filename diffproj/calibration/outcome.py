@@ -8,7 +8,7 @@ from torch import Tensor
 
 from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.compatibility import mismatch
-from diffproj.calibration.constraints import free_basis, held_at, make_prior
+from diffproj.calibration.constraints import free_basis, held_at, make_prior, of_camera, of_points
 from diffproj.calibration.covariance import Covariance, reshaped
 from diffproj.calibration.data import Data
 from diffproj.calibration.entangled import Entangled
@@ -34,14 +34,15 @@ def minimised(
     local: tuple[Tensor, ...],
     reference: Tensor,
 ) -> tuple[Fit, Prior | None]:
-    """Where the solver ends from that start, and the prior with its graph.
+    """Where the solver ends from that start, and the prior with its graph; of a flat target if points are to be free.
 
     Skew that is not to be fitted is held. `reference (P, s)` is what fixed parameters keep and priors without a mean
     are about; NaN where nothing is known.
     """
-    fixed = options.fixed if options.skew or not parameters.skew else (*options.fixed, SKEW)
+    fixed = tuple(name for name in options.fixed if not of_points(name))
+    fixed = fixed if options.skew or not parameters.skew else (*fixed, SKEW)
     steps = {name: getattr(options, name) for name in ("max_iterations", "tolerance", "progress")}
-    prior = make_prior(options.priors, reference, parameters, data.batch)
+    prior = make_prior(of_camera(options.priors), reference, parameters, data.batch)
     shared = held_at(reference, shared, parameters, fixed)
     task = data.task(
         parameters.lens,
@@ -73,6 +74,7 @@ def outcome(
     and the region of the image where it knows the lens go along.
     """
     task, solution, batch = found.task, found.solution, data.batch
+    few = task.parameters.few
     cameras = task.parameters.unpack(solution.shared, solution.local)
     status, causes = verdicts(found, data.views.names, data.target)
     before = None if known is None else noise_of(known, batch)
@@ -100,17 +102,18 @@ def outcome(
         camera,
         posed,
         data.views.to(torch.float64),
-        data.given_points.detach(),
+        data.given_points if task.free and solution.shared.requires_grad else data.given_points.detach(),
         shaped(task.used),
         shaped(found.rejected),
         shaped(status),
         shaped(solution.iterations),
-        shaped(solution.shared[:, -2:]) if task.bow else None,
+        shaped(solution.shared[:, few - 2 : few]) if task.bow else None,
         task.objective,
         causes,
         shaped(noise.variance.sqrt()),
         shares=None if task.shares is None else shaped(task.shares),
         skew=task.skew,
+        displacements=shaped(solution.shared[:, few:].unflatten(-1, (-1, 3))) if task.free else None,
         degrees_of_freedom=shaped(noise.freedom),
         lens_region=None if known is None else known.region,
         _covariance=partial(_covariance, found, data, before, known, doubt),

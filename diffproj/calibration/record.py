@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 OBJECTIVES = ("image", "plane")
 TENSORS = (
-    *("rms", "status", "iterations", "bow", "points", "used", "rejected", "pixel_sigma", "shares"),
+    *("rms", "status", "iterations", "bow", "displacements", "used", "rejected", "pixel_sigma", "shares"),
     *("degrees_of_freedom", "lens_region"),
 )
 """Attributes that go into a file as they are."""
@@ -44,7 +44,13 @@ class Recorded:
             True
         """
         lists: dict[str, Tensor | None] = {name: getattr(self, name) for name in TENSORS}
-        lists |= {"R": self.cameras.R, "t": self.cameras.t, "pixels": self.views.pixels, "visible": self.views.visible}
+        lists |= {
+            "points": self.nominal,
+            "R": self.cameras.R,
+            "t": self.cameras.t,
+            "pixels": self.views.pixels,
+            "visible": self.views.visible,
+        }
         others = self.other_poses if self.has_alternatives else None
         return {
             "objective": self.objective,
@@ -117,6 +123,7 @@ class Recorded:
             lens_region=_region(fields),
             unit=_unit(fields.get("unit")),
             landmarks=_landmarks(fields.get("landmarks"), N),
+            displacements=tensor(fields, "displacements", (*batch, N, 3)) if present(fields, "displacements") else None,
             _covariance=None if covariance is None else partial(_same, covariance),
             _others=None if others is None else partial(_same, others),
             _remarks=partial(_same, _texts("remarks", fields["remarks"])) if "remarks" in fields else None,

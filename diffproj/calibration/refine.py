@@ -6,7 +6,9 @@ from kornia.geometry.camera import PinholeCamera
 
 from diffproj._core.arguments import flag
 from diffproj.calibration import start
+from diffproj.calibration.circle_centres import with_true_centres
 from diffproj.calibration.data import Data
+from diffproj.calibration.free_points import with_free_points
 from diffproj.calibration.implicit import differentiated
 from diffproj.calibration.options import CalibrationOptions, calibration_options
 from diffproj.calibration.outcome import minimised, outcome
@@ -33,7 +35,7 @@ def refine(
             that broadcasts to `*B`, poses are found from the corners; with another that broadcasts to `(*B, V)`, its
             poses are the start, and its intrinsics are those of the first view. Where its image is turned, the camera
             that is turned itself is fitted, which sees the same (`Camera.upright`).
-        differentiable: carry gradients through the minimum: those of cameras and bow with respect to the views'
+        differentiable: carry gradients through the minimum: those of cameras and the target's shape by the views'
             pixels, the target's points, the weights and tensors among the priors are those of the minimiser (implicit
             function theorem, exact Hessian). To first order.
         options: as in `calibrate`: see `CalibrationOptions`.
@@ -64,11 +66,16 @@ def refine(
         )
     differentiable = flag("differentiable", differentiable)
     chosen = calibration_options("refine", options)
-    data = Data(views, target, chosen.weights, chosen.pixel_sigma)
-    data.check_options(chosen.objective, chosen.bow)
-    camera = as_camera(camera)
-    shared, local, parameters = start.from_camera(camera, data, chosen.bow, chosen.skew)
-    found, prior = minimised(data, chosen, parameters, shared, local, shared)
-    if differentiable:
-        found = differentiated(found, data, prior)
-    return outcome("refine", data, found, camera.size or views.size, chosen.throw)
+    beginning = as_camera(camera)
+
+    def fit(views: Views) -> Calibration:
+        data = Data(views, target, chosen.weights, chosen.pixel_sigma)
+        data.check_options(chosen.objective, chosen.bow, chosen.shape)
+        shared, local, parameters = start.from_camera(beginning, data, chosen.bow, chosen.skew)
+        found, prior = minimised(data, chosen, parameters, shared, local, shared)
+        found, prior = with_free_points(found, data, chosen, prior)
+        if differentiable:
+            found = differentiated(found, data, prior)
+        return outcome("refine", data, found, beginning.size or views.size, chosen.throw)
+
+    return with_true_centres(fit, views, target)

@@ -125,10 +125,10 @@ def _left_over(task: Task, left: Leftover, i: int, p: int, sigma: float) -> str:
             return f"the residuals {LENS_WORDS} {where}, as through another lens ({part}): {remedy}"
     if int(task.used[p].any(-1).sum()) >= SHAPE_VIEWS and counts(left.shape, i, SHAPE_SHARE):
         if counts(left.bow, i, BOW_PART * float(left.shape.share[i])):
-            return "the residuals repeat on the board, as if it were bent: take bow=True"
+            return "the residuals repeat on the board, as if it were bent: take shape='bow'"
         return (
             f"the residuals repeat on the board, whose corners lie {float(left.moved[i]):.2g} world units (RMS) "
-            "off the target's: a flatter or better print would tell more"
+            "off the target's: take shape='free', which finds where they are, or a flatter or better print"
         )
     if sigma > NOISY_PX:
         return (

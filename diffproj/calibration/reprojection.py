@@ -10,6 +10,8 @@ derivatives of the residual `projected - seen` in pixels, and the residual itsel
 
     by tau: J        by omega: q x J        by bow: (third column of R) . J  times  1 - xi^2 or 1 - eta^2
 
+Free points have no rows, for the residuals of one point depend on its own displacement alone: see `shape.py`.
+
 The order of the parameters is that of `parametrisation.py`; `bow.py` says what xi and eta are.
 """
 
@@ -18,6 +20,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from diffproj.calibration import shape
 from diffproj.calibration.bow import bow_shape
 from diffproj.calibration.lens_derivatives import DERIVATIVES
 from diffproj.calibration.parametrisation import INTRINSICS, POSE, Parametrisation, moved
@@ -37,6 +40,7 @@ class Reprojection:
         bow: whether the board's bow is among the shared parameters.
         skew: whether the skew of K is.
         whitening: what the residuals and their derivatives are multiplied by `(P, V, N, 2, 2)`; `None` for 1.
+        free: whether the displacements of all points are.
     """
 
     points: Tensor
@@ -46,6 +50,7 @@ class Reprojection:
     bow: bool = False
     skew: bool = False
     whitening: Tensor | None = None
+    free: bool = False
     parameters: Parametrisation = field(init=False, repr=False)
     _panel: Tensor = field(init=False, repr=False)
     _plane_points: Tensor = field(init=False, repr=False)
@@ -55,8 +60,8 @@ class Reprojection:
 
     def __post_init__(self) -> None:
         P, V, N, _ = self.pixels.shape
-        self.parameters = Parametrisation(self.lens, self.bow, self.skew)
-        self._panel = self.pixels.new_zeros(P, V, self.parameters.size + POSE + 1, 2, N)
+        self.parameters = Parametrisation(self.lens, self.bow, self.skew, N if self.free else 0)
+        self._panel = self.pixels.new_zeros(P, V, self.parameters.few + POSE + 1, 2, N)
         self._panel[:, :, 2, 0], self._panel[:, :, 3, 1] = 1.0, 1.0  # by c_x, c_y
         self._plane_points = self.points.mT.contiguous()
         self._bow_shape = bow_shape(self.points)
@@ -110,12 +115,31 @@ class Reprojection:
         return torch.einsum("pvnij,pvrjn->pvrin", self.whitening, panel)  # a new tensor: the panel keeps constant rows
 
     def rotated(self, shared: Tensor, R: Tensor) -> Tensor:
-        """`R X` for the (bowed) board's points, `(P, V, 3, N)`."""
+        """`R X` for the points of the (bowed or free) target, `(P, V, 3, N)`."""
+        if self.free:
+            moves = shared[:, self.parameters.few :].unflatten(-1, (-1, 3)).mT
+            return R @ (self._plane_points + moves).unsqueeze(1)
         if not self.bow:
             return R @ self._plane_points
         points = self._plane_points.expand(len(shared), 1, -1, -1).clone()
         points[:, 0, 2] += (shared[:, -2:, None] * self._bow_shape).sum(1)
         return R @ points
+
+    def bordered(
+        self, panel: Tensor, local: LocalState, U: Tensor, E: Tensor, g: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The blocks of the normal equations with those of free points, from a weighted panel."""
+        if not self.free:
+            return U, E, g
+        return shape.bordered(U, E, g, panel, self.by_displacement(panel, local))
+
+    def by_displacement(self, panel: Tensor, local: LocalState) -> Tensor:
+        """Derivatives of each corner's residual by the displacement of its point `(P, V, 3, 2, N)`."""
+        return shape.by_displacement(panel[:, :, -4:-1], local[0])
+
+    def every_row(self, panel: Tensor, local: LocalState) -> Tensor:
+        """The panel with rows for the displacements of free points, too `(P, V, s + 7, 2, N)`: large."""
+        return shape.dense(panel, self.by_displacement(panel, local), self.parameters.few) if self.free else panel
 
     def retract(self, local: LocalState, step: Tensor) -> LocalState:
         """Poses moved by steps `(P, V, 6)`."""

@@ -132,7 +132,7 @@ def _drawn_to(shared: Tensor, precision: Tensor, task: Task) -> Prior:
     more = torch.diag_embed(precision)
     if task.prior is None:
         return Prior(torch.where(precision > 0, shared, 0.0), more, torch.zeros_like(more))
-    mean, given, _ = task.prior
+    mean, given, *_ = task.prior
     own = given.diagonal(dim1=-2, dim2=-1)
     total = own + precision
     return Prior(torch.where(total > 0, (own * mean + precision * shared) / total, 0.0), given + more, given)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -23,6 +23,7 @@ from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.positions import Positions, positions
 from diffproj.calibration.record import Recorded
 from diffproj.calibration.region import covered_region
+from diffproj.calibration.shape import Shape
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
 from diffproj.targets.residuals import projected_minus_seen
@@ -36,10 +37,10 @@ class CalibrationError(RuntimeError):
     """The corners do not determine the camera, or the solver did not converge; the message says which and why.
 
     Attributes:
-        calibration: where it ended, or `None` where there is nothing to show.
+        calibration: where it ended, a `Calibration` or a `RigCalibration`, or `None` where there is nothing to show.
     """
 
-    def __init__(self, message: str, calibration: "Calibration | None" = None) -> None:
+    def __init__(self, message: str, calibration: Any = None) -> None:
         super().__init__(message)
         self.calibration = calibration
 
@@ -56,7 +57,7 @@ class Calibration(Account, Copied, Recorded):
             corner of a view was used, its pose is only a place holder. Where a view fits two poses, the better one;
             the other is in `alternatives`.
         views: the corners that were given.
-        points: the board's corners `(N, 3)` in world units, as if it were flat.
+        nominal: the target's points `(N, 3)` in world units, as they were given.
         used: which corners were used `(*B, V, N)`: seen, not rejected as outliers, and in a view with at least 4.
         rejected: which corners were rejected as outliers `(*B, V, N)`.
         status: how it ended, `Status` codes `(*B,)`.
@@ -76,12 +77,14 @@ class Calibration(Account, Copied, Recorded):
         comparison: how the lenses fared, where `distortion="auto"` compared them.
         landmarks: the names of the N points, where they are `Landmarks`; `None` for a board.
         unit: the world's unit, such as `"mm"`, where it is known; files keep it.
+        displacements: how far each point of the target lies from where it was given `(*B, N, 3)` in world units, where
+            `shape="free"` fitted them.
     """
 
     camera: Camera
     cameras: Camera
     views: Views
-    points: Float[Tensor, "n 3"]
+    nominal: Float[Tensor, "n 3"]
     used: Bool[Tensor, "*batch v n"]
     rejected: Bool[Tensor, "*batch v n"]
     status: Int[Tensor, "*batch"]
@@ -97,27 +100,53 @@ class Calibration(Account, Copied, Recorded):
     comparison: LensComparison | None = None
     unit: str | None = None
     landmarks: tuple[str, ...] | None = None
+    displacements: Float[Tensor, "*batch n 3"] | None = None
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
     _remarks: Callable[[], tuple[str, ...]] | None = None
     _mismatch: Callable[[], Mismatch] | None = None
 
     @property
+    def points(self) -> Float[Tensor, "*#batch n 3"]:
+        """The target's points in world units as they were fitted `(*B, N, 3)`; as they were given `(N, 3)`, if flat."""
+        if self.displacements is not None:
+            return self.nominal + self.displacements
+        return self.nominal if self.bow is None else bowed(self.nominal, self.bow)
+
+    @property
     def board_points(self) -> Float[Tensor, "*batch n 3"]:
-        """The board's corners `(*B, N, 3)` in world units with its bow, where one was fitted."""
-        if self.bow is None:
-            return self.points.expand(*self.views.batch_shape, -1, -1)
-        return bowed(self.points, self.bow)
+        """The same for each camera `(*B, N, 3)`."""
+        return self.points.expand(*self.views.batch_shape, -1, -1)
+
+    @property
+    def points_deviation(self) -> Float[Tensor, "*batch n 3"]:
+        """The standard deviation of each coordinate of `points` `(*B, N, 3)`, where they were fitted; 0 where not.
+
+        Infinite for points that fewer than two views show. `covariance.points` has how they go together.
+
+        Raises:
+            ValueError: the calibration came from a file without a covariance.
+        """
+        if self.displacements is None:
+            return torch.zeros_like(self.board_points)
+        spread = self.covariance.points.diagonal(dim1=-2, dim2=-1)
+        return spread.sqrt().unflatten(-1, (-1, 3))
+
+    @property
+    def shape(self) -> Shape:
+        """What was fitted of the target's shape."""
+        return "free" if self.displacements is not None else "flat" if self.bow is None else "bow"
 
     @property
     def parameters(self) -> Parametrisation:
         """The names and the order of the shared parameters."""
-        return Parametrisation.of(self.camera, self.bow is not None, self.skew)
+        count = 0 if self.displacements is None else len(self.nominal)
+        return Parametrisation.of(self.camera, self.bow is not None, self.skew, count)
 
     @property
     def shared(self) -> Float[Tensor, "*batch s"]:
         """The shared parameters `(*B, s)`, in the order of `parameters.names`."""
-        return self.parameters.pack(self.camera, self.bow)
+        return self.parameters.pack(self.camera, self.bow, self.displacements)
 
     @property
     def residuals(self) -> Float[Tensor, "*batch v n 2"]:
@@ -204,12 +233,12 @@ class Calibration(Account, Copied, Recorded):
         if not self.has_covariance:
             return False
         known = self.covariance_of_kept_poses
-        count = sum(not name.startswith("bow") for name in known.names)
+        count = self.parameters.of_camera.size
         return bool((known.shared[..., :count, :count] != 0).any())
 
     @cached_property
     def covariance(self) -> Covariance:
-        """The joint covariance of intrinsics, lens, bow and every pose; computed at the first call.
+        """The joint covariance of intrinsics, lens, the target's shape and every pose; computed at the first call.
 
         Where a view has another pose that may be the right one, that of its pose is the mean square of the error of the
         pose that was kept: its own covariance, and the step to the other pose as often as that is the right one.
@@ -220,7 +249,7 @@ class Calibration(Account, Copied, Recorded):
         own = self.covariance_of_kept_poses
         if not self.has_alternatives or not bool((self.other_poses.probability > 0).any()):
             return own
-        return widened(own, (self.cameras.R, self.cameras.t), self.other_poses, self.points.mean(0))
+        return widened(own, (self.cameras.R, self.cameras.t), self.other_poses, self.nominal.mean(0))
 
     @cached_property
     def covariance_of_kept_poses(self) -> Covariance:

@@ -33,7 +33,6 @@ problem ended is reported as a `Status`, never as an exception.
 """
 
 from collections.abc import Callable
-from enum import IntEnum
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -41,40 +40,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from diffproj.calibration.damping import FINAL_STEP_REDUCTION, HEAVY_DAMPING, DampingControl, Status
 from diffproj.calibration.losses import Loss
 
-INITIAL_DAMPING = 1e-6
-"""Small, so that from a good start the first steps are nearly Gauss-Newton steps."""
-DAMPING_INCREASE, DAMPING_DECREASE = 2.0, 3.0
-"""Factors of the damping after the first failure, and (at most) after the first success, in a row."""
-FIRST_INCREASE = 10.0
-"""Factor after the very first failure, before any success, while the order of magnitude is unknown."""
-HEAVY_DAMPING = 1e-3
-"""Damping above which the predicted reduction of a step is no measure of the distance from the minimum."""
-FINAL_STEP_REDUCTION = 1e-8
-"""Predicted reduction, relative to the cost, up to which a step may be the final one, applied without evaluation."""
-BEST_CONTRACTION = 0.02
-"""Least ratio of successive predicted reductions assumed in extrapolation; convergence near the minimum is linear."""
-ROUNDING = 1e-12
-"""Rounding error of the cost, a sum of many squares, relative to it."""
-MIN_DAMPING = 1e-15
-MAX_DAMPING = 1e14
-"""Beyond this damping, a problem without an acceptable step has diverged."""
+__all__ = ["Status"]  # which comes with the solver wherever it is needed
+
 LocalState = tuple[Tensor, ...]
 """Tensors `(P, V, ...)` with the state of the local blocks, which only the problem interprets."""
-
-
-class Status(IntEnum):
-    """Why the solver stopped."""
-
-    CONVERGED = 0
-    """The predicted reduction of the cost is below the tolerance."""
-    MAX_ITERATIONS = 1
-    """The maximum number of iterations was reached before convergence."""
-    DIVERGED = 2
-    """No step lowers the cost although its gradient is not zero, or the residuals are not finite at the start."""
-    DEGENERATE = 3
-    """The data do not determine all unknowns. (Set by the caller, not by the solver.)"""
 
 
 @runtime_checkable
@@ -93,21 +65,60 @@ class Problem(Protocol):
         ...
 
 
+@runtime_checkable
+class Bordered(Problem, Protocol):
+    """A problem with many more shared unknowns, behind the others, each of which few residuals depend on.
+
+    The panel has no rows for them.
+    """
+
+    def bordered(
+        self, panel: Tensor, local: LocalState, U: Tensor, E: Tensor, g: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """U, E and g with those unknowns, from the weighted panel that the others' blocks are of."""
+        ...
+
+
+@runtime_checkable
+class Summed(Protocol):
+    """A problem that adds up its normal equations itself, where most of the panel would be zeros.
+
+    Its residuals' weights are its own.
+    """
+
+    def equations(self, shared: Tensor, local: LocalState, loss: Loss | None) -> "tuple[Tensor, Equations]":
+        """The cost `(P,)` and the undamped normal equations, without a prior; not finite where a residual is not."""
+        ...
+
+    def retract(self, local: LocalState, step: Tensor) -> LocalState:
+        """Move the local blocks by tangent vectors `(P, V, l)`."""
+        ...
+
+
 class Prior(NamedTuple):
     """`1/2 (x - mean)^T precision (x - mean)`: mean `(P, s)`, precision `(P, s, s)`.
 
     `known (P, s, s)` is the part of the precision that stands for a measurement; all of it if left out. The rest only
     keeps the minimum where it makes sense: the solver makes no difference, the covariance does.
+
+    `root (P, s, k)` adds `root root^T` to the precision: of a stiff term that is 0 at the minimum, a sum of squares is
+    so to rounding, and a quadratic form is not.
     """
 
     mean: Tensor
     precision: Tensor
     known: Tensor | None = None
+    root: Tensor | None = None
+
+    @property
+    def whole(self) -> Tensor:
+        """All of the precision `(P, s, s)`."""
+        return self.precision if self.root is None else self.precision + self.root @ self.root.mT
 
     def part(self, where: slice | Tensor) -> "Prior":
         """That of some of the problems."""
-        known = None if self.known is None else self.known[where]
-        return Prior(self.mean[where], self.precision[where], known)
+        known, root = (None if part is None else part[where] for part in (self.known, self.root))
+        return Prior(self.mean[where], self.precision[where], known, root)
 
 
 class Equations(NamedTuple):
@@ -127,6 +138,9 @@ class Equations(NamedTuple):
         """The same equations for shared unknowns restricted to a basis `(P, s, q)`."""
         if basis is None:
             return self
+        if basis.shape[-1] == 0:
+            U, E, g = self.U[:, :0, :0], self.E[:, :, :0], self.g[:, :0]
+            return Equations(U, E, self.W, g, self.h, self.c)
         T = basis.mT
         return Equations(T @ self.U @ basis, T.unsqueeze(1) @ self.E, self.W, _times(T, self.g), self.h, self.c)
 
@@ -151,9 +165,21 @@ class Solution(NamedTuple):
     equations: Equations
 
 
+def equations_at(
+    problem: Problem,
+    shared: Float[Tensor, "p s"],
+    local: LocalState,
+    local_size: int,
+    weights: Float[Tensor, "p v n"] | None = None,
+    loss: Loss | None = None,
+) -> Equations:
+    """The normal equations at a point, for all unknowns whether they may move or not."""
+    return _Terms(problem, local_size, weights, loss, None).at(shared, local)[1]
+
+
 @np.errstate(all="ignore")  # infinite and NaN reductions are handled without warnings
 def solve(
-    problem: Problem,
+    problem: Problem | Summed,
     shared: Float[Tensor, "p s"],
     local: LocalState,
     *,
@@ -187,9 +213,10 @@ def solve(
     Returns:
         The solution, with a `Status` for each problem.
     """
-    terms = _Terms(problem, local_size, weights, loss, prior)
+    every = basis is None or basis.shape[-1] > 0  # where no shared unknown moves, those of the panel are enough
+    terms = _Terms(problem, local_size, weights, loss, prior, every)
     cost, equations = terms.at(shared, local)
-    control = _DampingControl(_array(cost))
+    control = DampingControl(_array(cost))
     for iteration in range(1, max_iterations + 1):
         along = equations.along(basis)
         q, dz, reduction = damped_step(along, torch.from_numpy(control.damping).to(cost))
@@ -215,56 +242,6 @@ def solve(
     ends = control.status.astype(np.int64), control.iterations
     status, iterations = (torch.from_numpy(end).to(cost.device) for end in ends)
     return Solution(shared, local, cost, status, iterations, equations)
-
-
-class _DampingControl:
-    """Damping, acceptance and stopping per problem, in NumPy, which is faster than PyTorch for a few numbers."""
-
-    def __init__(self, cost: np.ndarray) -> None:
-        self.cost = cost
-        self.damping = np.full_like(cost, INITIAL_DAMPING)
-        self.increase, self.decrease = np.full_like(cost, FIRST_INCREASE), np.full_like(cost, DAMPING_DECREASE)
-        self.active = np.isfinite(cost)
-        self.status = np.where(self.active, Status.MAX_ITERATIONS, Status.DIVERGED)
-        self.iterations = np.zeros(cost.shape, dtype=np.int64)
-        self.previous = np.full_like(cost, np.inf)
-        self.failed = np.zeros(cost.shape, dtype=bool)
-
-    def stop(self, expected: np.ndarray, tolerance: float, negligible: float) -> np.ndarray:
-        """Stop problems that have converged, which are returned, and those whose damping exceeds its maximum."""
-        # The current step will still be applied: the criterion is the reduction of the step after it, extrapolated.
-        after = expected * np.clip(expected / self.previous, BEST_CONTRACTION, 1)
-        self.previous = np.where(self.active, expected, self.previous)
-        converged = (after <= tolerance * self.cost) & (expected <= FINAL_STEP_REDUCTION * self.cost)
-        # Where the reduction is below the cost's rounding error, acceptance is random: the first failure ends it.
-        exhausted = (self.failed & (expected <= ROUNDING * self.cost)) | (expected <= 1e-3 * ROUNDING * self.cost)
-        done = self.active & (converged | exhausted | (self.cost <= negligible))
-        stuck = self.active & ~done & (self.damping > MAX_DAMPING)
-        self.status[done], self.status[stuck] = Status.CONVERGED, Status.DIVERGED
-        self.active &= ~(done | stuck)
-        self.iterations += self.active
-        return done
-
-    def accept(self, cost: np.ndarray, reduction: np.ndarray) -> np.ndarray:
-        """Accept trials that do not increase the cost, and update the damping from the gain ratio (Nielsen 1999).
-
-        The gain ratio is the actual over the predicted reduction: near 1 the damping decreases, well below it stays or
-        increases. Successes or failures in a row enlarge the changes; where they alternate, as in a curved valley, the
-        changes stay small.
-        """
-        better = self.active & (cost <= self.cost) & np.isfinite(reduction)  # false where the trial is NaN
-        worse = self.failed = self.active & ~better
-        model = 1 - (2 * (self.cost - cost) / reduction - 1) ** 3
-        factor = np.where(
-            better, np.maximum(np.minimum(model, 2), 1 / self.decrease), np.where(worse, self.increase, 1)
-        )
-        self.damping = np.maximum(self.damping * factor, MIN_DAMPING)
-        self.increase = np.where(better, DAMPING_INCREASE, np.where(worse, 2 * self.increase, self.increase))
-        self.decrease = np.where(
-            better, np.minimum(3 * self.decrease, 1e6), np.where(worse, DAMPING_DECREASE, self.decrease)
-        )
-        self.cost = np.where(better, cost, self.cost)
-        return better
 
 
 def damped_step(equations: Equations, damping: Float[Tensor, " p"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -312,12 +289,33 @@ class _Terms:
     """Evaluates the cost and the normal equations at a point."""
 
     def __init__(
-        self, problem: Problem, local_size: int, weights: Tensor | None, loss: Loss | None, prior: Prior | None
+        self,
+        problem: Problem | Summed,
+        local_size: int,
+        weights: Tensor | None,
+        loss: Loss | None,
+        prior: Prior | None,
+        every: bool = True,
     ) -> None:
         self.problem, self.local_size, self.weights, self.loss, self.prior = problem, local_size, weights, loss, prior
+        self.border = problem.bordered if every and isinstance(problem, Bordered) else None
 
     def at(self, shared: Tensor, local: LocalState) -> tuple[Tensor, Equations]:
-        panel = self.problem.linearise(shared, local)
+        if isinstance(self.problem, Problem):
+            cost, equations = self._products(self.problem.linearise(shared, local), local)
+        else:
+            cost, equations = self.problem.equations(shared, local, self.loss)
+        if self.prior is not None:
+            off = shared - self.prior.mean
+            pull = _times(self.prior.precision, off)
+            cost = cost + (off * pull).sum(-1) / 2
+            if self.prior.root is not None:
+                along = _times(self.prior.root.mT, off)
+                cost, pull = cost + along.square().sum(-1) / 2, pull + _times(self.prior.root, along)
+            equations = equations._replace(U=equations.U + self.prior.whole, g=equations.g + pull)
+        return cost, equations
+
+    def _products(self, panel: Tensor, local: LocalState) -> tuple[Tensor, Equations]:
         robust = None
         if self.weights is not None or self.loss is not None:
             squared = panel[..., -1, :, :].square().sum(-2)
@@ -331,13 +329,11 @@ class _Terms:
         s = rows.shape[-2] - self.local_size - 1
         totals = gram[..., :s, :].sum(1)
         c = gram[..., -1, -1] / 2
+        U, E, g = totals[..., :s], gram[..., :s, s:-1], totals[..., -1]
+        if self.border is not None:
+            U, E, g = self.border(panel, local, U, E, g)
         cost = c.sum(-1) if robust is None else robust
-        U, g = totals[..., :s], totals[..., -1]
-        if self.prior is not None:
-            off = shared - self.prior.mean
-            pull = _times(self.prior.precision, off)
-            cost, U, g = cost + (off * pull).sum(-1) / 2, U + self.prior.precision, g + pull
-        return cost, Equations(U, gram[..., :s, s:-1], gram[..., s:-1, s:-1], g, gram[..., s:-1, -1], c)
+        return cost, Equations(U, E, gram[..., s:-1, s:-1], g, gram[..., s:-1, -1], c)
 
 
 def _with_diagonal(matrix: Tensor, addition: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """`Task`: what is minimised, for P cameras side by side; and the solver run over it, in blocks of cameras."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from diffproj.calibration.own_frame import are_solid
 from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.reprojection import Reprojection
 from diffproj.calibration.result import Objective
+from diffproj.calibration.shape import Restraint, restraint_of
 from diffproj.calibration.solver import Equations, Prior, Solution, solve
 from diffproj.lens.models import LensModel
 
@@ -31,7 +33,7 @@ class Task:
         points: the target's points `(N, 3)` in their own frame.
         pixels: `(P, V, N, 2)`.
         used: which corners count `(P, V, N)`.
-        lens, bow, skew: the model.
+        lens, bow, skew, free: the model; `free` where the places of the target's points are unknowns.
         objective: residuals on the image or on the board.
         weights: of the corners `(P, V, N)`, or `None` for 1.
         known_noise: whether the weights are one over the variances, so that the residuals need not tell their level.
@@ -42,6 +44,7 @@ class Task:
         loss: a robust loss, or `None` for least squares.
         prior: on the shared parameters.
         basis: of the shared parameters' free directions `(P, s, q)`, or `None` for all.
+        printed: precision of each displacement of free points `(P, 3 N)`, in the unit of the weights; `None` for 0.
     """
 
     points: Tensor
@@ -50,6 +53,7 @@ class Task:
     lens: LensModel
     bow: bool = False
     skew: bool = False
+    free: bool = False
     objective: Objective = "image"
     weights: Tensor | None = None
     known_noise: bool = False
@@ -59,6 +63,7 @@ class Task:
     loss: Loss | None = None
     prior: Prior | None = None
     basis: Tensor | None = None
+    printed: Tensor | None = None
 
     @property
     def solid(self) -> bool:
@@ -68,7 +73,7 @@ class Task:
     @property
     def parameters(self) -> Parametrisation:
         """Which they are, and in which order."""
-        return Parametrisation(self.lens, self.bow, self.skew)
+        return Parametrisation(self.lens, self.bow, self.skew, self.points.shape[-2] if self.free else 0)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,7 +84,36 @@ class Task:
     def problem(self) -> Reprojection:
         """Residuals and Jacobians."""
         kind = BoardError if self.objective == "plane" else Reprojection
-        return kind(self.points, self.pixels, self.used, self.lens, self.bow, self.skew, self.whitening)
+        return kind(self.points, self.pixels, self.used, self.lens, self.bow, self.skew, self.whitening, free=self.free)
+
+    @property
+    def moves_points(self) -> bool:
+        """Whether points are free, and not all shared parameters held."""
+        return self.free and (self.basis is None or self.basis.shape[-1] > 0)
+
+    @cached_property
+    def restraint(self) -> Restraint | None:
+        """What fixes the frame of free points and how well they were printed; `None` where none are free."""
+        return self.restraint_at(self.points) if self.moves_points else None
+
+    def restraint_at(self, points: Tensor) -> Restraint:
+        """The same for other points of the target `(N, 3)`, differentiable by them."""
+        counts = self.pixels.new_ones(self.used.shape) if self.weights is None else self.weights
+        counts = counts if self.shares is None else counts * self.shares.unsqueeze(-1)
+        return restraint_of(points, self.pixels, self.used, counts, self.printed)
+
+    @property
+    def whole_prior(self) -> Prior | None:
+        """The prior together with what restrains free points."""
+        if self.restraint is None:
+            return self.prior
+        P, s = len(self.used), len(self.names)
+        few = s - self.restraint.printed.shape[-1]
+        held = torch.nn.functional.pad(self.restraint.alone + self.restraint.printed, (few, 0))
+        root = torch.nn.functional.pad(self.restraint.root, (0, 0, few, 0))
+        if self.prior is None:
+            return Prior(held.new_zeros(P, s), torch.diag_embed(held), root=root)
+        return Prior(self.prior.mean, self.prior.precision + torch.diag_embed(held), root=root)
 
     def holding(self, where: list[int]) -> "Task":
         """The same with some of the shared parameters held, by their positions."""
@@ -92,7 +126,7 @@ class Task:
     def part(self, where: slice | Tensor) -> "Task":
         """The task of some of the cameras."""
         cut = {name: getattr(self, name)[where] for name in ("pixels", "used")}
-        optional = ("weights", "whitening", "shares", "basis")
+        optional = ("weights", "whitening", "shares", "basis", "printed")
         cut |= {name: None if (whole := getattr(self, name)) is None else whole[where] for name in optional}
         prior = None if self.prior is None else self.prior.part(where)
         return replace(self, **cut, prior=prior)
@@ -146,7 +180,7 @@ def _solved(task: Task, shared: Tensor, local: tuple[Tensor, ...], **options: An
         local_size=POSE,
         weights=weights,
         loss=task.loss,
-        prior=task.prior,
+        prior=task.whole_prior,
         basis=task.basis,
         negligible=size * _scale(task, unit) * unit**2,
         **options,

@@ -45,6 +45,7 @@ def covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = N
         "precision": precision,
         "dispersion": phi,
         "shares": task.shares,
+        **found.frame(),
     }
     if task.objective == "plane":
         equations, scores = _on_the_plane(found)
@@ -108,7 +109,8 @@ def _on_the_plane(found: Fit) -> tuple[Equations, Scores]:
 
 def _panel(found: Fit) -> tuple[Tensor, Tensor, Tensor]:
     """Derivatives `(P, V, s + 6, 2, N)`, residuals `(P, V, 2, N)` and weights `(P, V, N)`."""
-    panel = found.task.problem.linearise(*_state(found))
+    problem, state = found.task.problem, _state(found)
+    panel = problem.every_row(problem.linearise(*state), state[1])
     rows, residual = panel[:, :, :-1], panel[:, :, -1]
     weight = found.task.weights
     return rows, residual, torch.ones_like(residual[:, :, 0]) if weight is None else weight
@@ -125,8 +127,8 @@ def _equations(found: Fit, rows: Tensor, weight: Tensor, more: Tensor | None = N
     H = H if more is None else H + more
     U = H[..., :s, :s]
     U = (U if found.task.shares is None else U * found.task.shares[..., None, None]).sum(1)
-    prior = found.task.prior
-    U = U if prior is None else U + prior.precision
+    prior = found.task.whole_prior
+    U = U if prior is None else U + prior.whole
     return Equations(U, H[..., :s, s:], H[..., s:, s:], *found.solution.equations[3:])
 
 

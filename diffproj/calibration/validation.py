@@ -14,14 +14,16 @@ from torch import Tensor
 
 from diffproj._core.arguments import checked_seed, whole_number
 from diffproj._core.shown import Shown
+from diffproj.calibration.circle_centres import with_true_centres
 from diffproj.calibration.data import Data
 from diffproj.calibration.distinct import alike
 from diffproj.calibration.held_out import errors_of, folds_of, repeated, without_views
 from diffproj.calibration.one_lens import calibrated
-from diffproj.calibration.options import CalibrationOptions, calibration_options
+from diffproj.calibration.options import CalibrationOptions, Options, calibration_options
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Status
 from diffproj.lens.models import LensModel
+from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views, as_views
 
@@ -90,7 +92,7 @@ def cross_validate(
 
     The pose of a held-out view is estimated from every second corner and evaluated on the others, then with the roles
     exchanged, so that no corner is evaluated with a pose that it contributed to. (A view with fewer than 4 such corners
-    is not evaluated.)
+    is not evaluated.) A target's shape is that of the views of the fit alone.
 
     Args:
         views: corners `(V, N, 2)` of one camera; view i is left out of fit i mod k.
@@ -101,7 +103,7 @@ def cross_validate(
 
     Raises:
         TypeError: views are no `dp.Views`, folds no whole number, or an option is unknown or of another type.
-        ValueError: fewer views than folds, fewer than 2 folds, more than one camera, or `bow`.
+        ValueError: fewer views than folds, fewer than 2 folds, or more than one camera.
         CalibrationError: a refit did not converge.
 
     Example:
@@ -113,10 +115,9 @@ def cross_validate(
     _check_views(views)
     _check_lens(distortion)
     chosen = calibration_options("cross_validate", options)
-    if chosen.bow:
-        raise ValueError("bow: want False, for held-out views are located on a flat board")
     want = f"a whole number from 2 to the number of views, {len(views)}"
     folds = whole_number("folds", folds, want, least=2, most=len(views))
+    views = _with_true_centres(views, target, distortion, chosen, "cross_validate")
     fits, errors = without_views(views, target, distortion, folds_of(views, folds), chosen, who="cross_validate")
     held_out_px, held_out_world, lost = errors.over_views()
     in_sample_px, in_sample_world, _ = errors_of(fits, fits.views.pixels, fits.used).over_views()
@@ -148,8 +149,8 @@ def bootstrap(
         options: as `calibrate` takes them, except `weights`, which count here how often a view was drawn.
 
     Returns:
-        The standard deviations by parameter name, as in `Covariance.deviations`. Draws that did not converge are left
-        out.
+        The standard deviations by parameter name, as in `Covariance.deviations` but for free points. Draws that did
+        not converge are left out.
 
     Raises:
         TypeError: views are no `dp.Views`, draws or seed no whole numbers, or an option is unknown or of another type.
@@ -169,6 +170,7 @@ def bootstrap(
     if "weights" in options:
         raise ValueError("weights: want none, for they count here how often a view was drawn")
     generator = torch.Generator().manual_seed(checked_seed(seed))
+    views = _with_true_centres(views, target, distortion, chosen, "bootstrap")
     group = _groups(Data(views, target, None))
     number = int(group.amax()) + 1
     if number < 2:
@@ -183,7 +185,8 @@ def bootstrap(
     kept = found.converged
     if int(kept.sum()) < max(2, draws // 2):
         raise CalibrationError(f"bootstrap: {int(kept.sum())} of {draws} draws determine the camera; add views", found)
-    return dict(zip(found.parameters.names, found.shared[kept].std(0).unbind(), strict=True))
+    names, spread = found.parameters.few_names, found.shared[kept].std(0)
+    return dict(zip(names, spread[: len(names)].unbind(), strict=True))
 
 
 def _check_views(views: Views) -> None:
@@ -196,6 +199,13 @@ def _check_lens(distortion: str) -> None:
         raise ValueError(
             "distortion: want the name of a lens, got 'auto'; calibrate with it, and give the lens it took"
         )
+
+
+def _with_true_centres(views: Views, target: Target, distortion: LensModel, chosen: Options, who: str) -> Views:
+    """The views; of circles, with their middles moved to where all views together put the centres."""
+    if not isinstance(target, CircleGrid):
+        return views
+    return with_true_centres(lambda moved: calibrated(moved, target, distortion, chosen, who), views, target).views
 
 
 def _groups(data: Data) -> Tensor:

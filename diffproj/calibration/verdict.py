@@ -15,7 +15,7 @@ from diffproj.calibration.reach import folds_at_corners, lost_corners
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import mean_squares
-from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.boards import Board, faces_away
 from diffproj.targets.landmarks import Landmarks
 
 MAX_RELATIVE_STD = 0.1
@@ -32,6 +32,10 @@ MIN_FORESHORTENING = 0.05
 PARALLEL_ANGLE = math.radians(15)
 """Angle between boards below which they count as parallel: they hardly determine the focal length, and the tilt
 found is arbitrary."""
+
+FEWEST_FOR_A_SHAPE = 6
+"""Different views that free points take, of which nothing is known beforehand. From fewer the shape takes what is wrong
+in a single view for its own: on real photographs, error bars then were half of what they should be."""
 
 NEARLY_NONE, MOST = 1e-3, 0.9
 """Weight below which a robust loss leaves nearly nothing of a corner, and the share of such corners that is most."""
@@ -70,6 +74,13 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     mirrored = ~no_pose & _mirrored(R, t, task.points, used, board)
     misfits = ~no_pose & used & (_relative_error(found) > MAX_RELATIVE_RESIDUAL)
     unknown = known.undetermined.clone()
+    if task.restraint is not None:  # points that hardly any view shows stay where they are, and say nothing of others
+        unknown[:, task.parameters.few :] &= ~task.restraint.unknown
+        size = (task.points - task.points.mean(0)).square().sum(-1).mean().sqrt()
+        unsure = known.shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, task.parameters.few :]
+        unknown[:, task.parameters.few :] |= unsure.isfinite() & (unsure > MAX_RELATIVE_STD * size)
+        shapeless = _too_few_for_a_shape(task)
+        unknown[:, -1] |= shapeless
     std = known.shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, :4]
     unknown[:, :4] |= _hardly_known(task, std / solution.shared[:, :1].abs())
     none = ~used.any(-1)
@@ -131,7 +142,11 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
         elif bool(alone[p]) and not (int(used[p].sum()) == 1 and bool(unknown[p].any())):
             causes[p] = ONE_VIEW if int(used[p].sum()) == 1 else f"the views show the board alike, and {ONE_VIEW}"
         elif not bool(redundant[p]) or bool(unknown[p].any()):
-            lacking = [name for name, lost in zip(task.names, unknown[p].tolist(), strict=True) if lost]
+            few = task.parameters.few_names
+            lacking = [name for name, lost in zip(few, unknown[p].tolist(), strict=False) if lost]
+            if task.free:
+                causes[p] = _shapeless(lacking, bool(unknown[p, len(few) :].any()), int(used[p].sum()))
+                continue
             seen = task.part(slice(p, p + 1))
             free = task.basis is None or bool(task.basis[p, 2:4].any())
             if task.solid or isinstance(board, Landmarks):
@@ -186,13 +201,13 @@ def _relative_error(found: Fit) -> Tensor:
 
 
 def _mirrored(R: Tensor, t: Tensor, points: Tensor, used: Tensor, board: object) -> Tensor:
-    """Which views show the board mirrored `(P, V)`: against a `Chessboard`'s axes, or else against the majority."""
+    """Which views show the board mirrored `(P, V)`: against a board's axes, or else against the majority."""
     middle = R @ points.mean(0) + t
     away = (R[..., 2] * middle).sum(-1) > 0  # the board's z points away from the camera
     if isinstance(board, Landmarks):  # not printed on one face of anything
         return torch.zeros_like(used)
-    if isinstance(board, Chessboard):
-        expected = torch.full_like(away[:, :1], board.axes == "opencv")
+    if isinstance(board, Board):
+        expected = torch.full_like(away[:, :1], faces_away(board))
     else:
         expected = 2 * (away & used).sum(-1, keepdim=True) >= used.sum(-1, keepdim=True)
     return used & (away != expected)
@@ -245,6 +260,26 @@ def _foreshortening(task: Task) -> Tensor:
     H = homographies(task.points, task.pixels, task.used)
     half = (task.points[:, :2] - task.points[:, :2].mean(0)).abs().amax(0)
     return (H[..., 2, :2].abs() * half).sum(-1) / H[..., 2, 2].abs()
+
+
+def _too_few_for_a_shape(task: Task) -> Tensor:
+    """Which cameras have too few different views for free points of which nothing is known beforehand `(P,)`."""
+    views = task.used.any(-1).to(task.pixels)
+    views = (views if task.shares is None else views * task.shares).sum(-1)
+    free = task.restraint.printed.sum(-1) == 0 if task.restraint is not None else torch.zeros_like(views) > 0
+    return free & (views < FEWEST_FOR_A_SHAPE - 0.5)
+
+
+def _shapeless(lacking: list[str], points: bool, views: int) -> str:
+    """What is to be said where the points of the target are free."""
+    lacking = [*lacking, *(["the places of the target's points"] if points else [])]
+    what = (
+        f"{views} views do not determine {', '.join(lacking)}" if lacking else "there are fewer corners than parameters"
+    )
+    return (
+        f"{what} together with its shape: take {FEWEST_FOR_A_SHAPE} and more that differ, tilted by 20 to 50 degrees "
+        "about both axes; or say how well the target was printed, such as priors={'points': 0.1}; or take shape='flat'"
+    )
 
 
 def _joined_names(names: tuple[str, ...], chosen: Tensor) -> str:

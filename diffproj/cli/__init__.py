@@ -16,7 +16,8 @@ from importlib import import_module
 from diffproj import __version__
 
 COMMANDS = {
-    "calibrate": "find a camera from photographs of a chessboard, and write a camera file",
+    "board": "write a page with a board to print at true scale",
+    "calibrate": "find a camera from photographs of a board, and write a camera file",
     "measure": "measure points, lengths and an area on a plane in a photograph, with error bars",
     "locate": "find where a camera stood from surveyed landmarks that a photograph shows",
     "convert": "turn a camera file of one program into that of another",

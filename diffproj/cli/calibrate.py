@@ -5,13 +5,14 @@ import functools
 from pathlib import Path
 from typing import get_args
 
+from diffproj.calibration.shape import Shape
 from diffproj.cli.drawing import drawing
-from diffproj.cli.inputs import add_orientation, board_size, camera_file, some_path
-from diffproj.cli.units import square_side
+from diffproj.cli.inputs import add_orientation, camera_file, some_path
+from diffproj.cli.which_board import add_kinds, add_measures, check_board
 from diffproj.lens.names import LensModel
 
 DESCRIPTION = """\
-Finds a camera from photographs of a chessboard: focal lengths, principal point
+Finds a camera from photographs of a board: focal lengths, principal point
 and lens with their standard deviations, and where the camera stood. Prints what
 it found and writes a camera file.
 
@@ -28,6 +29,11 @@ examples:
   diffproj calibrate left*.jpg --board 9x6 --square 25mm -o camera.yaml
   diffproj calibrate wide/ --board 11x8 --square 3cm --distortion auto \\
       --draw wide.png
+  diffproj calibrate photos/ --charuco 8x6 --square 25mm --marker 18mm \\
+      --dictionary 5X5_100
+  diffproj calibrate photos/ --aprilgrid 6x6 --tag 88mm --spacing 0.3
+  diffproj calibrate photos/ --circles 11x4 --asymmetric --spacing 20mm \\
+      --diameter 15mm
 
 The file is for diffproj.load_camera("camera.json") in Python; OpenCV reads the
 YAML and XML by cv2.FileStorage: camera_matrix, distortion_coefficients.
@@ -46,26 +52,16 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "photographs", nargs="+", type=some_path, metavar="PHOTO", help="photographs by one camera, or folders of them"
     )
     board = command.add_argument_group("the board")
+    add_kinds(board.add_mutually_exclusive_group(required=True))
+    add_measures(board)
     board.add_argument(
-        "--board",
-        type=board_size,
-        required=True,
-        metavar="CxR",
-        help="its inner corners, columns x rows: a board of 10 by 7 squares has 9x6 (required)",
+        "--shape",
+        choices=get_args(Shape),
+        default="flat",
+        help="of the print: flat, as it was designed; bow, bent a little: fit how far its middle stands off its edges, "
+        "too; free: fit where each corner is, too, which takes six views and more (default: flat)",
     )
-    board.add_argument(
-        "--square",
-        type=square_side,
-        required=True,
-        metavar="SIDE",
-        help="side of a square, measured on the print, such as 25mm, 2.5cm or 1in; its unit becomes the world's "
-        "(required)",
-    )
-    board.add_argument(
-        "--bow",
-        action="store_true",
-        help="the board may be bent a little: fit how far its middle stands off its edges, too",
-    )
+    board.add_argument("--bow", action="store_const", const="bow", dest="shape", help="the same as --shape bow")
     lens = command.add_argument_group("the camera")
     lens.add_argument(
         "--distortion",
@@ -108,6 +104,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
 
 
 def _check_together(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Check that the file can hold what is fitted."""
+    """Check that the board is measured, and that the file can hold what is fitted."""
+    check_board(command, options)
     if options.skew and options.output.suffix.lower() != ".json":
         command.error(f"--output: want a .json with --skew, which OpenCV's formats do not hold, got {options.output}")

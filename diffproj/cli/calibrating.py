@@ -1,4 +1,4 @@
-"""`diffproj calibrate`: from photographs of a chessboard to a camera file."""
+"""`diffproj calibrate`: from photographs of a board to a camera file."""
 
 import argparse
 import textwrap
@@ -13,16 +13,15 @@ from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawi
 from diffproj.cli.inputs import check_writable, writing
 from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import RESULTS, aligned, in_options, progress_bars, result, rounded
+from diffproj.cli.which_board import given_board
 from diffproj.files.save import save_camera
-from diffproj.targets.chessboard import Chessboard
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
     check_writable("--output", options.output)
     check_drawing(options.draw)
-    columns, rows = options.board
-    board = Chessboard(columns, rows, options.square.value)
+    board, side, _ = given_board(options)
     sources = photographs(options.photographs)
     check_no_photograph(options.draw, sources)
     with progress_bars() as bars:
@@ -32,12 +31,12 @@ def run(options: argparse.Namespace) -> int:
             views,
             board,
             options.distortion,
-            bow=options.bow,
+            shape=options.shape,
             skew=options.skew,
             reject_outliers=options.reject_outliers,
             progress=lambda done, total: bars.update(task, completed=done, total=total),
         )
-    calibration = replace(calibration, unit=options.square.unit)
+    calibration = replace(calibration, unit=side.unit)
     if calibration.comparison is not None:
         result(f"Lenses compared\n{calibration.comparison.summary()}\n")
     RESULTS.print(_views_table(calibration))
@@ -79,15 +78,22 @@ def _views_table(calibration: Calibration) -> Table:
 
 
 def _parameters_table(calibration: Calibration) -> Table:
-    values = calibration.shared.tolist()
+    names = calibration.parameters.few_names
     known = calibration.covariance.deviations
-    pairs = [rounded(value, float(deviation)) for value, deviation in zip(values, known.values(), strict=True)]
+    pairs = [
+        rounded(value, float(known[name])) for name, value in zip(names, calibration.shared.tolist(), strict=False)
+    ]
     table = Table(title="Camera", title_justify="left")
     table.add_column("parameter")
     table.add_column("value", no_wrap=True)
     table.add_column("standard deviation", no_wrap=True)
-    for name, *pair in zip(known, *(aligned(column) for column in zip(*pairs, strict=True)), strict=True):
+    for name, *pair in zip(names, *(aligned(column) for column in zip(*pairs, strict=True)), strict=True):
         table.add_row(_title(name, calibration.unit), *pair)
+    if calibration.displacements is not None:
+        off, sure = (part.square().mean(0).sqrt() for part in (calibration.displacements, calibration.points_deviation))
+        for axis, *pair in zip("xyz", off.tolist(), sure.tolist(), strict=True):
+            title = f"board's corners off the grid along {axis} (RMS), {calibration.unit or 'unit of --square'}"
+            table.add_row(title, *rounded(*pair))
     return table
 
 

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from diffproj.calibration.result import Calibration
+from diffproj.calibration.rig_result import RigCalibration
 from diffproj.cli.terminal import result
 from diffproj.files.document import Document
 from diffproj.files.load import found_in, load, load_camera
@@ -32,6 +33,9 @@ def run(options: argparse.Namespace) -> int:
         for python, remedy in REMEDIES:
             said = said.replace(python, remedy)
         raise ValueError(said) from error
+    if isinstance(found, RigCalibration):
+        result(f"{options.output}: a rig of {', '.join(found.names)}")
+        return 0
     camera = found.camera if isinstance(found, Calibration) else found
     lens = "no lens" if camera.distortion is None else type(camera.distortion).__name__
     many = f"{camera.batch_shape.numel()} cameras" if camera.batch_shape else "one camera"
@@ -40,11 +44,11 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _wanted(options: argparse.Namespace) -> Camera | Calibration:
-    """What to write: a whole calibration where nothing of it is to change."""
+def _wanted(options: argparse.Namespace) -> Camera | Calibration | RigCalibration:
+    """What to write: a whole calibration or rig where nothing of it is to change."""
     plain = options.source is None and options.camera is None and options.size is None and not options.without_pose
     found = load(options.input) if plain else _camera(options)
-    return found if isinstance(found, Calibration) else _sized(found, options)
+    return found if isinstance(found, Calibration | RigCalibration) else _sized(found, options)
 
 
 def _camera(options: argparse.Namespace) -> Camera:

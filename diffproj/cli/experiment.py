@@ -10,8 +10,9 @@ from diffproj.lens.names import LensModel
 
 DESCRIPTION = (
     "Calibrates a camera from views of a chessboard, finds the pose of each test view, puts every corner of it back on "
-    "the board's plane and compares it with its known place. Prints Table 1 and writes table1.csv, fig7.png and "
-    "camera.json (the whole calibration) to the output folder."
+    "the board's plane and compares it with its known place. Prints Table 1, for the board as it was designed and "
+    "as it was printed, whose corners the fitting views tell, and writes both as CSV, fig7.png and camera.json (the "
+    "whole calibration) to the output folder."
 )
 
 

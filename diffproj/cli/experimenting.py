@@ -7,9 +7,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from diffproj._core.atomic import write_whole
+from diffproj.calibration.result import CalibrationError
 from diffproj.cli.inputs import check_folder, writing
 from diffproj.cli.photographs import find_corners, photographs
-from diffproj.cli.terminal import RESULTS, progress_bars, result
+from diffproj.cli.terminal import RESULTS, in_options, progress_bars, result
 from diffproj.cli.units import heading
 from diffproj.files.save import save_camera
 from diffproj.paper.experiment import Experiment, choose, default_split, parse_split, run_experiment
@@ -34,16 +35,35 @@ def run(options: argparse.Namespace) -> int:
     fit, test = choose(views, split)
     outcome = run_experiment(fit, test, board, options.distortion, options.strict)
     outcome = replace(outcome, fit=replace(outcome.fit, unit=options.square.unit))
-    RESULTS.print(_table(outcome))
+    RESULTS.print(_table(outcome, "board as designed"))
+    measured, why = _on_the_measured_board(fit, test, board, options)
+    if measured is None:
+        result(f"\nThe board as it was printed: {why}")
+    else:
+        RESULTS.print(_table(measured, "board as printed, its corners where the fitting views have them"))
     result(f"\n{outcome.fit.summary()}")
     picture = figures.png(figures.fig7(outcome))
     with writing("--output", options.output):
         options.output.mkdir(parents=True, exist_ok=True)
         write_whole(options.output / "table1.csv", outcome.to_csv())
+        if measured is not None:
+            write_whole(options.output / "table1_measured_board.csv", measured.to_csv())
         write_whole(options.output / "fig7.png", picture)
         save_camera(options.output / "camera.json", outcome.fit)
-    result(f"\nWritten to {options.output}: table1.csv, fig7.png, camera.json")
+    second = "" if measured is None else "table1_measured_board.csv, "
+    result(f"\nWritten to {options.output}: table1.csv, {second}fig7.png, camera.json")
     return 0
+
+
+def _on_the_measured_board(
+    fit: Views, test: Views, board: Chessboard, options: argparse.Namespace
+) -> tuple[Experiment | None, str]:
+    """The same with the board's shape as the fitting views tell it; `None` where they do not, and why."""
+    try:
+        outcome = run_experiment(fit, test, board, options.distortion, options.strict, "free")
+    except CalibrationError as error:
+        return None, in_options(str(error))
+    return replace(outcome, fit=replace(outcome.fit, unit=options.square.unit)), ""
 
 
 def _corners(options: argparse.Namespace) -> tuple[Views, Chessboard, tuple[list[int], list[int]]]:
@@ -72,9 +92,9 @@ def _corners(options: argparse.Namespace) -> tuple[Views, Chessboard, tuple[list
     return views, board, default_split(len(views))
 
 
-def _table(outcome: Experiment) -> Table:
+def _table(outcome: Experiment, board: str) -> Table:
     unit = heading(outcome.fit.unit) or "world units"
-    table = Table(title=f"Table 1. Errors on the board ({unit}), mean ± standard deviation")
+    table = Table(title=f"Table 1. Errors on the board ({unit}), mean ± standard deviation; {board}")
     table.add_column("view", overflow="fold")
     table.add_column("corners", justify="right")
     for axis in ("E_x", "E_y", "E_z"):

@@ -34,6 +34,16 @@ def board_size(text: str) -> tuple[int, int]:
     return int(columns), int(rows)
 
 
+def counts(text: str) -> tuple[int, int]:
+    """Read how many things a board has, such as `8x6`."""
+    columns, separator, rows = text.lower().partition("x")
+    if not (separator and columns.isdecimal() and rows.isdecimal() and len(text) < 100):
+        raise argparse.ArgumentTypeError(f"want numbers as COLUMNSxROWS, such as 8x6, got {text!r}")
+    if max(int(columns), int(rows)) > LARGEST_BOARD:
+        raise argparse.ArgumentTypeError(f"want at most {LARGEST_BOARD} each way, got {text!r}")
+    return int(columns), int(rows)
+
+
 def some_path(text: str) -> Path:
     """Read the name of a file or folder; an empty one would be that of the folder where one is."""
     if not text or "\0" in text:

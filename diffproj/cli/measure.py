@@ -4,8 +4,9 @@ import argparse
 import functools
 
 from diffproj.cli.drawing import drawing
-from diffproj.cli.inputs import DETECTOR, HAND, LARGEST_NUMBER, add_orientation, board_size, numbers, some_path
-from diffproj.cli.units import Length, height, square_side
+from diffproj.cli.inputs import DETECTOR, HAND, LARGEST_NUMBER, add_orientation, numbers, some_path
+from diffproj.cli.units import Length, height
+from diffproj.cli.which_board import add_kinds, add_measures, check_board
 
 DESCRIPTION = """\
 Turns pixels of a photograph into points on a plane, and prints them with the
@@ -13,8 +14,9 @@ lengths between successive points, and from three points on the area that they
 enclose in their order, each with its standard deviation and 95 % interval.
 
 Where the camera stood is taken from a board in the photograph (--board and
---square), or from a view that the camera file knows (--view): one that it was
-calibrated with, or the one that 'diffproj locate' found from landmarks.
+--square, or another board), or from a view that the camera file knows (--view):
+one that it was calibrated with, or the one that 'diffproj locate' found from
+landmarks.
 """
 
 EPILOG = """\
@@ -93,20 +95,9 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
     pose = command.add_argument_group("where the camera stood: a board in PHOTO, or a view of the calibration")
     either = pose.add_mutually_exclusive_group(required=True)
-    either.add_argument(
-        "--board",
-        type=board_size,
-        metavar="CxR",
-        help="inner corners of the board, columns x rows: a board of 10 by 7 squares has 9x6",
-    )
+    add_kinds(either)
     either.add_argument("--view", metavar="NAME", help="name of the view, such as left01.jpg")
-    pose.add_argument(
-        "--square",
-        type=square_side,
-        metavar="SIDE",
-        help="side of a square of the board, measured on the print, such as 25mm, 2.5cm or 1in; its unit becomes that "
-        "of all results",
-    )
+    add_measures(pose)
     plane = command.add_argument_group("the plane")
     which = plane.add_mutually_exclusive_group()
     which.add_argument(
@@ -180,7 +171,6 @@ def _check_which_pose(command: argparse.ArgumentParser, options: argparse.Namesp
         )
     if options.view is not None and options.square is not None:
         command.error("--square: goes with --board, not with --view")
-    if options.board is not None and options.photograph is None:
+    if options.view is None and options.photograph is None:
         command.error("PHOTO: want a photograph that shows the board, got none")
-    if options.board is not None and options.square is None:
-        command.error("--square: want the side of the board's squares along with --board, got none")
+    check_board(command, options)

@@ -12,7 +12,7 @@ import numpy as np
 from rich.progress import Progress
 
 from diffproj.cli.terminal import counted, note
-from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.boards import Board
 from diffproj.targets.detection import detect
 from diffproj.targets.images import SUFFIXES, Source, listed
 from diffproj.targets.views import Views
@@ -44,7 +44,7 @@ def photographs(paths: Iterable[Path]) -> list[Source]:
 
 
 def find_corners(
-    sources: list[Any], board: Chessboard, bars: Progress, title: str = "Finding corners", orientation: str = "sensor"
+    sources: list[Any], board: Board, bars: Progress, title: str = "Finding corners", orientation: str = "sensor"
 ) -> Views:
     """The board's corners in photographs, on all cores, under a progress bar."""
     task = bars.add_task(title, total=None)

@@ -9,12 +9,13 @@ import torch
 
 from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.calibration.rig_result import RigCalibration
 from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.terminal import progress_bars
 from diffproj.cli.units import Length, agreed, heading
+from diffproj.cli.which_board import given_board
 from diffproj.files.load import load
 from diffproj.geometry.camera import Camera
-from diffproj.targets.chessboard import Chessboard
 
 
 @dataclass(frozen=True)
@@ -93,9 +94,10 @@ def new_photograph(options: argparse.Namespace) -> Scene:
         ValueError: no single photograph, no board in it, another size than the camera's, or no pose that fits.
     """
     camera, calibration = loaded(options.camera)
-    square = options.square
+    board, side, option = given_board(options)
+    square = Length(_first_step(board.points), side.unit)
     if calibration is not None:
-        square, doubt = agreed(square, _calibrated_square(calibration), options.camera)
+        square, doubt = agreed(square, _calibrated_square(calibration), options.camera, option)
         if doubt is not None:
             warnings.warn(doubt, stacklevel=2)
     if options.photograph.is_dir():
@@ -103,8 +105,6 @@ def new_photograph(options: argparse.Namespace) -> Scene:
     sources = photographs([options.photograph])
     if len(sources) > 1:
         raise ValueError(f"PHOTO: want one photograph, got {len(sources)} of the form {options.photograph}")
-    columns, rows = options.board
-    board = Chessboard(columns, rows, square.value)
     with progress_bars() as bars:
         views = find_corners(sources, board, bars, orientation=options.orientation)
     check_size(camera, views.size, options.camera, options.photograph)
@@ -112,14 +112,14 @@ def new_photograph(options: argparse.Namespace) -> Scene:
         found = locate(views, board, camera if calibration is None else calibration)
     except CalibrationError as error:
         raise ValueError(
-            f"{options.photograph}: no pose of the board explains its corners; check --camera, --board and --square"
+            f"{options.photograph}: no pose of the board explains its corners; check --camera and the board's options"
         ) from error
     includes = ("pixels", "pose")
     title = f"{options.photograph}: board found\nRMS {float(found.rms):.4f} px over {int(found.used.sum())} corners"
     if calibration is not None:
         title += f" ({float(calibration.rms):.4f} px in the calibration)"
         includes += ("camera",) if calibration.knows_intrinsics else ()
-    unit = heading(square.unit) or "the unit of --square"
+    unit = heading(square.unit) or f"the unit of {option}"
     return Scene(options.camera, Path(str(sources[0])), found, 0, includes, title, square, unit)
 
 
@@ -131,6 +131,11 @@ def loaded(path: Path) -> tuple[Camera, Calibration | None]:
         ValueError: it holds no camera, or several.
     """
     found = load(path)
+    if isinstance(found, RigCalibration):
+        raise ValueError(  # noqa: TRY004
+            f"--camera: want one camera, got a rig of {', '.join(found.names)} in {path}; diffproj convert "
+            "--camera NAME takes one of them out"
+        )
     camera, calibration = (found.camera, found) if isinstance(found, Calibration) else (found, None)
     if camera.batch_shape:
         raise ValueError(f"--camera: want one camera, got {camera.batch_shape.numel()} side by side in {path}")
@@ -156,5 +161,9 @@ def _calibrated_square(calibration: Calibration) -> Length:
 
     Landmarks have no such side: only the unit counts.
     """
-    first, second, *_ = calibration.points
-    return Length(float(torch.linalg.vector_norm(second - first)), calibration.unit)
+    return Length(_first_step(calibration.points), calibration.unit)
+
+
+def _first_step(points: torch.Tensor) -> float:
+    """The distance from the first point to the second."""
+    return float(torch.linalg.vector_norm(points[1] - points[0]))

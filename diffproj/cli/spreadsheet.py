@@ -48,7 +48,9 @@ class Spreadsheet:
                 if any(cells) and not cells[0].startswith("#"):
                     yield reader.line_num, cells
         except csv.Error as error:
-            raise ValueError(f"{self._option}: want {self._want}, got something else in {self.path} ({error})") from None
+            raise ValueError(
+                f"{self._option}: want {self._want}, got something else in {self.path} ({error})"
+            ) from None
 
     def number(self, cell: str) -> float | None:
         """The number in a cell; `None` where there is none, or one that is not finite or beyond 1e100."""

@@ -46,9 +46,11 @@ def in_options(text: str) -> str:
     text = re.sub(r", or (let fixed or priors hold|fix) the principal point and the lens( \([^)]*\))?", "", text)
     return (
         text.replace("distortion=", "--distortion ")
-        .replace("bow=True", "--bow")
+        .replace("shape=", "--shape ")
         .replace("skew=True", "--skew")
         .replace("'auto'", "auto")
+        .replace("give legacy=True", "give --legacy")
+        .replace("give legacy=False", "leave --legacy out")
     )
 
 

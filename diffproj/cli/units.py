@@ -44,6 +44,16 @@ def square_side(text: str) -> Length:
     return found
 
 
+def length(text: str) -> Length:
+    """Read a length of the board, such as `18mm`, `18` or `0.3`."""
+    found = _length(text)
+    if found is None or not SMALLEST <= found.value <= 1 / SMALLEST:
+        raise argparse.ArgumentTypeError(
+            f"want a positive number, with its unit or without, such as 18mm, got {text!r}"
+        )
+    return found
+
+
 def height(text: str) -> Length:
     """Read a height, such as `12`, `-3` or `1.2cm`."""
     found = _length(text)
@@ -82,7 +92,7 @@ def heading(unit: str | None) -> str | None:
     return None if unit is None else IN_WORDS.get(unit, unit)
 
 
-def agreed(square: Length, calibrated: Length, file: object) -> tuple[Length, str | None]:
+def agreed(square: Length, calibrated: Length, file: object, option: str = "--square") -> tuple[Length, str | None]:
     """The side with its unit, and a warning where it is not that of the calibration.
 
     Where no unit is given and the number is the calibration's, so is the unit.
@@ -91,8 +101,9 @@ def agreed(square: Length, calibrated: Length, file: object) -> tuple[Length, st
         square: that of the board in the photograph.
         calibrated: that of the board that the camera was calibrated with.
         file: the camera file, for the warning.
+        option: which option gave the side, for the warning.
     """
-    given = f"--square: {square} here, and {calibrated} in {file}"
+    given = f"{option}: {square} here, and {calibrated} in {file}"
     if not {square.unit, calibrated.unit} <= set(METRES):
         if math.isclose(square.value, calibrated.value, rel_tol=SAME):
             unit = square.unit or calibrated.unit

@@ -45,20 +45,33 @@ def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
     Raises:
         ValueError: a lens that Kalibr does not have, skew, or no size.
     """
-    lines = []
+    lines: list[str] = []
     for i, camera in enumerate(cameras_of(item, "Kalibr")):
-        if camera.size is None:
-            raise ValueError("size: want the size of the image, which Kalibr needs; Camera(..., size=(width, height))")
-        model = "equidistant" if is_fisheye(camera) else "none" if camera.distortion is None else "radtan"
-        lens = coefficients(camera) if model != "radtan" else first_brown(camera, 4, "Kalibr's radtan")
-        (f_x, _, c_x), (_, f_y, c_y), _ = camera.K.tolist()
-        rows = np.vstack([np.column_stack([camera.R.numpy(), camera.t.numpy()]), [0, 0, 0, 1]]).tolist()
-        lines += [f"cam{i}:", "  T_cam_imu:", *(f"  - {numbers_text(row)}" for row in rows)]
-        lines += ["  cam_overlaps: []", "  camera_model: pinhole", f"  distortion_coeffs: {numbers_text(lens)}"]
-        lines += [f"  distortion_model: {model}", f"  intrinsics: {numbers_text([f_x, f_y, c_x, c_y])}"]
-        lines += [f"  resolution: [{camera.size[0]}, {camera.size[1]}]", f"  rostopic: /cam{i}/image_raw"]
-        lines += [f"  timeshift_cam_imu: {number_text(0.0)}"]
+        pose = np.column_stack([camera.R.numpy(), camera.t.numpy()]).tolist()
+        lines += [*camera_lines(i, camera, pose, "T_cam_imu"), f"  timeshift_cam_imu: {number_text(0.0)}"]
     return {path: "\n".join(lines) + "\n"}
+
+
+def camera_lines(number: int, camera: Camera, pose: list[list[float]], key: str) -> list[str]:
+    """The lines of one camera, with three rows of its pose under a key; without a pose where the key is empty.
+
+    Raises:
+        ValueError: a lens that Kalibr does not have, skew, or no size.
+    """
+    if camera.size is None:
+        raise ValueError("size: want the size of the image, which Kalibr needs; Camera(..., size=(width, height))")
+    if bool(camera.K[0, 1] != 0):
+        raise ValueError(f"K: want no skew, which Kalibr does not hold, got {float(camera.K[0, 1]):.3g} px; use .json")
+    model = "equidistant" if is_fisheye(camera) else "none" if camera.distortion is None else "radtan"
+    lens = coefficients(camera) if model != "radtan" else first_brown(camera, 4, "Kalibr's radtan")
+    (f_x, _, c_x), (_, f_y, c_y), _ = camera.K.tolist()
+    lines = [f"cam{number}:"]
+    if key:
+        lines += [f"  {key}:", *(f"  - {numbers_text(row)}" for row in [*pose, [0.0, 0.0, 0.0, 1.0]])]
+    lines += ["  cam_overlaps: []", "  camera_model: pinhole", f"  distortion_coeffs: {numbers_text(lens)}"]
+    lines += [f"  distortion_model: {model}", f"  intrinsics: {numbers_text([f_x, f_y, c_x, c_y])}"]
+    lines += [f"  resolution: [{camera.size[0]}, {camera.size[1]}]", f"  rostopic: /cam{number}/image_raw"]
+    return lines
 
 
 def _cameras(tree: dict[str, Any]) -> dict[str, dict[str, Any]]:

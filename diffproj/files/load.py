@@ -1,14 +1,20 @@
 """`load`, `load_camera` and `load_calibration`: cameras and calibrations from files."""
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import numpy as np
 
 from diffproj._core.arguments import file_path
 from diffproj.calibration.result import Calibration
+from diffproj.calibration.rig_result import RigCalibration
 from diffproj.files import own_json
 from diffproj.files.document import Document
 from diffproj.files.formats import FormatName, PathLike, format_of
 from diffproj.files.found import Found
 from diffproj.geometry.camera import Camera
+
+T = TypeVar("T")
 
 DAMAGE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 """What a reader meets in a file that is not what it says; all become one `ValueError` that names the file."""
@@ -81,30 +87,31 @@ def load_calibration(path: PathLike) -> Calibration:
         True
     """
     document = Document.read(file_path("path", path))
-    calibration = _calibration(document)
+    calibration = _own(document, own_json.read_calibration)
     if calibration is None:
         raise ValueError(
-            f"{path}: want a calibration as save_camera writes it to .json, got a file with cameras alone; load_camera "
-            "reads it"
+            f"{path}: want a calibration as save_camera writes it to .json, got a file with cameras alone or a rig; "
+            "load reads it"
         )
     return calibration
 
 
-def load(path: PathLike) -> Camera | Calibration:
-    """Load what a file holds: the whole calibration where there is one, the camera otherwise.
+def load(path: PathLike) -> Camera | Calibration | RigCalibration:
+    """Load what a file holds: the whole calibration or rig where there is one, the camera otherwise.
 
     Raises:
         TypeError: the path is none.
         OSError: there is no such file, or it cannot be read.
         ValueError: as for `load_camera`.
     """
-    calibration = _calibration(Document.read(file_path("path", path)))
-    return load_camera(path) if calibration is None else calibration
+    document = Document.read(file_path("path", path))
+    found = _own(document, own_json.read_rig) or _own(document, own_json.read_calibration)
+    return load_camera(path) if found is None else found
 
 
-def _calibration(document: Document) -> Calibration | None:
+def _own(document: Document, read: Callable[[Document], T | None]) -> T | None:
     try:
-        return own_json.read_calibration(document) if own_json.recognises(document) else None
+        return read(document) if own_json.recognises(document) else None
     except DAMAGE as error:
         raise ValueError(_message(document, error)) from error
 

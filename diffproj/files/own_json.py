@@ -1,11 +1,12 @@
-"""This package's own JSON: any batch of cameras, or a whole calibration with its corners and its covariance.
+"""This package's own JSON: any batch of cameras, a whole calibration with its corners and its covariance, or a rig.
 
     {"format": "diffproj camera", "version": 2,
      "camera": {"dtype", "size", "K", "R", "t", "lens": {"model", "coefficients"}},
      "calibration": {"rms", "R", "t", "points", "pixels", "visible", "used", ..., "covariance", "other_poses"}}
 
-`calibration` is there only where a whole calibration was saved. Numbers are written so that they come back exactly;
-`null` stands for one that is not finite. Where a list would have thousands of numbers, they stand packed in it, as
+`calibration` is there only where a whole calibration was saved. A rig is of the format "diffproj rig", with `cameras`
+by name, each at its place, and all else in `rig`. Numbers are written so that they come back exactly; `null` stands for
+one that is not finite. Where a list would have thousands of numbers, they stand packed in it, as
 
     {"shape": [1000, 54, 2], "float64": "..."}          or "bool": base64 of little-endian numbers, row by row
 
@@ -26,6 +27,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.result import Calibration
+from diffproj.calibration.rig_result import RigCalibration
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.numbers import image_size
@@ -33,6 +35,7 @@ from diffproj.geometry.camera import Camera
 from diffproj.lens.models import KINDS, coefficients_of
 
 KIND, VERSION = "diffproj camera", 2
+RIG = "diffproj rig"
 """What every file says of itself."""
 
 MANY = 4096
@@ -44,16 +47,20 @@ DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 def recognises(document: Document) -> bool:
-    """Whether it calls itself a camera file of diffproj."""
-    return document.mapping.get("format") == KIND
+    """Whether it calls itself a camera file of diffproj, or a rig's."""
+    return document.mapping.get("format") in (KIND, RIG)
 
 
-def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
-    """A camera or a calibration.
+def write(path: Path, item: Camera | Calibration | RigCalibration) -> dict[Path, str]:
+    """A camera, a calibration or a rig.
 
     Raises:
         ValueError: a lens of another library.
     """
+    if isinstance(item, RigCalibration):
+        cameras = {name: _camera_fields(camera) for name, camera in item.cameras.items()}
+        whole = {"format": RIG, "version": VERSION, "cameras": cameras, "rig": item.to_fields()}
+        return {path: _readable(json.dumps(_plain(whole), indent=1, allow_nan=False))}
     camera = item.camera if isinstance(item, Calibration) else item
     document = {"format": KIND, "version": VERSION, "camera": _camera_fields(camera)}
     if isinstance(item, Calibration):
@@ -62,12 +69,31 @@ def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
 
 
 def read(document: Document) -> Found:
-    """The camera of a file, a batch where it is one; of a calibration, the one without a pose.
+    """The camera of a file, a batch where it is one; of a calibration, the one without a pose; all of a rig.
 
     Raises:
         ValueError: it is no camera file of this package, or damaged.
     """
-    return Found({"camera": _camera(_checked(document)["camera"])})
+    fields = _checked(document)
+    if fields["format"] == RIG:
+        return Found({name: _camera(camera) for name, camera in fields["cameras"].items()})
+    return Found({"camera": _camera(fields["camera"])})
+
+
+def read_rig(document: Document) -> RigCalibration | None:
+    """The rig in a file; `None` where it holds none.
+
+    Raises:
+        ValueError: it is no file of this package, or damaged.
+    """
+    fields = _checked(document)
+    if fields["format"] != RIG:
+        return None
+    try:
+        cameras = {name: _camera(camera) for name, camera in fields["cameras"].items()}
+        return RigCalibration.from_fields(_unpacked(fields["rig"]), cameras)
+    except DAMAGE as error:
+        raise ValueError(f"the rig in this file is damaged ({_said(error)})") from error
 
 
 def read_calibration(document: Document) -> Calibration | None:
@@ -77,7 +103,7 @@ def read_calibration(document: Document) -> Calibration | None:
         ValueError: it is no camera file of this package, or damaged.
     """
     fields = _checked(document)
-    if fields.get("calibration") is None:
+    if fields["format"] == RIG or fields.get("calibration") is None:
         return None
     camera = _camera(fields["camera"])
     try:
@@ -135,7 +161,8 @@ def _tensor(fields: dict[str, Any], name: str, dtype: torch.dtype) -> Tensor:
 def _checked(document: Document) -> dict[str, Any]:
     """What is in a file, known to be one of this package and of a version that is read."""
     fields = document.mapping
-    if fields.get("format") != KIND or "camera" not in fields:
+    holds = {KIND: "camera", RIG: "cameras"}.get(str(fields.get("format")))
+    if holds is None or holds not in fields or (holds == "cameras" and not isinstance(fields[holds], dict)):
         raise ValueError("want a camera file of diffproj, got another file")
     version = fields.get("version")
     if isinstance(version, bool) or version not in range(1, VERSION + 1):

@@ -5,17 +5,24 @@ from kornia.geometry.camera import PinholeCamera
 from diffproj._core.arguments import file_path
 from diffproj._core.atomic import write_whole
 from diffproj.calibration.result import Calibration
+from diffproj.calibration.rig_result import RigCalibration
+from diffproj.files import rigs
 from diffproj.files.formats import FormatName, PathLike, format_to_write
 from diffproj.geometry.camera import Camera, as_camera
 
 
-def save_camera(path: PathLike, camera: Camera | PinholeCamera | Calibration, format: FormatName | None = None) -> None:  # noqa: A002
-    """Save a camera or a calibration.
+def save_camera(
+    path: PathLike,
+    camera: Camera | PinholeCamera | Calibration | RigCalibration,
+    format: FormatName | None = None,  # noqa: A002
+) -> None:
+    """Save a camera, a calibration or a rig.
 
     A file is written whole or not at all. What a format cannot hold is refused, not dropped: a pose, a batch, skew, the
-    last coefficients of a lens. This package's own JSON holds all, and whole calibrations. Of a calibration, the other
-    formats hold the camera alone, without the world's unit and the error bars; OpenCV's also get the poses, with the
-    unit as `world_unit`, and the RMS errors, for other programs: `load_camera` reads the camera.
+    last coefficients of a lens. This package's own JSON holds all, and whole calibrations and rigs. Of a calibration,
+    the other formats hold the camera alone, without the world's unit and the error bars; OpenCV's also get the poses,
+    with the unit as `world_unit`, and the RMS errors, for other programs: `load_camera` reads the camera. Of a rig,
+    OpenCV's formats hold a pair, Kalibr's a chain of cameras.
 
     Args:
         path: the file to write; its folder must exist.
@@ -37,16 +44,20 @@ def save_camera(path: PathLike, camera: Camera | PinholeCamera | Calibration, fo
         >>> bool(again.rms == calibration.rms)
         True
     """
-    if not isinstance(camera, Camera | PinholeCamera | Calibration):
-        raise TypeError(f"camera: want dp.Camera or dp.Calibration, got {type(camera).__name__}")
+    if not isinstance(camera, Camera | PinholeCamera | Calibration | RigCalibration):
+        raise TypeError(f"camera: want dp.Camera, dp.Calibration or a rig, got {type(camera).__name__}")
     if isinstance(camera, PinholeCamera):
         camera = as_camera(camera)
     one = camera.camera if isinstance(camera, Calibration) else camera
-    if any(part.is_meta for part in one.tensors()):
+    if isinstance(one, Camera) and any(part.is_meta for part in one.tensors()):
         raise ValueError("camera: want values to write, got tensors on the device meta")
     path = file_path("path", path)
     try:
-        contents = format_to_write(path, format).write(path, camera)
+        contents = (
+            rigs.write(path, camera, format)
+            if isinstance(camera, RigCalibration)
+            else (format_to_write(path, format).write(path, camera))
+        )
     except ValueError as error:
         said = str(error)
         raise ValueError(said if said.startswith("format:") else f"{path}: {said}") from error

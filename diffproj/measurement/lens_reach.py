@@ -41,7 +41,7 @@ def stretch(
         camera: at its pose.
         parameters: of the camera.
         plane: of the points.
-        known: the covariance of camera, bow and pose `(*B, q, q)`.
+        known: the covariance of camera and pose `(*B, q, q)`.
         middle: where the pose turns about in it `(3,)`; the world's origin if `None`.
         by_theta: the derivative of the points by these `(*B, N, 3, q)`.
     """

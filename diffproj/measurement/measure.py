@@ -20,7 +20,6 @@ Where a view's pose may be the wrong one of two, the other is too far away for t
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -97,7 +96,7 @@ def measure(
         number = view_number(chosen_view(calibration, view), calibration.views.names)
         camera, known, middle = _at_view(calibration, number)
         posed = calibration.posed[..., number]
-        parameters = replace(calibration.parameters, bow=False)
+        parameters = calibration.parameters.of_camera
         doubtful = doubts(calibration, number)
     else:
         camera = as_camera(calibration, "calibration").upright()
@@ -185,6 +184,10 @@ def _at_view(calibration: Calibration, number: int) -> tuple[Camera, Tensor | No
         covariance = calibration.covariance_of_kept_poses
         known, middle = covariance.about_middle.view(number), covariance.middle
         known = calibration.mismatch.scale[..., number, None, None].square() * known
+        # The shape is that of the target that was calibrated on, and not of what is measured.
+        few, last = calibration.parameters.of_camera.size, known.shape[-1] - POSE
+        rows = torch.tensor([*range(few), *range(last, last + POSE)], device=known.device)
+        known = known[..., rows.unsqueeze(-1), rows]
     return calibration.cameras[..., number], known, middle
 
 
@@ -204,7 +207,7 @@ def _projection_derivatives(
     known: Tensor | None,
     middle: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Derivatives of the pixels by theta `(*B, N, 2, s + 6)` (bow excluded: 0) and by the point `(*B, N, 2, 3)`.
+    """Derivatives of the pixels by theta `(*B, N, 2, s + 6)` and by the point `(*B, N, 2, 3)`.
 
     The pose turns about `middle (3,)`: about a distant origin a turn and a shift would nearly cancel. Where a point is
     not valid, they are those of some other point.
@@ -227,8 +230,6 @@ def _projection_derivatives(
         columns.append(F @ lens.by_coefficients(direction))
     if parameters.skew:
         columns.append(torch.nn.functional.pad(xy[..., 1:, None], (0, 0, 0, 1)))
-    # A bow bends the board that was calibrated on, not what is measured.
-    columns.append(F.new_zeros(*F.shape[:-1], known.shape[-1] - parameters.size - POSE))
     turn = torch.linalg.cross(arm.unsqueeze(-2), by_camera_point)  # g . (omega x arm) = omega . (arm x g)
     return torch.cat([*columns, turn, by_camera_point], dim=-1), by_point
 

@@ -1,6 +1,5 @@
 """`CalibrationPrior`: how far a camera may move from its calibration, given the calibration's covariance."""
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -66,10 +65,10 @@ class CalibrationPrior(GeometryModule):
             raise ValueError("calibration: want one camera with its covariance, as calibrate gives it")
         view = None if view is None else view_number(view, calibration.views.names)
         camera = (calibration.camera if view is None else calibration.cameras[view]).detach()
-        known, parameters = calibration.covariance.about_middle, replace(calibration.parameters, bow=False)
+        known, parameters = calibration.covariance.about_middle, calibration.parameters.of_camera
         middle = calibration.covariance.middle
         C = (known.shared if view is None else known.view(view)).detach()
-        # The rows of C are the camera's parameters, the bow of the board, which is none of the camera's, and the pose.
+        # The rows of C are the camera's parameters, the target's shape, which is none of the camera's, and the pose.
         of_pose = range(len(known.names), len(known.names) + (0 if view is None else POSE))
         rows = torch.tensor([*range(parameters.size), *of_pose], device=C.device)
         self.parametrisation, self.with_pose = parameters, view is not None

@@ -21,6 +21,7 @@ from diffproj._core.shown import Shown
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration
+from diffproj.calibration.shape import Shape
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.plane import Plane
 from diffproj.lens.models import LensModel
@@ -65,8 +66,8 @@ class Experiment(Shown):
 
     @property
     def exact(self) -> Float[Tensor, "n 3"]:
-        """The corners' known places `(N, 3)`."""
-        return self.board.points
+        """The corners' known places `(N, 3)`: the board's own, or where the fitting views show that it has them."""
+        return self.fit.points
 
     @property
     def errors(self) -> Float[Tensor, "v n 3"]:
@@ -107,7 +108,12 @@ class Experiment(Shown):
 
 
 def run_experiment(
-    fit: Views, test: Views, board: Chessboard, distortion: LensModel = "brown5", strict: bool = False
+    fit: Views,
+    test: Views,
+    board: Chessboard,
+    distortion: LensModel = "brown5",
+    strict: bool = False,
+    shape: Shape = "flat",
 ) -> Experiment:
     """Run the paper's experiment.
 
@@ -118,6 +124,9 @@ def run_experiment(
         distortion: which lens to fit; the paper neglects it (`"none"`).
         strict: find each pose from every second corner and measure the others, so that no corner is measured with a
             pose that it contributed to. (The paper finds the pose from the corners that it measures.)
+        shape: of the board. The paper takes it for the ideal grid (`"flat"`). With `"free"` the fitting views tell
+            where each corner really is, and corners of the test views, which have no part in that, are put back on
+            the plane of their own height and compared with these places.
 
     Returns:
         The outcome, in the board's unit.
@@ -143,13 +152,15 @@ def run_experiment(
             raise ValueError(f"{name}: want at least one view, got none")
     as_board(board)
     strict = flag("strict", strict)
-    calibration = calibrate(fit, board, distortion)
+    calibration = calibrate(fit, board, distortion, shape=shape)
     held_out = torch.zeros(test.pixels.shape[-2], dtype=torch.bool, device=test.device)
     if strict:
         held_out[1::2] = True
     located = locate(test.hiding(held_out), board, calibration)
     measured = test.hiding(~held_out) if strict else test
-    points, valid = back_project(measured.pixels.to(torch.float64), located.cameras, Plane.z(0.0))
+    heights = calibration.points[:, 2]
+    plane = Plane.z(0.0) if shape == "flat" else Plane.per_point([0.0, 0.0, 1.0], heights)
+    points, valid = back_project(measured.pixels.to(torch.float64), located.cameras, plane)
     return Experiment(calibration, located, board, points, valid & measured.visible)
 
 

@@ -3,11 +3,13 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from diffproj._core.arguments import choice, instance, number, whole_number
+from diffproj.targets.artwork import Artwork
 
 Axes = Literal["opencv", "paper"]
 """The board's two world frames; see `Chessboard`."""
@@ -72,6 +74,21 @@ class Chessboard:
         return self.columns, self.rows
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of its points."""
+        return self.rows, self.columns
+
+    @property
+    def side(self) -> float:
+        """The side of a square, in world units."""
+        return self.square
+
+    @property
+    def title(self) -> str:
+        """What it is, in words."""
+        return f"board with {self.columns} x {self.rows} inner corners"
+
+    @property
     def turns(self) -> int:
         """The number of turns in its plane after which the board looks the same: 1, 2 or 4.
 
@@ -111,25 +128,20 @@ class Chessboard:
             torch.tensor([left, right, right, left], dtype=torch.float64, device="cpu"),
         )
 
+    @property
+    def artwork(self) -> Artwork:
+        """What is printed: its squares, dark at the top left."""
+        x, y = (self.square * np.arange(count + 2.0) for count in self.size)
+        dark = np.indices((self.rows + 1, self.columns + 1)).sum(axis=0) % 2 == 0
+        corner, right, _, down = self.outline.numpy()
+        along, below = right - corner, down - corner
+        axes = corner, along / np.linalg.norm(along), below / np.linalg.norm(below)
+        return Artwork(x, y, dark, np.zeros((0, 3)), axes)
+
     def _placed(self, row: Float[Tensor, " n"], column: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
         """World points in this board's frame from rows and columns in units of squares."""
         along = (column, row) if self.axes == "opencv" else (row, column)
         return torch.stack([*along, torch.zeros_like(row)], dim=-1) * self.square
-
-
-def origin_doubt(board: Chessboard) -> str:
-    """What to know about a board that looks the same when turned: which corner is the first is not seen.
-
-    Example:
-        >>> origin_doubt(Chessboard(8, 6))[:74]
-        'a board with 8 x 6 inner corners looks the same when turned by 180 degrees'
-    """
-    return (
-        f"a board with {board.columns} x {board.rows} inner corners looks the same when turned by "
-        f"{360 // board.turns} degrees: the first corner, and with it the origin of the world, is one nearest to the "
-        "photograph's top left, and may be another in the next photograph; keep the board as it is, or use one whose "
-        "columns + rows is odd, such as 9 x 6"
-    )
 
 
 def as_board(board: Chessboard) -> Chessboard:

@@ -1,21 +1,23 @@
-"""Detect a chessboard's corners in photographs, with sub-pixel accuracy and in a defined order."""
+"""Detect a target's points in photographs, with sub-pixel accuracy and in a defined order."""
 
 import functools
 import warnings
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from diffproj._core.arguments import function, whole_number
-from diffproj.targets.chessboard import Chessboard, as_board
-from diffproj.targets.corners import refine_grid
-from diffproj.targets.images import Orientation, Photograph, Source, as_8_bit, grey, listed
-from diffproj.targets.numbering import follow, in_order
-from diffproj.targets.search import find_pattern
+from diffproj.targets.april_grid import AprilGrid
+from diffproj.targets.boards import Board, as_target
+from diffproj.targets.charuco import CharucoBoard
+from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.circle_grid import CircleGrid
+from diffproj.targets.finders import Found, find
+from diffproj.targets.images import Orientation, Photograph, Source, grey, listed
+from diffproj.targets.numbering import follow
 from diffproj.targets.tasks import results_of
 from diffproj.targets.videos import Frame, distinct
 from diffproj.targets.views import Views
@@ -46,28 +48,37 @@ class BoardNotFoundError(ValueError):
 
 def detect(
     photographs: Source | Iterable[Source],
-    board: Chessboard,
+    target: Board,
     progress: Callable[[int, int], object] | None = None,
     *,
     orientation: Orientation | str = "sensor",
     frames: int | None = None,
     executor: Executor | None = None,
 ) -> Views:
-    """Detect the board's inner corners in photographs of one camera.
+    """Detect a target's points in photographs of one camera.
 
-    The board is found as a pattern of saddle points of brightness, in copies of several sizes, and where only a part of
-    it is found so, by OpenCV's detectors. Its dark and light may be exchanged, as in thermal images. Each corner is
-    then placed by fitting its neighbourhood with two crossing edges, their blur and the light. Corners that do not look
-    like corners, or lie off the surface through their neighbours, are sought once more, and hidden (`Views.visible`) if
-    they stay so: behind a hand or a clip, in glare, beyond the photograph's border. Half of all corners, and of those
-    along each side, must be visible.
+    A `CharucoBoard` or an `AprilGrid` is found by its markers, as much of it as is in view. Each corner is placed by
+    fitting the whole print around it; corners that do not fit, or lie off the surface through their neighbours, are
+    hidden (`Views.visible`). At least 6 must be visible, on two rows and two columns. Each is known by itself, however
+    the board is turned.
 
-    The order is that of `Chessboard.points`. It is never mirrored: along a row, then down a column, is clockwise in the
-    image. It starts at a dark corner of the board: the square between the first four corners is dark, and so is the one
-    diagonally outside the first corner. Where columns + rows is odd, as on a 9 x 6 board, this determines the order:
-    each corner keeps its number however the board is rotated. Other boards look the same when turned
-    (`Chessboard.turns`): the first photograph takes the order whose first corner is closest to its top left, and each
-    later one the order whose rows turn least from the photograph before.
+    A `CircleGrid` is found as dark ellipses on a lattice, of which up to a quarter may be hidden. The pixels are the
+    middles of the ellipses; `calibrate` knows that a centre is seen elsewhere. Its order is never mirrored, and where
+    the board looks the same when turned (`CircleGrid.turns`), the rule for chessboards holds.
+
+    A `Chessboard` is found as a pattern of saddle points of brightness, in copies of several sizes, and where only a
+    part of it is found so, by OpenCV's detectors. Its dark and light may be exchanged, as in thermal images. Each
+    corner is then placed by fitting its neighbourhood with two crossing edges, their blur and the light. Corners that
+    do not look like corners, or lie off the surface through their neighbours, are sought once more, and hidden
+    (`Views.visible`) if they stay so: behind a hand or a clip, in glare, beyond the photograph's border. Half of all
+    corners, and of those along each side, must be visible.
+
+    A chessboard's order is that of `Chessboard.points`. It is never mirrored: along a row, then down a column, is
+    clockwise in the image. It starts at a dark corner of the board: the square between the first four corners is dark,
+    and so is the one diagonally outside the first corner. Where columns + rows is odd, as on a 9 x 6 board, this
+    determines the order: each corner keeps its number however the board is rotated. Other boards look the same when
+    turned (`Chessboard.turns`): the first photograph takes the order whose first corner is closest to its top left, and
+    each later one the order whose rows turn least from the photograph before.
 
     Args:
         photographs: a file, a folder, a pattern such as `"photos/left*.jpg"`, one image, or a list of files and
@@ -76,7 +87,7 @@ def detect(
             Kornia has it, `(C, H, W)` in RGB, of the same types, or `(B, C, H, W)`. All of one size. Of a folder,
             hidden files and those of other kinds are left out. A video (`.mp4`, `.avi`, `.mov`, `.mkv`) gives sharp
             frames, at most 60 from all its parts, without those in which the board hardly moved.
-        board: the board to look for, with at least 3 x 3 inner corners.
+        target: the board to look for; a chessboard has at least 3 x 3 inner corners.
         progress: called with `(done, total)` after each photograph.
         orientation: `"sensor"` counts a file's pixels as the sensor recorded them, whichever way up the camera was
             held: one lens has one principal point. `"upright"` turns each file as its EXIF data ask, as viewers do.
@@ -106,7 +117,7 @@ def detect(
         >>> views.pixels[0, :2].round(decimals=1).tolist()  # each edge is half a pixel before its first pixel
         [[69.5, 69.5], [109.5, 69.5]]
     """
-    _check_board(board)
+    as_target(target)
     if progress is not None:
         function("progress", progress, "a function of (done, total)")
     if orientation not in get_args(Orientation):
@@ -118,62 +129,35 @@ def detect(
         frames = whole_number("frames", frames, "a whole number from 1 on", least=1)
     listing = listed(photographs, frames)
     # One reading for size and corners: to decode a photograph takes as long as to find a board in it.
-    find = functools.partial(_find, board=board, orientation=raster)
+    find = functools.partial(_find, target=target, orientation=raster)
     found = results_of(find, listing, executor, progress)
     size = _common_size(listing, [one.size for one in found])
     pairs = [(photograph, one.grid) for photograph, one in zip(listing, found, strict=True) if one.grid is not None]
     if not pairs:
-        raise BoardNotFoundError(_advice([photograph.label for photograph in listing], found, board))
+        raise BoardNotFoundError(_advice([photograph.label for photograph in listing], found, target))
     for photograph, one in zip(listing, found, strict=True):
         if one.grid is None and _sharpness(photograph) is None:
-            text = f"{_miss(photograph, one.seen, board)}; photograph skipped"
+            text = f"{_miss(photograph, one, target)}; photograph skipped"
             warnings.warn(text, BoardNotFoundWarning, stacklevel=2)
     seen, grids = zip(*pairs, strict=True)
-    grids = follow(list(grids), board)
+    grids = follow(list(grids), target) if isinstance(target, Chessboard | CircleGrid) else list(grids)
     # Of a video, one view of each place: copies of a view make error bars too small.
     chosen = [k for k, photograph in enumerate(seen) if _sharpness(photograph) is not None]
     new = distinct([grids[k] for k in chosen], [_sharpness(seen[k]) or 0.0 for k in chosen], size)
     kept = sorted({*range(len(seen))} - {k for k, differs in zip(chosen, new, strict=True) if not differs})
-    pixels = torch.from_numpy(np.stack([grids[k] for k in kept])).reshape(len(kept), len(board), 2)
+    pixels = torch.from_numpy(np.stack([grids[k] for k in kept])).reshape(len(kept), len(target), 2)
     names = [seen[k].name for k in kept]
     return Views(pixels, pixels.isfinite().all(dim=-1), names=names, size=size)
 
 
-class _Found(NamedTuple):
-    """What was found in one photograph.
-
-    Attributes:
-        grid: `(rows, columns, 2)` px, in order, NaN where hidden; None where there is no such board.
-        seen: `(columns, rows)` of the largest pattern where there is no such board; (0, 0) for none.
-        size: `(width, height)` of the photograph.
-    """
-
-    grid: Float[np.ndarray, "rows columns 2"] | None
-    seen: tuple[int, int]
-    size: tuple[int, int]
-
-
-def _find(photograph: Photograph, board: Chessboard, orientation: Orientation) -> _Found:
-    """Read one photograph and find the board in it: the work of one task."""
+def _find(photograph: Photograph, target: Board, orientation: Orientation) -> Found:
+    """Read one photograph and find the target in it: the work of one task."""
     image = grey(photograph, orientation)
     size = image.shape[1], image.shape[0]
     try:
-        pattern = find_pattern(as_8_bit(image), board)
-        if pattern.grid is None:
-            return _Found(None, pattern.seen, size)
-        refined = refine_grid(image, pattern.grid)
-        if not refined.is_board():
-            return _Found(None, (0, 0), size)
-        return _Found(in_order(refined.grid, image, board), board.size, size)
+        return find(image, target)._replace(size=size)
     except Exception as error:
         raise RuntimeError(f"{photograph.label}: {type(error).__name__} while searching it: {error}") from error
-
-
-def _check_board(board: Chessboard) -> None:
-    as_board(board)
-    if min(board.size) < 3:
-        got = f"{board.columns} x {board.rows}"
-        raise ValueError(f"board: want at least 3 x 3 inner corners for OpenCV's detector, got {got}")
 
 
 def _sharpness(photograph: Photograph) -> float | None:
@@ -200,10 +184,12 @@ def _named(labels: list[str]) -> str:
     return ", ".join(labels[:3]) + (f" and {len(labels) - 3} more" if len(labels) > 3 else "")
 
 
-def _miss(photograph: Photograph, seen: tuple[int, int], board: Chessboard) -> str:
+def _miss(photograph: Photograph, found: Found, target: Board) -> str:
     """What is said of a photograph without the board."""
-    text = f"{photograph.label}: found no board with {board.columns} x {board.rows} inner corners"
-    return text + (f", but a pattern with {seen[0]} x {seen[1]}" if _telling(seen) else "")
+    text = f"{photograph.label}: found no {target.title}"
+    if found.hint:
+        return f"{text}, but {found.hint}"
+    return text + (f", but a pattern with {found.seen[0]} x {found.seen[1]}" if _telling(found.seen) else "")
 
 
 def _telling(seen: tuple[int, int]) -> bool:
@@ -211,7 +197,7 @@ def _telling(seen: tuple[int, int]) -> bool:
     return min(seen) >= 3
 
 
-def _advice(labels: list[str], found: list[_Found], board: Chessboard) -> str:
+def _advice(labels: list[str], found: list[Found], target: Board) -> str:
     seen = [one.seen for one in found if _telling(one.seen)]
     there = ""
     if seen:
@@ -220,8 +206,22 @@ def _advice(labels: list[str], found: list[_Found], board: Chessboard) -> str:
             f" There is a pattern with {usual[0]} x {usual[1]} inner corners in {seen.count(usual)} of them: if that "
         )
         there += f"is the board, give Chessboard({usual[0]}, {usual[1]}, ...)."
+    hints = [one.hint for one in found if one.hint]
+    if hints:
+        there = f" There is {hints[0]}."
     return (
-        f"photographs: want a board with {board.columns} x {board.rows} inner corners, found none in "
-        f"{_named(labels)}.{there} Check that the numbers count inner corners (one less than the squares each way), "
-        "that the whole board is in view with a margin around it, and that the photographs are sharp and evenly lit"
+        f"photographs: want a {target.title}, found none in {_named(labels)}.{there} Check that {_CHECKS[type(target)]}"
     )
+
+
+_CHECKS: dict[type, str] = {
+    Chessboard: "the numbers count inner corners (one less than the squares each way), that the whole board is in view "
+    "with a margin around it, and that the photographs are sharp and evenly lit",
+    CharucoBoard: "the numbers count squares, columns first, that dictionary and legacy are those that the board was "
+    "made with, and that the photographs are sharp and evenly lit, with markers of 15 px or more",
+    AprilGrid: "the numbers count tags, columns first, that the tags are of the family 36h11 and begin with number 0, "
+    "and that the photographs are sharp and evenly lit, with tags of 25 px or more",
+    CircleGrid: "the numbers count circles, columns first, that every second line is shifted where asymmetric says so, "
+    "that the whole board is in view, and that the photographs are sharp and evenly lit, with circles of 6 px or more",
+}
+"""What may be wrong where a target is in no photograph."""

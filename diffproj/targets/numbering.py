@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from diffproj.targets.chessboard import Chessboard
+from diffproj.targets.circle_grid import CircleGrid
 
 Grid = Float[np.ndarray, "rows columns 2"]
 
@@ -24,7 +25,7 @@ def in_order(grid: Grid, image: Shaped[np.ndarray, "h w"], board: Chessboard) ->
     return np.ascontiguousarray(min(grids, key=lambda candidate: float(np.linalg.norm(_first(candidate)))))
 
 
-def follow(grids: list[Grid], board: Chessboard) -> list[Grid]:
+def follow(grids: list[Grid], board: Chessboard | CircleGrid) -> list[Grid]:
     """Give boards that look alike when turned one origin through a sequence of photographs.
 
     Of the orders that look alike, each photograph takes the one whose rows turn least from the photograph before. This

@@ -1,6 +1,6 @@
-"""Synthetic board photographs and corners with ground truth.
+"""Synthetic photographs of targets, and their points, with ground truth.
 
-A photograph is the printed board, `board_texture`, rendered by `diffproj.render`, which back-projects every pixel onto
+A photograph is the printed target, `board_texture`, rendered by `diffproj.render`, which back-projects every pixel onto
 the board. Vignetting and Gaussian blur model the optics, Gaussian noise the sensor.
 """
 
@@ -21,7 +21,7 @@ from diffproj.geometry.grid import pixel_grid
 from diffproj.geometry.intrinsics import pixel_to_normalized
 from diffproj.geometry.plane import Plane
 from diffproj.geometry.rectification import render
-from diffproj.targets.chessboard import Chessboard, as_board
+from diffproj.targets.boards import Board, as_printed
 from diffproj.targets.views import Views
 
 BLACK, WHITE, TABLE = 0.12, 0.88, 0.55
@@ -42,14 +42,16 @@ class Texture(NamedTuple):
     axes: tuple[Tensor, Tensor, Tensor]
 
 
-def board_texture(board: Chessboard, texels: int = 32) -> Texture:
-    """The texture of the board on z = 0, s to the right along its rows and t down along its columns.
+def board_texture(board: Board, texels: int = 32) -> Texture:
+    """The texture of a printed target on z = 0, s to the right and t down, as it stands upright.
 
-    The printed squares have a white margin of one square, and the paper a margin of table of one square.
+    The print has a white margin, and the paper a margin of table, each as wide as a square, a tag, or the distance
+    between two circles.
 
     Args:
-        board: in either frame.
-        texels: per side of a square; edges are between texels.
+        board: any target that is printed: a `Chessboard` in either frame, a `CharucoBoard`, an `AprilGrid`.
+        texels: per side of a square or a tag, or for the distance between two circles; a chessboard's edges are between
+            texels.
 
     Raises:
         TypeError: it is no board, or texels no whole number.
@@ -61,25 +63,26 @@ def board_texture(board: Chessboard, texels: int = 32) -> Texture:
         >>> texture.image.shape, texture.extent
         (torch.Size([1, 16, 18]), (-30.0, -30.0, 60.0, 50.0))
     """
-    as_board(board)
+    as_printed(board)
     texels = whole_number("texels", texels, "at least 1 along a square", least=1, most=10_000)
-    # Indices of squares: 0 follows the first inner corner.
-    row, column = (torch.arange(-3, count + 2, device="cpu") for count in (board.rows, board.columns))
-    row = row.unsqueeze(-1)
-    printed = (row >= -1) & (row < board.rows) & (column >= -1) & (column < board.columns)
-    paper = (row >= -2) & (row <= board.rows) & (column >= -2) & (column <= board.columns)
-    grey = torch.full(paper.shape, TABLE, dtype=torch.float32, device="cpu")
-    grey = grey.masked_fill(paper, WHITE).masked_fill(printed & ((row + column) % 2 == 0), BLACK)
-    low, side = -3 * board.square, board.square
-    extent = (low, low, (board.columns + 2) * side, (board.rows + 2) * side)
-    x, y, _ = torch.eye(3, dtype=torch.float32, device="cpu")
-    axes = (torch.zeros_like(x), y, x) if board.axes == "paper" else (torch.zeros_like(x), x, y)
-    return Texture(grey.repeat_interleave(texels, 0).repeat_interleave(texels, 1)[None], extent, axes)
+    art, side = board.artwork, board.side
+    step = side / texels
+    width, height = (math.ceil(length / step - 1e-6) for length in art.size)
+    shape = height + 4 * texels, width + 4 * texels
+    dark = torch.from_numpy(art.darkness((-2 * side, -2 * side), step, shape)).float()
+    grey = torch.full(shape, TABLE, dtype=torch.float32, device="cpu")
+    paper = slice(texels, -texels), slice(texels, -texels)
+    grey[paper] = WHITE + (BLACK - WHITE) * dark[paper]
+    origin, right, down = art.axes
+    left, top = float(origin @ right) - 2 * side, float(origin @ down) - 2 * side
+    extent = (left, top, left + step * shape[1], top + step * shape[0])
+    right, down = (torch.from_numpy(part).float() for part in (right, down))
+    return Texture(grey[None], extent, (torch.zeros_like(right), right, down))
 
 
 def photograph(
     camera: Camera | PinholeCamera,
-    board: Chessboard,
+    board: Board,
     *,
     blur_px: float = 0.7,
     noise: float = 4 / 255,
@@ -109,7 +112,7 @@ def photograph(
         >>> photograph(setup.test[0], setup.board).shape
         torch.Size([480, 640])
     """
-    camera, board = _sized(camera), as_board(board)
+    camera, board = _sized(camera), as_printed(board)
     blur_px = number("blur_px", blur_px, "a number from 0 to 1000 px", least=0, most=1000)
     noise = number("noise", noise, "a part of the grey values' range of at least 0", least=0)
     vignetting = number("vignetting", vignetting, "a number from 0 to 1", least=0, most=1)
@@ -135,7 +138,7 @@ def photograph(
     return torch.stack(images).reshape(*camera.batch_shape, height, width)
 
 
-def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px: float = 0.2, seed: int = 0) -> Views:
+def corner_views(camera: Camera | PinholeCamera, board: Board, *, noise_px: float = 0.2, seed: int = 0) -> Views:
     """Project the board's corners into cameras of batch shape `(*B, V)`, with Gaussian noise on each coordinate.
 
     Args:
@@ -157,7 +160,7 @@ def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px:
         >>> corner_views(setup.fit, setup.board).pixels.shape
         torch.Size([10, 54, 2])
     """
-    camera, board = as_camera(camera), as_board(board)
+    camera, board = as_camera(camera), as_printed(board)
     noise_px = number("noise_px", noise_px, "a standard deviation of at least 0 px", least=0)
     if not camera.batch_shape:
         raise ValueError("camera: want a batch of views (V,), got a single camera; camera.at(R, t) makes one")
@@ -171,7 +174,7 @@ def corner_views(camera: Camera | PinholeCamera, board: Chessboard, *, noise_px:
 
 def random_cameras(
     camera: Camera | PinholeCamera,
-    board: Chessboard,
+    board: Board,
     views: int,
     *,
     tilt: float = math.radians(40),
@@ -199,7 +202,7 @@ def random_cameras(
         >>> random_cameras(setup.fit[0], setup.board, 20).batch_shape
         torch.Size([20])
     """
-    camera, board = _sized(camera), as_board(board)
+    camera, board = _sized(camera), as_printed(board)
     views = whole_number("views", views, "a number of views from 1 to 100,000", least=1, most=100_000)
     tilt = number("tilt", tilt, "an angle of at least 0 radians", least=0)
     want = "(nearest, farthest) in sides of the board, above 0"
@@ -209,9 +212,8 @@ def random_cameras(
     generator = _generator(seed)
     points = board.points.to(camera.dtype)
     middle, extent = points.mean(dim=0), float((points.amax(dim=0) - points.amin(dim=0)).amax())
-    upright = torch.eye(3, dtype=camera.dtype, device="cpu")
-    if board.axes == "paper":
-        upright = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=camera.dtype, device="cpu")
+    _, right, down = (torch.from_numpy(part).to(camera.dtype) for part in board.artwork.axes)
+    upright = torch.stack([right, down, torch.linalg.cross(right, down)])
     here = camera.to("cpu")  # as the draws, so that a seed gives the same poses on every device
     singles = [here] if not camera.batch_shape else [here[i] for i in _indices(camera.batch_shape)]
     rotations, shifts = [], []
@@ -261,13 +263,15 @@ def _generator(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(checked_seed(seed))
 
 
-def _texels(camera: Camera, board: Chessboard) -> int:
-    """Texels per side of a square: about two per pixel where the board's image is largest, from 8 to 256."""
-    pixels, valid = camera.project(board.points.to(camera.dtype))
-    pixels = torch.where(valid.unsqueeze(-1), pixels, torch.nan).reshape(board.rows, board.columns, 2)
-    sides = torch.cat([pixels.diff(dim=axis).norm(dim=-1).flatten() for axis in (0, 1)])
-    longest = sides[sides.isfinite()]
-    return min(256, max(8, math.ceil(2 * float(longest.amax())))) if len(longest) else 8
+def _texels(camera: Camera, board: Board) -> int:
+    """Texels per side: about two per pixel where the board's image is largest, from 8 to 256."""
+    points = board.points.to(camera.dtype)
+    pixels, valid = camera.project(points)
+    pixels = torch.where(valid.unsqueeze(-1), pixels, torch.nan).reshape(*board.shape, 2)
+    points = points.reshape(*board.shape, 3)
+    scale = torch.cat([(pixels.diff(dim=k).norm(dim=-1) / points.diff(dim=k).norm(dim=-1)).flatten() for k in (0, 1)])
+    largest = scale[scale.isfinite()]
+    return min(256, max(8, math.ceil(2 * board.side * float(largest.amax())))) if len(largest) else 8
 
 
 def _falloff(camera: Camera) -> Float[Tensor, "h w"]:

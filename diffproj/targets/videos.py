@@ -74,9 +74,15 @@ def distinct(
     least = MOVED * float(np.hypot(*size))
     kept: list[int] = []
     for k in sorted(range(len(grids)), key=lambda k: -sharpness[k]):
-        if all(np.nanmean(np.linalg.norm(grids[k] - grids[other], axis=-1)) >= least for other in kept):
+        if all(_moved(grids[k], grids[other]) >= least for other in kept):
             kept.append(k)
     return [k in kept for k in range(len(grids))]
+
+
+def _moved(one: Float[np.ndarray, "rows columns 2"], other: Float[np.ndarray, "rows columns 2"]) -> float:
+    """Mean motion in px of the corners that both views show; infinite where they share none."""
+    motion = np.linalg.norm(one - other, axis=-1)
+    return float(np.nanmean(motion)) if np.isfinite(motion).any() else np.inf
 
 
 def _decoded(video: Path) -> Iterator[UInt8[np.ndarray, "_h _w"]]:

@@ -108,8 +108,8 @@ def test_the_boards_shape() -> None:
     bent = BOARD.points.clone()
     bent[:, 2] = 1.5 * (1 - ((bent[:, 0] - 100) / 100).square())
     views = seen(camera(600, BROWN), 3, points=bent)
-    assert all("take bow=True" in text for text in dp.calibrate(views, BOARD).remarks)
-    assert silent(dp.calibrate(views, BOARD, bow=True))
+    assert all("take shape='bow'" in text for text in dp.calibrate(views, BOARD).remarks)
+    assert silent(dp.calibrate(views, BOARD, shape="bow"))
 
 
 def test_corners_that_scatter() -> None:

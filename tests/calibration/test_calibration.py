@@ -653,7 +653,7 @@ def bowed_views(views: int, bow: tuple[float, float], seed: int = 0, cameras: Se
 @pytest.mark.parametrize("count", [13, 100, 300])
 def test_a_bowed_board(count: int) -> None:
     views = bowed_views(count, (0.5, 0.0))
-    flat, bowed = dp.calibrate(views, BOARD), dp.calibrate(views, BOARD, bow=True)
+    flat, bowed = dp.calibrate(views, BOARD), dp.calibrate(views, BOARD, shape="bow")
     deviations = bowed.covariance.deviations
     assert abs(bowed.bow[0] - 0.5) < 4 * deviations["bow_x"]
     assert abs(bowed.bow[1]) < 4 * deviations["bow_y"]
@@ -668,7 +668,7 @@ def test_a_bowed_board(count: int) -> None:
 def test_bow_is_unbiased_and_its_deviation_is_true() -> None:
     """200 simulations at once: standardised errors have mean 0 and deviation 1, to four deviations of either."""
     views = bowed_views(13, (0.5, -0.2), cameras=(200,), seed=2)
-    found = dp.calibrate(views, BOARD, bow=True)
+    found = dp.calibrate(views, BOARD, shape="bow")
     deviations = found.covariance.deviations
     truths = {"bow_x": (found.bow[:, 0], 0.5), "bow_y": (found.bow[:, 1], -0.2)}
     truths |= {"f_x": (found.camera.K[:, 0, 0], 533.0), "f_y": (found.camera.K[:, 1, 1], 534.0)}
@@ -680,7 +680,7 @@ def test_bow_is_unbiased_and_its_deviation_is_true() -> None:
 
 def test_bundled_boards_are_bowed() -> None:
     for side in ("left", "right"):
-        flat, bowed = (dp.calibrate(dp.example_views(side), BOARD, bow=bow) for bow in (False, True))
+        flat, bowed = (dp.calibrate(dp.example_views(side), BOARD, shape=shape) for shape in ("flat", "bow"))
         assert 0.03 < 1 - bowed.rms / flat.rms < 0.07
         assert bowed.bow[1].item() == pytest.approx(-0.17, abs=0.03)
 
@@ -834,8 +834,8 @@ def test_bad_input_is_refused_by_name() -> None:
         (ValueError, "objective: want one of 'image', 'plane'", lambda: dp.calibrate(views, board, objective="both")),
         (
             ValueError,
-            "bow: want False with objective='plane'",
-            lambda: dp.calibrate(views, board, bow=True, objective="plane"),
+            "shape: want 'flat' with objective='plane', got 'bow'",
+            lambda: dp.calibrate(views, board, shape="bow", objective="plane"),
         ),
         (
             TypeError,
@@ -887,7 +887,7 @@ def test_bad_input_is_refused_by_name() -> None:
             "calibrate: want options of weights, .*, got 'wieghts'",
             lambda: dp.calibrate(views, board, wieghts=1),
         ),
-        (TypeError, "locate: want options of .*, got 'bow'", lambda: dp.locate(views, board, truth[0], bow=True)),
+        (TypeError, "locate: want options of .*, got 'shape'", lambda: dp.locate(views, board, truth[0], shape="bow")),
     ]
     for kind, message, call in cases:
         with pytest.raises(kind, match=message):

@@ -30,7 +30,7 @@ def moved(cameras: dp.Camera) -> Tensor:
 @pytest.mark.parametrize(("square", "part"), SQUARES.items())
 @pytest.mark.parametrize(
     "options",
-    [{}, {"objective": "plane"}, {"bow": True}, {"loss": dp.Huber(0.3)}],
+    [{}, {"objective": "plane"}, {"shape": "bow"}, {"loss": dp.Huber(0.3)}],
     ids=["plain", "plane", "bow", "huber"],
 )
 def test_calibrate(square: float, part: float, options: dict[str, Any]) -> None:

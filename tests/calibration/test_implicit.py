@@ -41,6 +41,7 @@ def answer(calibration: dp.Calibration) -> torch.Tensor:
     parts = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *(100 * lens.coefficients)]
     parts += [*calibration.cameras.t[1], *(100 * calibration.cameras.R[3].flatten())]
     parts += [] if calibration.bow is None else list(100 * calibration.bow)
+    parts += [] if calibration.displacements is None else list(calibration.points[[0, 7, 19]].flatten())
     return torch.stack(parts)
 
 
@@ -59,7 +60,8 @@ def check(solve: Callable[[torch.Tensor, bool], dp.Calibration], value: torch.Te
 
 CASES: dict[str, dict[str, Any]] = {
     "plain": {},
-    "bow": {"bow": True},
+    "bow": {"shape": "bow"},
+    "free": {"shape": "free", "weights": torch.tensor(10.0, dtype=D), "priors": {"points": 1.0}},
     "fixed": {"fixed": ("c_x", "p1"), "tied_focal": True},
     "huber": {"loss": dp.Huber(0.5)},
     "cauchy": {"loss": dp.Cauchy(1.0)},
@@ -67,8 +69,9 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-STEPS = {"huber": 3e-5}
-"""Steps in px; a longer one takes corners across Huber's kink, where the gradient changes by a jump."""
+STEPS = {"huber": 3e-5, "free": 1e-3}
+"""Steps in px; a longer one takes corners across Huber's kink, where the gradient changes by a jump, and free points of
+five views along a curve."""
 
 
 @pytest.mark.parametrize("case", list(CASES))
@@ -91,15 +94,18 @@ def test_gradient_by_pixels(case: str) -> None:
     check(solve, pixels, STEPS.get(case, 5e-3))
 
 
-def test_gradient_by_board_points() -> None:
+@pytest.mark.parametrize("shape", ["flat", "free"])
+def test_gradient_by_board_points(shape: str) -> None:
     camera, pixels, visible, points = situation()
     in_plane = torch.tensor([1.0, 1.0, 0.0], dtype=D)
 
     def solve(points: torch.Tensor, differentiable: bool) -> dp.Calibration:
         views = dp.Views(pixels, visible, size=(640, 480))
-        return dp.refine(views, Target(points * in_plane), camera, differentiable=differentiable, tolerance=1e-17)
+        options: dict[str, Any] = {"differentiable": differentiable, "tolerance": 1e-17}
+        options |= CASES["free"] if shape == "free" else {}
+        return dp.refine(views, Target(points * in_plane), camera, **options)
 
-    check(solve, points, 5e-3)
+    check(solve, points, 1e-3 if shape == "flat" else 1e-2)
 
 
 @pytest.mark.parametrize("loss", [None, dp.Huber(0.5)])

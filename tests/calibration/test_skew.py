@@ -100,10 +100,10 @@ def test_bow_and_batch_beside_it() -> None:
     _, views = simulated(noise_px=0.1)
     other = simulated(noise_px=0.1, seed=2, K=K - torch.tensor([[0.0, 15, 0], [0, 0, 0], [0, 0, 0]], dtype=D))[1]
     both = dp.Views(torch.stack([views.pixels, other.pixels]), size=views.size)
-    batch = dp.calibrate(both, BOARD, skew=True, bow=True)
+    batch = dp.calibrate(both, BOARD, skew=True, shape="bow")
     assert batch.parameters.names[-3:] == ("skew", "bow_x", "bow_y")
     for i in range(2):
-        one = dp.calibrate(dp.Views(both.pixels[i], size=views.size), BOARD, skew=True, bow=True)
+        one = dp.calibrate(dp.Views(both.pixels[i], size=views.size), BOARD, skew=True, shape="bow")
         torch.testing.assert_close(batch.shared[i], one.shared, rtol=1e-6, atol=1e-6)
         assert abs(float(one.bow.abs().max())) < 1.0
     assert (batch.camera.K[:, 0, 1] - torch.tensor([7.5, -7.5], dtype=D)).abs().max() < 1.0

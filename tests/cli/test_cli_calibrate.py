@@ -166,8 +166,8 @@ def test_calibrate_refuses_photographs_by_name(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--square", "25"], "the following arguments are required: --board"),
-        (["--board", "9x6"], "the following arguments are required: --square"),
+        (["--square", "25"], "one of the arguments --board --charuco --aprilgrid --circles --target is required"),
+        (["--board", "9x6"], "--square: want the side of the board's squares along with --board"),
         (["--board", "9", "--square", "25"], "--board: want inner corners as COLUMNSxROWS, such as 9x6, got '9'"),
         (["--board", "9x2", "--square", "25"], "--board: want at least 3x3 inner corners"),
         (

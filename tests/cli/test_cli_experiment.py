@@ -24,7 +24,12 @@ def test_experiment_prints_the_table_and_writes_three_files(tmp_path: Path, caps
     assert (code, err) == (0, "")
     assert "Table 1" in out
     assert "left14.jpg" in out
-    assert sorted(path.name for path in folder.iterdir()) == ["camera.json", "fig7.png", "table1.csv"]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "camera.json",
+        "fig7.png",
+        "table1.csv",
+        "table1_measured_board.csv",
+    ]
     assert cv2.imread(str(folder / "fig7.png")) is not None
     assert dp.load_calibration(folder / "camera.json").rms < 0.19
     assert (folder / "table1.csv").read_text().startswith("view,corners,mean_E_x")

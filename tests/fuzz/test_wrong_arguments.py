@@ -61,6 +61,9 @@ class Things(NamedTuple):
     accuracy: dp.AccuracyMap
     experiment: dp.Experiment
     photograph: torch.Tensor
+    pair: dict[str, dp.Views]
+    rig: dp.RigCalibration
+    triangulated: dp.Triangulation
 
 
 @functools.cache
@@ -80,6 +83,13 @@ def things() -> Things:
     plane = dp.Plane.z(0.0)
     measured = dp.measure(views.pixels[0, :5], calibration, plane, view=0)
     accuracy = dp.AccuracyMap.over_image(calibration, view=0, step=40)
+    beside = dp.Camera(
+        K, dp.rotation_from_euler(0.05, 0.1, 0.02), torch.tensor([-20.0, 1, 2], dtype=D), lens, (128, 96)
+    )
+    second = beside.at(beside.R @ cameras.R, (beside.R @ cameras.t.unsqueeze(-1)).squeeze(-1) + beside.t)
+    pair = {"one": views, "two": dp.synthetic.corner_views(second, board, noise_px=0.05, seed=1)}
+    known = {"one": plain.without_pose(), "two": beside}
+    rig = dp.calibrate_rig(pair, board, cameras=known, fixed=("intrinsics",), throw=False)
     return Things(
         K,
         plain,
@@ -99,6 +109,9 @@ def things() -> Things:
         accuracy,
         dp.run_experiment(views[:3], views[3:], board, "none"),
         torch.tensor(np.kron(np.indices((6, 7)).sum(0) % 2, np.ones((12, 12))) * 200, dtype=torch.uint8),
+        pair,
+        rig,
+        rig.triangulate({name: one.pixels[0] for name, one in pair.items()}, 0.1),
     )
 
 
@@ -279,6 +292,14 @@ def _lenses(t: Things) -> dict[str, Call]:
 def _targets(t: Things) -> dict[str, Call]:
     v, b = t.views, t.board
     return {
+        "AprilGrid": Call(dp.AprilGrid, {"columns": 3, "rows": 2, "tag": 10.0, "spacing": 0.3}),
+        "CharucoBoard": Call(
+            dp.CharucoBoard,
+            {"columns": 4, "rows": 3, "square": 10.0, "marker": 7.0, "dictionary": "4X4_50", "legacy": True},
+        ),
+        "CircleGrid": Call(
+            dp.CircleGrid, {"columns": 4, "rows": 3, "spacing": 10.0, "diameter": 5.0, "asymmetric": "rows"}
+        ),
         "Chessboard": Call(dp.Chessboard, {"columns": 4, "rows": 3, "square": 10.0, "axes": "paper"}),
         "Landmarks": Call(
             dp.Landmarks, {"points": b.points, "names": [str(n) for n in range(len(b))], "sigma": 0.1}, 3
@@ -290,7 +311,7 @@ def _targets(t: Things) -> dict[str, Call]:
         "Views.hiding": Call(v.hiding, {"mask": torch.arange(12) == 3}),
         "Views.stack": Call(dp.Views.stack, {"items": [v, v], "dim": 0}),
         "detect": Call(
-            dp.detect, {"photographs": t.photograph, "board": dp.Chessboard(6, 5), "progress": print_nothing}, 3
+            dp.detect, {"photographs": t.photograph, "target": dp.Chessboard(6, 5), "progress": print_nothing}, 3
         ),
         "example_views": Call(dp.example_views, {"side": "left"}, 1),
         "image_residuals": Call(dp.image_residuals, {"camera": t.cameras, "views": v, "target": b}),
@@ -325,6 +346,7 @@ def _calibration(t: Things) -> dict[str, Call]:
     }
     more = {
         "objective": "image",
+        "shape": "flat",
         "bow": False,
         "skew": False,
         "fixed": ("principal_point",),
@@ -338,7 +360,7 @@ def _calibration(t: Things) -> dict[str, Call]:
     return {
         "calibrate": Call(dp.calibrate, {**on, "distortion": "none", **options, **more}, 6),
         "refine": Call(dp.refine, {**on, "camera": rough, "differentiable": True, **options, **more}, 6),
-        "locate": Call(dp.locate, {**on, "camera": k, **options, "reject_outliers": 5.0}, 4),
+        "locate": Call(dp.locate, {**on, "camera": k, **options, "reject_outliers": 5.0, "same_target": True}, 4),
         "locate landmarks": Call(
             dp.locate,
             {
@@ -350,6 +372,48 @@ def _calibration(t: Things) -> dict[str, Call]:
             },
             4,
         ),
+        "calibrate_rig": Call(
+            dp.calibrate_rig,
+            {
+                "views_by_camera": t.pair,
+                "target": t.board,
+                "distortion": "none",
+                "moments": {"one": [1, 2, 3, 4], "two": [1, 2, 3, 4]},
+                "cameras": t.rig,
+                **options,
+                "weights": {"one": 1.0, "two": torch.ones(12, dtype=D)},
+                "fixed": ("intrinsics",),
+                "reject_outliers": 5.0,
+            },
+            3,
+        ),
+        "cross_validate_rig": Call(
+            dp.cross_validate_rig,
+            {
+                "views_by_camera": t.pair,
+                "target": t.board,
+                "distortion": "none",
+                "folds": 2,
+                "moments": None,
+                "cameras": t.rig,
+                "fixed": ("intrinsics",),
+                "throw": False,
+            },
+            0.2,
+        ),
+        "RigCalibration.baseline": Call(t.rig.baseline, {"one": "one", "other": "two"}),
+        "RigCalibration.place_covariance": Call(t.rig.place_covariance, {"name": "two"}),
+        "RigCalibration.parameters_of": Call(t.rig.parameters_of, {"name": "two"}),
+        "RigCalibration.triangulate": Call(
+            t.rig.triangulate,
+            {
+                "pixels_by_camera": {name: one.pixels[0] for name, one in t.pair.items()},
+                "pixel_sigma": {"one": 0.1, "two": 0.2},
+            },
+        ),
+        "RigCalibration[]": Call(t.rig.__getitem__, {"name": "one"}),
+        "Triangulation.between": Call(t.triangulated.between, {"i": 0, "j": 1}),
+        "Triangulation.length": Call(t.triangulated.length, {"i": 0, "j": 1}),
         "cross_validate": Call(dp.cross_validate, {**on, "distortion": "none", "folds": 2, **held}, 1),
         "bootstrap": Call(dp.bootstrap, {**on, "distortion": "none", "draws": 3, "seed": 0, "fixed": held["fixed"]}, 1),
         "Covariance.between": Call(k.covariance.between, {"view": 0, "other": 1}),
@@ -359,7 +423,14 @@ def _calibration(t: Things) -> dict[str, Call]:
         **_evidence(),
         "run_experiment": Call(
             dp.run_experiment,
-            {"fit": t.views[:3], "test": t.views[3:], "board": t.board, "distortion": "none", "strict": False},
+            {
+                "fit": t.views[:3],
+                "test": t.views[3:],
+                "board": t.board,
+                "distortion": "none",
+                "strict": False,
+                "shape": "flat",
+            },
             1,
         ),
     }
@@ -450,6 +521,9 @@ def _measurement(t: Things) -> dict[str, Call]:
         ),
         "figures.accuracy": Call(dp.figures.accuracy, {"found": t.accuracy, "unit": "mm"}, 0.1),
         "figures.corners": Call(dp.figures.corners, {"calibration": k}, 0.1),
+        "figures.target_shape": Call(
+            dp.figures.target_shape, {"calibration": dp.calibrate(t.views, t.board, "none", shape="bow")}, 0.1
+        ),
         "figures.fig7": Call(dp.figures.fig7, {"experiment": t.experiment, "magnification": 2.0}, 0.1),
     }
 
@@ -490,6 +564,11 @@ def _uses(t: Things) -> dict[str, Call]:
         ),
         "CalibrationPrior": Call(dp.CalibrationPrior, {"calibration": t.calibration, "view": 1}),
         "CalibrationPrior()": Call(prior, {"camera": t.calibration.cameras[0]}),
+        "draw_target": Call(
+            dp.draw_target,
+            {"target": t.board, "path": folder / "board.svg", "paper": "A5", "dpi": 60, "unit": "mm"},
+            3,
+        ),
         "save_camera": Call(dp.save_camera, {"path": folder / "saved.json", "camera": c, "format": "json"}, 3),
         "load": Call(dp.load, {"path": path}, 3),
         "load_camera": Call(dp.load_camera, {"path": path, "format": "json"}, 3),
@@ -508,6 +587,10 @@ OTHER = {
     "Loss",
     "Observation",
     "LensComparison",  # results that are made inside
+    "Baseline",
+    "RigCalibration",
+    "RigCrossValidation",
+    "Triangulation",
     "Adjustment",
     "Calibration",
     "Covariance",
@@ -552,6 +635,7 @@ NOT_CALLED = {
     "PlaneMap.quietly",  # as the constructor
     "Camera.warped_by",
     "Covariance.from_fields",  # of files
+    "RigCalibration.from_fields",
     "SoftL1.value",  # as Huber's and Cauchy's
     "SoftL1.weight",
     "Cauchy.value",

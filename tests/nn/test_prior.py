@@ -37,7 +37,7 @@ def shifted(camera: dp.Camera, **off: float) -> dp.Camera:
 
 
 @pytest.mark.parametrize("view", [None, 2])
-@pytest.mark.parametrize("options", [{}, {"bow": True}, {"loss": dp.Huber(0.3)}])
+@pytest.mark.parametrize("options", [{}, {"shape": "bow"}, {"loss": dp.Huber(0.3)}])
 def test_tied_focal_lengths_count_once_and_their_ratio_not_at_all(options: dict, view: int | None) -> None:
     calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard(), tied_focal=True, **options)
     camera = calibration.camera if view is None else calibration.cameras[view]

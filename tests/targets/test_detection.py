@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffproj.targets import detection
+from diffproj.targets import detection, finders
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.detection import BoardNotFoundError, BoardNotFoundWarning, detect
 from diffproj.targets.search import Pattern
@@ -145,7 +145,7 @@ REORDERED = {
 def test_whatever_the_search_returns(monkeypatch, order):
     image, corners = photograph()
     reordered = REORDERED[order](corners.reshape(6, 9, 2))
-    monkeypatch.setattr(detection, "find_pattern", lambda image, board: Pattern(reordered))
+    monkeypatch.setattr(finders, "find_pattern", lambda image, board: Pattern(reordered))
     assert farthest(detect(image, BOARD), corners) < 0.2
 
 
@@ -156,7 +156,7 @@ def test_whatever_the_search_returns_on_a_square_board(monkeypatch, order, trans
     image, corners = photograph(board)
     grid = REORDERED[order](corners.reshape(4, 4, 2))
     reordered = np.ascontiguousarray(grid.swapaxes(0, 1) if transposed else grid)
-    monkeypatch.setattr(detection, "find_pattern", lambda image, board: Pattern(reordered))
+    monkeypatch.setattr(finders, "find_pattern", lambda image, board: Pattern(reordered))
     assert farthest(detect(image, board), corners) < 0.2
 
 
@@ -472,7 +472,7 @@ def test_bad_files_are_named(tmp_path, monkeypatch):
     broken.write_bytes(b"this is text")
     empty.touch()
     with monkeypatch.context() as patch:
-        patch.setattr(detection, "find_pattern", lambda *_: pytest.fail("searched before all files were looked for"))
+        patch.setattr(finders, "find_pattern", lambda *_: pytest.fail("searched before all files were looked for"))
         with pytest.raises(FileNotFoundError, match=r"no such file: .*missing\.jpg"):
             detect([good, tmp_path / "missing.jpg"], BOARD)
     with pytest.raises(ValueError, match=r"broken\.png: want an image, got 12 bytes that OpenCV cannot read"):
@@ -495,7 +495,7 @@ def test_a_file_that_may_not_be_read(tmp_path):
 
 def test_boards_that_cannot_be_searched():
     image, _ = photograph()
-    with pytest.raises(ValueError, match=r"board: want at least 3 x 3 inner corners .*, got 9 x 2"):
+    with pytest.raises(ValueError, match=r"target: want at least 3 x 3 inner corners .*, got 9 x 2"):
         detect(image, Chessboard(9, 2))
     with pytest.raises(TypeError, match="board"):
         detect(image, (9, 6))

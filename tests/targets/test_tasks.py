@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffproj.targets import detection, tasks
+from diffproj.targets import finders, tasks
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.detection import detect
 from diffproj.targets.tasks import results_of
@@ -87,7 +87,7 @@ def test_an_exception_names_its_photograph(folder, monkeypatch):
     def fails(image, board):
         raise cv2.error("out of memory")
 
-    monkeypatch.setattr(detection, "find_pattern", fails)
+    monkeypatch.setattr(finders, "find_pattern", fails)
     with ThreadPoolExecutor(2) as pool, pytest.raises(RuntimeError, match=r"\d\.png: error while searching it: out of"):
         detect(folder, Chessboard(9, 6), executor=pool)
     monkeypatch.undo()

@@ -1,0 +1,269 @@
+"""From a rig's start to its minimum: solve, look again at views that were set apart, reject outliers, solve again."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.entangled import DENOMINATOR
+from diffproj.calibration.fit import MAX_REJECTION_ROUNDS, normal_tensors
+from diffproj.calibration.losses import Loss
+from diffproj.calibration.options import Options
+from diffproj.calibration.parametrisation import POSE
+from diffproj.calibration.rig_options import free_directions
+from diffproj.calibration.rig_problem import RigParameters, RigProblem
+from diffproj.calibration.rig_start import RigStart
+from diffproj.calibration.rig_views import RigViews
+from diffproj.calibration.solver import Equations, solve
+from diffproj.calibration.task import NEGLIGIBLE_PX
+
+READMITTED = 10.0
+"""RMS residuals of all views up to which a view that was set apart fits after all."""
+LEAST_PX = 1e-6
+"""Noise in pixels below which residuals are rounding errors, none of which is an outlier."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigFit:
+    """The fit of a rig.
+
+    Attributes:
+        views: of all cameras.
+        problem: with the corners used in the last round, its unknowns counted from the minimum.
+        shared: the unknowns `(1, s)`: intrinsics, and poses that have not moved from the problem's base.
+        local: the target in the rig at each moment, from its middle.
+        equations: there.
+        used, rejected: corners `(V_c, N)` by camera.
+        apart: views that contradict the others at their moment `(V_c,)`, which were left out.
+        status, iterations: of the solver.
+        basis: of the free directions of the shared unknowns `(1, s, q)`, or `None` for all.
+        loss: a robust loss, or `None`.
+        restrained: cameras whose terms below the line are held, for without that their lens folds.
+    """
+
+    views: RigViews
+    problem: RigProblem
+    shared: Tensor
+    local: tuple[Tensor, ...]
+    equations: Equations
+    used: dict[str, Tensor]
+    rejected: dict[str, Tensor]
+    apart: dict[str, Tensor]
+    status: int
+    iterations: int
+    basis: Tensor | None
+    loss: Loss | None
+    restrained: tuple[str, ...] = ()
+
+    @property
+    def parameters(self) -> RigParameters:
+        """Which unknowns the views share."""
+        return self.problem.parameters
+
+    @property
+    def free(self) -> int:
+        """How many shared unknowns are free."""
+        return self.parameters.size if self.basis is None else self.basis.shape[-1]
+
+    @property
+    def by_camera(self) -> dict[str, Tensor]:
+        """Projected minus seen corners `(V_c, N, 2)`, 0 where a corner was not used."""
+        return _by_camera(self.views, self.problem, self.problem.residuals(self.shared, self.local))
+
+
+def rig_fit(
+    views: RigViews,
+    parameters: RigParameters,
+    intrinsics: Mapping[str, Tensor],
+    start: RigStart,
+    inliers: Mapping[str, Tensor],
+    positions: Sequence[int],
+    options: Options,
+) -> RigFit:
+    """The minimum.
+
+    Args:
+        views: of all cameras.
+        parameters: the shared unknowns.
+        intrinsics: of each camera to start from.
+        start: the cameras and the target in the rig.
+        inliers: corners that no camera on its own rejected `(V_c, N)`.
+        positions: of the shared unknowns that are held.
+        options: checked.
+    """
+    found = _fitted(views, parameters, intrinsics, start, inliers, positions, options)
+    below = _folding(found)
+    if below:  # two terms of a rational lens that nearly cancel: on its own, the camera's was kept from that
+        positions = sorted({*positions, *(position for one in below.values() for position in one)})
+        found = _fitted(views, parameters, intrinsics, start, inliers, positions, options)
+    return replace(found, restrained=tuple(below))
+
+
+def _folding(found: RigFit) -> dict[str, list[int]]:
+    """Where the free terms below the line stand, of the cameras whose lens folds at its corners."""
+    R, t = found.problem.cameras(found.shared)
+    free = torch.ones_like(found.shared[0]) if found.basis is None else found.basis[0].abs().sum(-1)
+    below = {}
+    for c, (name, kind) in enumerate(zip(found.views.names, found.parameters.kinds, strict=True)):
+        own, where = found.parameters.intrinsics(c), found.views.where[name]
+        terms = [own.start + kind.names.index(term) for term in DENOMINATOR if term in kind.names]
+        if not any(bool(free[i] > 0) for i in terms):
+            continue
+        R_v, t_v = R[c] @ found.local[0][0, where], found.local[1][0, where] @ R[c].T + t[c]
+        _, valid = kind.unpack(found.shared[0, own], (R_v, t_v)).project(found.views.points)
+        if bool((found.used[name] & ~valid).any()):
+            below[name] = terms
+    return below
+
+
+def _fitted(
+    views: RigViews,
+    parameters: RigParameters,
+    intrinsics: Mapping[str, Tensor],
+    start: RigStart,
+    inliers: Mapping[str, Tensor],
+    positions: Sequence[int],
+    options: Options,
+) -> RigFit:
+    basis = free_directions(parameters, positions, start.t)
+    shared = start.t.new_zeros(1, parameters.size)
+    for c, name in enumerate(views.names):
+        shared[0, parameters.intrinsics(c)] = intrinsics[name]
+        if c:
+            shared[0, parameters.pose(c)] = torch.cat([torch.zeros_like(start.t[c]), start.t[c]])
+    local = tuple(part.unsqueeze(0) for part in start.poses)
+    given = {name: views.data[name].used[0] for name in views.names}
+    used = {name: _enough(inliers[name] & ~start.apart[name].unsqueeze(-1)) for name in views.names}
+    with torch.inference_mode():
+        fit = _Rounds(views, parameters, start.R, basis, options)
+        fit.solve(used, shared, local)
+        apart = fit.reviewed(given, start.apart)
+        if any(bool((apart[name] != start.apart[name]).any()) for name in views.names):
+            used = {name: _enough(inliers[name] & ~apart[name].unsqueeze(-1)) for name in views.names}
+            fit.solve(used, fit.shared, fit.local)
+        rejected = {name: given[name] & apart[name].unsqueeze(-1) for name in views.names}
+        if options.outlier_limit is not None:
+            for _ in range(MAX_REJECTION_ROUNDS):
+                kept = fit.inliers(given, options.outlier_limit)
+                kept = {name: kept[name] & ~apart[name].unsqueeze(-1) for name in views.names}
+                rejected = {name: given[name] & ~kept[name] for name in views.names}
+                enough = {name: _enough(part) for name, part in kept.items()}
+                if all(torch.equal(enough[name], fit.used[name]) for name in views.names):
+                    break
+                fit.solve(enough, fit.shared, fit.local)
+        found = fit.at_the_minimum(rejected, apart)
+    state = normal_tensors((found.shared, found.local, found.equations, found.problem.base))
+    problem = RigProblem(views, parameters, state[3], found.used)
+    return replace(found, shared=state[0], local=state[1], equations=state[2], problem=problem)
+
+
+class _Rounds:
+    """The solver's rounds, each from where the last ended."""
+
+    def __init__(
+        self, views: RigViews, parameters: RigParameters, base: Tensor, basis: Tensor | None, options: Options
+    ) -> None:
+        self.views, self.parameters, self.base, self.basis, self.options = views, parameters, base, basis, options
+        self.iterations, self.round = 0, 0
+
+    def solve(self, used: dict[str, Tensor], shared: Tensor, local: tuple[Tensor, ...]) -> None:
+        options, self.used = self.options, used
+        self.problem = RigProblem(self.views, self.parameters, self.base, used)
+        self.every = sum(int(part.sum()) for part in used.values())
+        rounds = 1 if options.outlier_limit is None else 1 + MAX_REJECTION_ROUNDS
+        before = min(self.round, rounds - 1) * options.max_iterations
+
+        def tell(step: int, _: Tensor) -> None:
+            if options.progress is not None:
+                options.progress(before + step, rounds * options.max_iterations)
+
+        found = solve(
+            self.problem,
+            shared,
+            local,
+            local_size=POSE,
+            loss=options.loss,
+            basis=self.basis,
+            max_iterations=options.max_iterations,
+            tolerance=options.tolerance,
+            negligible=max(1, self.every) * self._scale() * NEGLIGIBLE_PX**2,
+            progress=tell,
+        )
+        self.shared, self.local, self.status = found.shared, found.local, int(found.status[0])
+        self.iterations, self.round = self.iterations + int(found.iterations[0]), self.round + 1
+
+    def _scale(self) -> float:
+        """What a negligible residual costs, over its square: little with small weights, or a small loss."""
+        weights = [group.weights.max() for group in self.problem.groups if group.weights is not None]
+        scale = float(min(weights)) if weights else 1.0
+        if self.options.loss is not None:
+            squared = torch.full((1,), NEGLIGIBLE_PX**2, dtype=torch.float64, device=self.shared_device)
+            scale *= float(self.options.loss.value(squared)) / NEGLIGIBLE_PX**2
+        return scale
+
+    @property
+    def shared_device(self) -> torch.device:
+        return self.base.device
+
+    def residuals(self, used: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Of more corners than were fitted to `(V_c, N, 2)`."""
+        problem = RigProblem(self.views, self.parameters, self.base, used)
+        return _by_camera(self.views, problem, problem.residuals(self.shared, self.local))
+
+    def reviewed(self, given: dict[str, Tensor], apart: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Views that still contradict the others at the minimum, of those that were set apart."""
+        if not any(bool(part.any()) for part in apart.values()):
+            return apart
+        squares = {name: off.square().sum(-1) for name, off in self.residuals(given).items()}
+        fitted = sum(float(squares[name][self.used[name]].sum()) for name in squares)
+        level = max(fitted / max(1, self.every), LEAST_PX**2)
+        mean = {name: squares[name].sum(-1) / given[name].sum(-1).clamp(min=1) for name in squares}
+        return {name: part & ~(mean[name] <= READMITTED**2 * level) for name, part in apart.items()}
+
+    def inliers(self, given: dict[str, Tensor], limit: float) -> dict[str, Tensor]:
+        """Which of the given corners are inliers `(V_c, N)`, by their weighted residuals and their camera's noise."""
+        kept = {}
+        for name, residual in self.residuals(given).items():
+            weights = self.views.data[name].weights
+            residual = residual if weights is None else residual * weights[0].sqrt().unsqueeze(-1)
+            known = torch.where(self.used[name].unsqueeze(-1), residual.abs(), torch.nan)
+            sigma = (1.4826 * known.flatten().nanmedian()).clamp(min=LEAST_PX)
+            kept[name] = given[name] & (residual.square().sum(-1) <= (limit * sigma).square())
+        return kept
+
+    def at_the_minimum(self, rejected: dict[str, Tensor], apart: dict[str, Tensor]) -> RigFit:
+        base, t = self.problem.cameras(self.shared)
+        shared = self.shared.clone()
+        for c in range(1, len(base)):
+            shared[0, self.parameters.pose(c)] = torch.cat([torch.zeros_like(t[c]), t[c]])
+        problem = self.problem.rebased(base)
+        _, equations = problem.equations(shared, self.local, self.options.loss)
+        return RigFit(
+            self.views,
+            problem,
+            shared,
+            self.local,
+            equations,
+            self.used,
+            rejected,
+            apart,
+            self.status,
+            self.iterations,
+            self.basis,
+            self.options.loss,
+        )
+
+
+def _enough(used: Tensor) -> Tensor:
+    """The same without views of fewer than four corners."""
+    return used & (used.sum(-1, keepdim=True) >= 4)
+
+
+def _by_camera(views: RigViews, problem: RigProblem, residuals: list[Tensor]) -> dict[str, Tensor]:
+    found = {name: torch.zeros_like(views.data[name].pixels[0]) for name in views.names}
+    for group, residual in zip(problem.groups, residuals, strict=True):
+        for c in group.members:
+            mine = group.camera == c
+            found[views.names[c]][group.number[mine]] = residual[mine].mT
+    return found

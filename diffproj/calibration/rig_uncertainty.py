@@ -1,0 +1,172 @@
+"""The joint covariance of a rig: intrinsics and places of all cameras, and the target's pose at each moment.
+
+The forms are those of `uncertainty.py`, with the noise of a corner estimated for each camera: where the corners of one
+scatter more than another's, the covariance of the scores is not a multiple of the normal matrix, but sums up each
+camera's share. With s_c the noise of camera c, and all views of a moment one group,
+
+    H = sum_c sum w J^T J       M = sum_c s_c^2 sum w J^T J       covariance = phi H^-1 M H^-1
+
+phi the dispersion (`dispersion.py`): how much the moments contradict each other.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.covariance import Covariance, Scores, covariance, local_inverse, reshaped
+from diffproj.calibration.dispersion import believed, contradiction
+from diffproj.calibration.losses import slope_and_bend
+from diffproj.calibration.parametrisation import POSE
+from diffproj.calibration.rig_fit import RigFit
+from diffproj.calibration.rig_problem import cross_matrix
+from diffproj.calibration.solver import Equations
+
+
+class CameraNoise(NamedTuple):
+    """What the residuals of each camera tell of the noise of its corners `(C,)`.
+
+    Attributes:
+        variance: of a residual component, of weight 1.
+        pixel_variance: of a coordinate in px^2.
+        freedom: degrees of freedom that they are from.
+        bend: the mean derivative of the score, 1 for least squares.
+        inflation: what a robust loss loses: 1 for least squares.
+    """
+
+    variance: Tensor
+    pixel_variance: Tensor
+    freedom: Tensor
+    bend: Tensor
+    inflation: Tensor
+
+
+def camera_noise(found: RigFit) -> CameraNoise:
+    """The noise of each camera; NaN where there are no degrees of freedom."""
+    views, names = found.views, found.views.names
+    count = torch.zeros(len(names), len(views.moments), dtype=torch.float64, device=found.shared.device)
+    for c, name in enumerate(names):
+        count[c, views.where[name]] = found.used[name].sum(-1).to(count)
+    # A moment's pose takes six degrees of freedom, from each of its cameras by its corners.
+    of_poses = POSE * (count / count.sum(0).clamp(min=1)).sum(-1)
+    free = torch.ones_like(found.shared[0]) if found.basis is None else found.basis[0].abs().sum(-1)
+    parameters = found.parameters
+    own = torch.stack(
+        [free[parameters.columns(c)[: None if c else parameters.kinds[0].size]].sum() for c in range(len(names))]
+    )
+    spare = 2 * count.sum(-1) - of_poses - own
+    lost = torch.full_like(spare, torch.nan)
+    rows = []
+    for c, (name, residual) in enumerate(found.by_camera.items()):
+        used, squared = found.used[name], residual.square().sum(-1)
+        weights = views.data[name].weights
+        weight = used.to(squared) if weights is None else weights[0] * used
+        plain = torch.where(spare[c] > 0, squared.sum() / spare[c], lost[c])
+        bend, inflation = torch.ones_like(plain), torch.ones_like(plain)
+        if found.loss is None:
+            level = torch.where(spare[c] > 0, (weight * squared).sum() / spare[c], lost[c])
+        else:
+            slope, curve = slope_and_bend(found.loss, squared)
+            n = used.sum().clamp(min=1)
+
+            def mean(values: Tensor, used: Tensor = used, n: Tensor = n) -> Tensor:
+                return (values * used).sum() / n
+
+            bend = mean(slope + curve * squared).clamp(min=1e-3)
+            square = mean(slope.square() + 2 * slope * curve * squared + 2 * (curve * squared).square())
+            inflation = (1 + (1 - spare[c] / (2 * n)) * (square / bend.square() - 1).clamp(min=0)).square()
+            level = torch.where(spare[c] > 0, (weight * slope.square() * squared).sum() / spare[c], lost[c])
+            plain = (1.4826 * residual[used].abs().flatten().median()).square() if bool(used.any()) else lost[c]
+        rows.append((level, plain, spare[c], bend, inflation))
+    return CameraNoise(*(torch.stack(column) for column in zip(*rows, strict=True)))
+
+
+def plain_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
+    """The covariance for one noise of all cameras and independent corners: what verdicts go by."""
+    freedom = noise.freedom.clamp(min=0)
+    pooled = (torch.where(freedom > 0, noise.variance * freedom, 0.0)).sum() / freedom.sum().clamp(min=1)
+    return covariance(found.equations, found.parameters.names, pooled.unsqueeze(0), basis=found.basis)
+
+
+def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
+    """The joint covariance, without batch axes; poses are the target's in the rig."""
+    problem, state = found.problem, (found.shared, found.local, None)
+    _, H = problem.totals(*state, scale=noise.bend)
+    _, M = problem.totals(*state, scale=(noise.variance * noise.inflation).nan_to_num(0.0), by_moment=True)
+    phi = _dispersion(found, H, M)
+    scores = Scores(M.U, M.E, M.W)
+    found_one = covariance(
+        H, found.parameters.names, torch.ones_like(phi), basis=found.basis, scores=scores, dispersion=phi
+    )
+    middle = found.views.middle
+    R, _ = found.views.frame.world_pose(found.local[0][0], found.local[1][0])
+    return replace(reshaped(found_one, ()), middle=middle, _arm=R @ middle)
+
+
+def _dispersion(found: RigFit, H: Equations, M: Equations) -> Tensor:
+    """How much more the moments contradict each other than independent corners would `(1,)`."""
+    seen = torch.stack([_seen(found, name) for name in found.views.names]).any(0)
+    if found.free == 0 or int(seen.sum()) < 2:
+        return torch.ones_like(H.g[:, 0])
+    with torch.inference_mode():
+        _, own = found.problem.totals(found.shared, found.local, found.loss, by_moment=True)
+        inverse, _ = local_inverse(own.W)
+        F = own.E @ inverse
+        u = own.g - (F @ own.h.unsqueeze(-1)).squeeze(-1)
+        S = own.U - F @ own.E.mT
+        leaning = F @ M.E.mT
+        K = M.U - leaning - leaning.mT + F @ M.W @ F.mT
+        if found.basis is not None:
+            T = found.basis.mT.unsqueeze(1)
+            u, S, K = (T @ u.unsqueeze(-1)).squeeze(-1), T @ S @ T.mT, T @ K @ T.mT
+        share = seen.to(u).unsqueeze(0)
+        told = contradiction(u, S, K, share, S.sum(1), u.sum(1))
+        return believed(told).clone()
+
+
+def _seen(found: RigFit, name: str) -> Tensor:
+    """Moments at which a camera saw the target `(M,)`."""
+    seen = torch.zeros(len(found.views.moments), dtype=torch.bool, device=found.shared.device)
+    seen[found.views.where[name]] = found.used[name].any(-1)
+    return seen
+
+
+def of_camera(found: RigFit, joint: Covariance, camera: int) -> Covariance:
+    """The covariance of one camera and the target's pose in each of its views, with all else that is shared behind.
+
+    The pose in a view is composed of the camera's place in the rig and the target's: `dz_v = A_v dx_c + B_v dz_m`.
+    """
+    views, parameters = found.views, found.parameters
+    name, s = views.names[camera], parameters.size
+    own, place = parameters.intrinsics(camera), parameters.pose(camera)
+    where = views.where[name]
+    R, _ = found.problem.cameras(found.shared)
+    R_c, R_m, t_m = R[camera], found.local[0][0, where], found.local[1][0, where]
+    arm = (R_c @ t_m.unsqueeze(-1)).squeeze(-1)
+    B = torch.block_diag(R_c, R_c)
+    follow, mixed, alone = B @ joint._follow[where], B @ joint._mixed[where], B @ joint._alone[where] @ B.mT
+    if camera:
+        A = torch.eye(POSE, dtype=B.dtype, device=B.device).repeat(len(where), 1, 1)
+        A[:, 3:, :3] = -cross_matrix(arm)
+        follow = follow.clone()
+        follow[:, :, place] -= A
+    order = [*range(own.start, own.stop), *(i for i in range(s) if not own.start <= i < own.stop)]
+    names = tuple(
+        joint.names[i].removeprefix(f"{name}.") if own.start <= i < own.stop else joint.names[i] for i in order
+    )
+    rows = torch.tensor(order, device=B.device)
+    unknown = joint.undetermined_views[where]
+    middle = views.middle
+    return Covariance(
+        names,
+        joint.shared[rows][:, rows],
+        joint.undetermined[rows],
+        unknown,
+        joint.dispersion,
+        follow[..., rows],
+        mixed[..., rows],
+        alone,
+        middle,
+        (R_c @ views.frame.world_pose(R_m, t_m)[0]) @ middle,
+    )

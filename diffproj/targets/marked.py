@@ -1,0 +1,291 @@
+"""Find a board of square markers in a photograph: which of its corners are seen, and where, to a hundredth of a pixel.
+
+OpenCV finds markers. Those that stand to each other as on the board say where its corners are; each corner is fitted
+with the print around it, and from corners that fit, those whose markers were not read are found as well.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Shaped, UInt8
+
+from diffproj.targets.april_grid import AprilGrid
+from diffproj.targets.charuco import CharucoBoard
+from diffproj.targets.corner_fit import Fitted
+from diffproj.targets.dictionaries import dictionary_named
+from diffproj.targets.pattern_fit import LARGEST, SMALLEST, Patches, fit_patches, patches_of
+from diffproj.targets.surface import off_surface
+
+MISFIT = 0.30
+"""Misfit from which a corner is not taken: half covered ones, and those of another number, leave more."""
+
+FAINT = 0.15
+"""Least contrast, relative to the median of the view: glare drowns the rest."""
+
+VAGUE = 0.20
+"""Standard deviation in px from which a corner is not taken."""
+
+NEAR = 2.3
+"""Distance between markers, in pitches, up to which they vouch for each other."""
+
+AGREED = 0.35
+"""How far off a marker may be from where another puts it, in pitches."""
+
+RIVALS = 0.3
+"""Share of markers that stand amid those that agree, and elsewhere on the board, from which none is believed."""
+
+FEWEST = 6
+"""Corners that a view must show, on at least two rows and two columns."""
+
+ENOUGH = 8
+"""Markers that agree from which no other copy of the image is searched: corners lead to the rest of the board."""
+
+WIDEST = 2400
+"""Longer side in px from which markers are sought in a smaller copy first."""
+
+
+MarkedBoard = AprilGrid | CharucoBoard
+"""Boards with markers."""
+
+
+class Marker(NamedTuple):
+    """A marker that was read.
+
+    Attributes:
+        number: its number.
+        quad: `(4, 2)` px, its corners.
+        board: `(4, 2)`, where the print has them.
+        affine: `(2, 3)`, px from places on the print.
+    """
+
+    number: int
+    quad: Float[np.ndarray, "4 2"]
+    board: Float[np.ndarray, "4 2"]
+    affine: Float[np.ndarray, "2 3"]
+
+
+def find_marked(
+    image: Shaped[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], board: MarkedBoard
+) -> Float[np.ndarray, "n 2"] | None:
+    """The board's corners in px, NaN where not seen; None where too little of it is seen.
+
+    Args:
+        image: `(H, W)`, uint8 or float32.
+        grey: the same in 8 bits.
+        board: the board.
+    """
+    for border in board.borders:
+        markers = _agreeing(grey, board, border)
+        if len(markers) > 1:
+            corners = _Search(image, board, border).corners(markers)
+            if corners is not None:
+                return corners
+    return None
+
+
+class _Search:
+    """The corners of one board in one image."""
+
+    def __init__(self, image: Shaped[np.ndarray, "h w"], board: MarkedBoard, border: int) -> None:
+        self.image, self.board = image, board
+        self.places = board.corners
+        self.patches = patches_of(board.artwork_with(border), self.places, 1.3 * board.reach)
+
+    def corners(self, markers: list[Marker]) -> Float[np.ndarray, "n 2"] | None:
+        """All corners that can be told, from markers that agree."""
+        known = np.full(self.places.shape, np.nan)
+        good = np.zeros(len(known), dtype=bool)
+        sources = np.concatenate([one.board for one in markers]), np.concatenate([one.quad for one in markers])
+        tried = np.zeros(len(known), dtype=bool)
+        for round_ in range(8):
+            todo = np.flatnonzero(~good & ~tried) if round_ == 0 else np.flatnonzero(~good)
+            start, jacobians = _predicted(self.places[todo], *sources, self.board.pitch, first=round_ == 0)
+            there = np.isfinite(start).all(axis=-1)
+            todo, start, jacobians = todo[there], start[there], jacobians[there]
+            found = self._fitted(todo, start, jacobians)
+            if found is None:
+                break
+            before = int(good.sum())
+            good[todo] = found.good
+            known[todo] = np.where(found.good[:, None], found.corners, np.nan)
+            good = self._smooth(known, good)
+            known[~good] = np.nan
+            if int(good.sum()) <= before or good.sum() < 4:
+                break
+            sources = self.places[good], known[good]
+        rows, columns = (len(np.unique(np.round(self.places[good, axis], 9))) for axis in (1, 0))
+        if good.sum() < FEWEST or min(rows, columns) < 2:
+            return None
+        return known
+
+    def _fitted(self, which: np.ndarray, start: np.ndarray, jacobians: np.ndarray) -> "_Tried | None":
+        height, width = self.image.shape
+        scale = np.linalg.norm(jacobians, axis=1).min(axis=-1)
+        inside = ((start > 1) & (start < [width - 2, height - 2])).all(axis=-1) & (scale * self.board.apart > 4)
+        if not inside.any():
+            return None
+        radius = np.clip(scale[inside] * self.board.reach, SMALLEST, LARGEST)
+        part = which[inside]
+        patches = Patches(*(each[part] for each in self.patches))
+        fit = fit_patches(self.image, start[inside], jacobians[inside], patches, radius)
+        good, corners = np.zeros(len(which), dtype=bool), np.full((len(which), 2), np.nan)
+        good[inside] = self._taken(fit, start[inside], scale[inside])
+        corners[inside] = fit.corners
+        return _Tried(corners, good)
+
+    def _taken(self, fit: Fitted, start: np.ndarray, scale: np.ndarray) -> np.ndarray:
+        dark = -fit.contrast
+        usual = float(np.median(dark[fit.misfit < MISFIT])) if (fit.misfit < MISFIT).any() else 1.0
+        height, width = self.image.shape
+        good = (fit.misfit < MISFIT) & (dark > FAINT * usual) & (dark > 2) & (fit.sigma < VAGUE)
+        good &= np.linalg.norm(fit.corners - start, axis=-1) < 0.3 * scale * self.board.apart
+        return good & ((fit.corners >= 1) & (fit.corners <= [width - 2, height - 2])).all(axis=-1)
+
+    def _smooth(self, known: np.ndarray, good: np.ndarray) -> np.ndarray:
+        """Those that lie where their neighbours put them."""
+        good = good.copy()
+        for _ in range(3):
+            off, limit = off_surface(self.places, known, good, self.board.pitch)
+            wrong = good & (off > limit)
+            if not wrong.any():
+                break
+            good &= ~wrong
+        return good
+
+
+class _Tried(NamedTuple):
+    corners: Float[np.ndarray, "n 2"]
+    good: Shaped[np.ndarray, " n"]
+
+
+def _agreeing(grey: UInt8[np.ndarray, "h w"], board: MarkedBoard, border: int) -> list[Marker]:
+    """The largest set of markers that stand to each other as on the board, from the copy that shows most."""
+    best: list[Marker] = []
+    for small in _copies(grey):
+        found = _read(small, grey, board, border)
+        agreed = _consistent(found, board.pitch)
+        if len(agreed) > len(best):
+            best = agreed
+        if len(best) >= min(ENOUGH, 0.5 * len(board.markers)):
+            break
+    return best
+
+
+def _copies(grey: UInt8[np.ndarray, "h w"]) -> Iterator[UInt8[np.ndarray, "_h _w"]]:
+    """The image at sizes to search: itself; one of twice or half its size; dark and light exchanged."""
+    longest = max(grey.shape)
+    if longest > WIDEST:
+        yield cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    yield grey
+    if longest <= WIDEST:
+        yield cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+
+
+def _read(
+    small: UInt8[np.ndarray, "_h _w"], grey: UInt8[np.ndarray, "h w"], board: MarkedBoard, border: int
+) -> list[Marker]:
+    """The board's markers that OpenCV reads in a copy, in px of the image."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = border
+    parameters.minMarkerPerimeterRate = 0.015
+    parameters.minDistanceToBorder = 1
+    quads, numbers, _ = cv2.aruco.ArucoDetector(dictionary_named(board.dictionary), parameters).detectMarkers(small)
+    scale = np.array(grey.shape[::-1]) / small.shape[::-1]
+    markers, found = board.markers, []
+    for read, quad in zip([] if numbers is None else np.ravel(numbers), quads, strict=True):
+        number = int(read)
+        if number in markers:
+            corners = (quad.reshape(4, 2).astype(np.float64) + 0.5) * scale - 0.5
+            design = np.column_stack([markers[number], np.ones(4)])
+            affine = np.linalg.lstsq(design, corners, rcond=None)[0].T
+            if np.linalg.det(affine[:, :2]) > 0:
+                found.append(Marker(number, corners, markers[number], affine))
+    return found
+
+
+def _consistent(found: list[Marker], pitch: float) -> list[Marker]:
+    """The largest set of markers in which each is where a neighbour puts it, and puts that where it is."""
+    if len(found) < 2:
+        return []
+    board = np.stack([one.board.mean(axis=0) for one in found])
+    seen = np.stack([one.quad.mean(axis=0) for one in found])
+    affine = np.stack([one.affine for one in found])
+    put = affine[:, None, :, :2] @ board[None, :, :, None]
+    put = put[..., 0] + affine[:, None, :, 2]
+    size = np.sqrt(np.abs(np.linalg.det(affine[:, :, :2]))) * pitch
+    off = np.linalg.norm(put - seen[None], axis=-1)
+    distance = np.linalg.norm(board[:, None] - board[None], axis=-1) / pitch
+    near = (distance < NEAR) & (distance > 0)
+    agree = near & (off < AGREED * np.maximum(distance, 1) * np.minimum(size[:, None], size[None]))
+    agree &= agree.T
+    left, best = set(range(len(found))), set()
+    while left:
+        group, edge = set(), {left.pop()}
+        while edge:
+            one = edge.pop()
+            group.add(one)
+            edge |= {int(k) for k in np.flatnonzero(agree[one])} & left
+            left -= edge
+        if len({found[k].number for k in group}) > len({found[k].number for k in best}):
+            best = group
+    members = sorted(best)
+    if len({found[k].number for k in members}) < 2:
+        return []
+    # Markers amid the group that stand elsewhere on the board: it is another board that has some places in common.
+    apart = np.linalg.norm(seen[:, None] - seen[None, members], axis=-1) / size[None, members]
+    rivals = [k for k in range(len(found)) if k not in best and apart[k].min() < NEAR]
+    if len(rivals) > RIVALS * len(members):
+        return []
+    votes = agree[:, members].sum(axis=1)
+    chosen: dict[int, int] = {}
+    for k in sorted(members, key=lambda k: -votes[k]):
+        chosen.setdefault(found[k].number, k)
+    return [found[k] for k in sorted(chosen.values())]
+
+
+def _predicted(
+    places: Float[np.ndarray, "n 2"],
+    board: Float[np.ndarray, "m 2"],
+    seen: Float[np.ndarray, "m 2"],
+    pitch: float,
+    first: bool,
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+    """Where the nearest points of the board put others, and px for world units there; NaN where none is near.
+
+    A homography through the nearest points, of markers at first and of corners later, weighted by their distance.
+    """
+    start, jacobians = np.full(places.shape, np.nan), np.zeros((len(places), 2, 2))
+    count = min(16 if first else 12, len(board))
+    for i, place in enumerate(places):
+        distance = np.linalg.norm(board - place, axis=-1) / pitch
+        nearest = np.argpartition(distance, count - 1)[:count]
+        if distance[nearest].min() > (1.0 if first else 1.6):
+            continue
+        nearest = nearest[distance[nearest] < 3.2]
+        if len(nearest) < 4 or np.linalg.matrix_rank(board[nearest] - board[nearest].mean(axis=0), tol=0.1 * pitch) < 2:
+            continue
+        weight = 1 / (0.3 + distance[nearest])
+        x, y = ((board[nearest] - place) / pitch).T
+        u, v = (seen[nearest] - seen[nearest].mean(axis=0)).T
+        one, none = np.ones_like(x), np.zeros_like(x)
+        rows = np.concatenate(
+            [
+                np.stack([x, y, one, none, none, none, -u * x, -u * y], axis=1) * weight[:, None],
+                np.stack([none, none, none, x, y, one, -v * x, -v * y], axis=1) * weight[:, None],
+            ]
+        )
+        # The perspective is held near none: few points near each other hardly tell it.
+        spread = float(np.hypot(u, v).mean()) + 1e-9
+        held = np.zeros((2, 8))
+        held[0, 6] = held[1, 7] = spread * 0.3
+        h = np.linalg.lstsq(np.concatenate([rows, held]), np.concatenate([u * weight, v * weight, [0, 0]]), rcond=None)[
+            0
+        ]
+        start[i] = h[[2, 5]] + seen[nearest].mean(axis=0)
+        jacobians[i] = [h[:2] - h[2] * h[6:], h[3:5] - h[5] * h[6:]]
+    jacobians /= pitch
+    turned = np.linalg.det(jacobians) <= 0
+    start[turned] = np.nan
+    return start, jacobians
