@@ -1,4 +1,4 @@
-"""What `diffproj locate` found, as one JSON document, in which what is not known is `None`, and as tables for people."""
+"""What `diffproj locate` found: one JSON document, in which what is not known is `None`, and tables for people."""
 
 import argparse
 import math

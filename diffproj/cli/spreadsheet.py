@@ -1,4 +1,4 @@
-"""Tables as spreadsheets write them: commas, semicolons or tabs between cells, and decimal commas with the latter two."""
+"""Tables as spreadsheets write them: commas, semicolons or tabs between cells; with the latter two, decimal commas."""
 
 import csv
 import io
