@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Shaped
 from torch import Tensor
 
 from diffproj.calibration.locate import locate
@@ -22,7 +24,7 @@ from diffproj.cli.scene import check_size, loaded
 from diffproj.cli.terminal import failure, result
 from diffproj.files.save import save_camera
 from diffproj.geometry.camera import Camera
-from diffproj.targets.images import grey, listed
+from diffproj.targets.images import Orientation, grey, listed
 from diffproj.targets.views import Views
 
 FEWEST = 4
@@ -38,9 +40,9 @@ def run(options: argparse.Namespace) -> int:
         check_no_photograph(options.draw, [options.photograph])
     camera, calibration = loaded(options.camera)
     surveyed = read_landmarks(options.landmarks)
-    picture = _picture(options)
-    size = camera.size
-    if picture is not None:
+    picture, size = None, camera.size
+    if options.photograph is not None:
+        picture = _picture(options.photograph, options.orientation)
         size = picture.shape[1], picture.shape[0]
         check_size(camera, size, options.camera, options.photograph)
     if size is None and options.draw is not None:
@@ -66,17 +68,14 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _picture(options: argparse.Namespace) -> Any:
-    """The grey values of the photograph, where there is one."""
-    path: Path | None = options.photograph
-    if path is None:
-        return None
+def _picture(path: Path, orientation: Orientation) -> Shaped[np.ndarray, "h w"]:
+    """The grey values of the photograph."""
     if path.is_dir():
         raise ValueError(f"PHOTO: want one photograph, got the folder {path}")
     sources = photographs([path])
     if len(sources) > 1:
         raise ValueError(f"PHOTO: want one photograph, got {len(sources)} of the form {path}")
-    return grey(listed(sources[0])[0], options.orientation)
+    return grey(listed(sources[0])[0], orientation)
 
 
 def _located(

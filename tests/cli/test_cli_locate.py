@@ -187,7 +187,7 @@ def test_a_river_of_unknown_focal_length(capsys: pytest.CaptureFixture[str]) -> 
     assert [row["name"] for row in found["landmarks"]] == list("123456")
     code, out, _ = run(capsys, "--camera", "rough.yaml", "--landmarks", "river.csv", "--free", "focal,k1")
     assert code == 0
-    assert re.search(r"focal length f_x, px +│ +1556", out)
+    assert re.search(r"focal length f_x, px +│ +155[67]", out)
 
 
 def test_deviations_of_pixels_and_landmarks_are_carried(capsys: pytest.CaptureFixture[str]) -> None:
@@ -262,13 +262,14 @@ def test_the_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None
     """It shows landmarks by name, those too that were not said to be seen."""
     out = tmp_path / "located.json"
     picture = tmp_path / "located.png"
-    arguments = ("beach.jpg", *DRONE, "--landmarks", "more.csv", "-o", str(out), "--draw", str(picture))
+    arguments = (*DRONE, "--landmarks", "more.csv", "-o", str(out), "--draw", str(picture))
     code, text, err = run(capsys, *arguments)
     assert (code, err) == (0, "")
     assert f"Drawn to {picture}" in text
     assert cv2.imread(str(picture)).shape[1] == 1200
     located = dp.load_calibration(out)
-    (axes,) = figures.landmarks(located, title="a $ sign").axes
+    (axes,) = figures.landmarks(located, 0, np.full((2160, 3840), 90, np.uint8), "a $ sign").axes
+    assert len(axes.images) == 1
     assert [text.get_text() for text in axes.texts] == ["mast", "wall", "gate", "post", "drain", "hut"]
     bare = dp.locate(
         dp.Views(located.views.pixels[:, :5]), dp.Landmarks(located.points[:5]), dp.load_camera("sizeless.json")
