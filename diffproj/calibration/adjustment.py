@@ -27,6 +27,8 @@ SHOWN = 5
 """Numbers of cameras in a message."""
 NOTHING = 1e-12
 """Deviation, relative to the value, that is rounding: of what was held."""
+ROUNDED = 1e-7
+"""The same relative to the largest deviation of the pose, whose covariance it was computed from."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -144,15 +146,16 @@ class Adjustment(Calibration):
             raise ValueError(f"summary: want one camera, got batch shape {tuple(self.views.batch_shape)}; see message")
         values = {**dict(zip(self.parameters.names, self.shared.tolist(), strict=True)), **self._mounting_values()}
         spreads = self._spreads()
+        rounding = ROUNDED * max((spreads[name] for name in MOUNTING if spreads[name] < torch.inf), default=0.0)
         unit = f" {self.unit}" if self.unit else ""
         lines = []
         for name, value in values.items():
             spread = spreads.get(name, 0.0)
-            spread = spread if spread > NOTHING * max(1.0, abs(value)) else 0.0
+            spread = spread if spread > NOTHING * max(1.0, abs(value)) + (name in MOUNTING) * rounding else 0.0
             if name in MOUNTING or spread:
                 kind = " degrees" if name in MOUNTING[:3] else unit if name in MOUNTING else ""
                 known = " (not known)" if spread == torch.inf else f" ± {spread:.4f}" if spread else " (fixed)"
-                lines.append(f"{name:<16}{value:12.4f}{known}{kind}")
+                lines.append(f"{name:<16}{value:z12.4f}{known}{kind}")
         for one, part in zip(self.observations, self.parts, strict=True):
             rms = float(part.detach().square().mean().sqrt())
             lines.append(f"{type(one).__name__:<16}{part.shape[-2]:5d} seen, residuals {rms:.2f} deviations")
