@@ -58,7 +58,10 @@ def test_colony_of_penguins() -> None:
         assert float(getattr(spread, name)) == pytest.approx(deviation, rel=0.05), name
     assert "Heights (2.0 times)" in found.doubts  # penguins are less alike than 3 cm
     lines = found.summary().splitlines()
-    assert [line.split() for line in lines if line[0] in "xy"] == [["x", "0.0000", "(fixed)"], ["y", "0.0000", "(fixed)"]]
+    assert [line.split() for line in lines if line[0] in "xy"] == [
+        ["x", "0.0000", "(fixed)"],
+        ["y", "0.0000", "(fixed)"],
+    ]
 
 
 VANISHING = [[1136.941176, 209.411765], [-1842.891566, 174.939760]]
