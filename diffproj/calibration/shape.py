@@ -19,14 +19,12 @@ that of the nominal points: like the side of a chessboard's square, their size a
 A point that fewer than two views show stays at its nominal place, and its variance is infinite.
 """
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-Shape = Literal["flat", "bow", "free"]
-"""What is taken of a target's shape: its points are where it says, or bent to a paraboloid, or each free."""
 AXES = ("x", "y", "z")
 FEWEST_VIEWS = 2
 """Views that show a point, below which it stays where the target has it."""

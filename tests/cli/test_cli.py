@@ -80,14 +80,15 @@ def test_missing_matplotlib_is_found_before_the_work(
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [
-        (["help"], 0, "find a camera from photographs of a chessboard"),
+        (["help"], 0, "find a camera from photographs of a board"),
         (["--help"], 0, "'diffproj help COMMAND' tells more about a command."),
         (["--version"], 0, f"diffproj {dp.__version__}\n"),
         (["calibrat"], 2, "invalid choice: 'calibrat' (choose from"),
         (["help", "nothing"], 2, "invalid choice: 'nothing'"),
         ([], 2, "the following arguments are required: COMMAND"),
         (["help", "measure"], 0, "The origin is the first inner corner"),
-        (["calibrate", "--help"], 0, "Finds a camera from photographs of a chessboard"),
+        (["calibrate", "--help"], 0, "Finds a camera from photographs of a board"),
+        (["locate", "--help"], 0, "Four landmarks that do not lie on a line are enough"),
         (["experiment", "--help"], 0, "--strict"),
         (
             ["measure", "photo.png", "--camera", "a.json", "--board", "9x6", "--points", "1,2"],
