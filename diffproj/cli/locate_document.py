@@ -18,6 +18,16 @@ MOUNTING = ("tilt", "roll", "heading", "x", "y", "z")
 """In the order of the covariance of a mounting."""
 
 ANGLES = MOUNTING[:3]
+LEVEL = 0.1
+"""Relief, as a part of their extent, below which landmarks lie on a ground."""
+
+FEW = 8
+"""Degrees of freedom below which they are told."""
+
+BELOW = (
+    "The camera is on the side of the landmarks to which z decreases. If z points up, x and y are exchanged: x is east or "
+    "right, y north or ahead. If not, tilt, roll and heading are those of a world that is upside down."
+)
 IN_WORDS = {
     "tilt": "tilt, degrees below the horizon",
     "roll": "roll, degrees",
@@ -68,9 +78,17 @@ def document(
         "deviations_include": includes + (["camera"] if calibrated and not free and found.knows_intrinsics else []),
         "landmarks": rows,
         "worst": max(used, key=lambda row: row["off"])["name"],
+        "remarks": [BELOW] if _from_below(found) else [],
         "message": found.message,
         "verdict": found.verdict,
     }
+
+
+def _from_below(found: Calibration) -> bool:
+    """Whether level ground is seen from where z decreases: so it looks where x and y were exchanged."""
+    points = found.points
+    size = points.amax(0) - points.amin(0)
+    return bool(size[2] < LEVEL * size[:2].amax()) and bool(found.cameras[0].center[2] < points[:, 2].mean())
 
 
 def _landmarks(found: Calibration, surveyed: Surveyed) -> list[dict[str, Any]]:
@@ -111,6 +129,8 @@ def say(told: dict[str, Any]) -> None:
     worst = next(row for row in told["landmarks"] if row["name"] == told["worst"])
     if worst["off"] > 0.0:
         result(f"\nFarthest off: {worst['name']}, {worst['off']:.3g} px")
+    for remark in told["remarks"]:
+        result("\n" + textwrap.fill(remark, 79))
     result("\n" + textwrap.fill(in_options(told["verdict"]), 79))
     result(textwrap.fill(_about_deviations(told), 79))
 
@@ -136,7 +156,7 @@ def _title(name: str) -> str:
 
 
 def _landmarks_table(told: dict[str, Any]) -> Table:
-    table = Table(title="Landmarks: where the camera sees them, minus their pixels", title_justify="left")
+    table = Table(title="Landmarks: projected minus seen", title_justify="left")
     table.add_column("landmark", overflow="fold")
     for name in ("pixel u, v", "off by u, v in px", "together"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -156,7 +176,9 @@ def _about_deviations(told: dict[str, Any]) -> str:
     freedom, sigma = told["degrees_of_freedom"], told["pixel_sigma"]
     noise = f"{sigma:.2g} px for each landmark" if sigma is not None else "that of each landmark"
     if freedom is not None:
-        noise += ", as the residuals tell" + (f" from {freedom:.0f} degrees of freedom only" if freedom < 8 else "")
+        noise += ", as the residuals tell" + (
+            f" from {counted(round(freedom), 'degree')} of freedom only" if freedom < 8 else ""
+        )
     survey = ", the landmarks' own deviations" if "landmarks" in told["deviations_include"] else ""
     if "camera" in told["deviations_include"]:
         return f"The deviations hold the noise of the pixels ({noise}){survey} and how surely the camera is known."

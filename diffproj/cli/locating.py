@@ -107,9 +107,19 @@ def _located(
             start, tied = camera.without_pose(), "focal" in options.free
             found = refine(views, surveyed.landmarks, start, fixed=fixed, tied_focal=tied, **steps)
     except (ValueError, CalibrationError) as error:
-        text = re.sub("^(target|views): ", "", failure(error))
+        text = _in_words(failure(error), surveyed)
         raise ValueError(text if text.startswith("--") else f"{path}: {text}") from error
     return replace(found, unit=options.unit)
+
+
+def _in_words(text: str, surveyed: Surveyed) -> str:
+    """What the library says of the landmarks, with their names and the command's options."""
+    text = re.sub("^(target|views): |^refine: ", "", text)
+    text = re.sub(r"; fixed=\(.*$", "; or less in --free", text)
+    names = surveyed.landmarks.names
+    return re.sub(
+        r"with (\d+) and (\d+) alike", lambda m: f"with {names[int(m[1])]!r} and {names[int(m[2])]!r} alike", text
+    )
 
 
 def _free(options: argparse.Namespace, camera: Camera) -> tuple[str, ...]:

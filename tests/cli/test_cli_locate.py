@@ -82,6 +82,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             f"{line[:-1]},{s}\n" for line, s in zip(lines, ["sigma_z", *"1"] + ["-1"] * 4, strict=True)
         ),
         "both.csv": "u,v,x,y,sigma,sigma_x\n1,2,3,4,5,6\n",
+        "alike.csv": BEACH + "again" + lines[1][4:],
+        "mixed.csv": BEACH.replace("2521.9588508,483.68938913", "@")
+        .replace("3770.57121219,1802.68876725", "2521.9588508,483.68938913")
+        .replace("@", "3770.57121219,1802.68876725"),
+        "exchanged.csv": BEACH.replace("x,y,z", "y,x,z"),
         "few.csv": "".join(lines[:4]),
         "line.csv": "name,u,v,x,y,z\n" + "".join(f"{i},{100 * i},{70 * i + 5},{i},{2 * i},{3 * i}\n" for i in range(6)),
         "outside.csv": BEACH.replace("2707.49279597", "9707"),
@@ -258,6 +263,15 @@ def test_a_wrong_landmark_is_rejected(capsys: pytest.CaptureFixture[str]) -> Non
     assert "rejected" in out
 
 
+def test_exchanged_axes_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of nearly level ground the mirror image fits too, from below."""
+    assert parsed(capsys, *DRONE, *LANDMARKS)["remarks"] == []
+    (remark,) = parsed(capsys, *DRONE, "--landmarks", "exchanged.csv")["remarks"]
+    assert "If z points up, x and y are exchanged" in remark
+    _, out, _ = run(capsys, *DRONE, "--landmarks", "exchanged.csv")
+    assert "The camera is on the side of the landmarks to which z decreases." in out
+
+
 def test_the_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """It shows landmarks by name, those too that were not said to be seen."""
     out = tmp_path / "located.json"
@@ -283,6 +297,11 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
     ((*LANDMARKS,), 2, "the following arguments are required: --camera"),
     ((*DRONE, *LANDMARKS, "--free", "focal;k1"), 2, "--free: want names with commas between, such as focal"),
     ((*DRONE, *LANDMARKS, "--free", "k7"), 1, "^diffproj: --free: want names from focal, .*, got 'k7'"),
+    (
+        (*DRONE, *LANDMARKS, "--free", "focal,principal_point,distortion"),
+        1,
+        "beach.csv: the views do not determine f_x, .*: more landmarks, near and far; or less in --free$",
+    ),
     ((*DRONE, *LANDMARKS, "--pixel-sigma", "0"), 2, "--pixel-sigma: want a positive number of pixels"),
     ((*DRONE, *LANDMARKS, "--unit", "px"), 2, "--unit: invalid choice: 'px'"),
     ((*DRONE, *LANDMARKS, "-o", "camera.yaml"), 2, "--output: want a file ending in .json, which holds the pose too"),
@@ -327,6 +346,8 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
             ("rough.csv", "--landmarks: want a standard deviation in column 'pixel_sigma' .* none for 'post'"),
             ("few.csv", "--landmarks: want at least 4 with a pixel, got 3 in few.csv"),
             ("line.csv", "line.csv: want points that do not lie on one line"),
+            ("alike.csv", "alike.csv: want points that are all distinct, got 6 with 'mast' and 'again' alike"),
+            ("mixed.csv", "mixed.csv: the corners of mixed do not match the landmarks: .* --reject-outliers finds few"),
             ("outside.csv", r"outside.csv: want corners inside the photographs of 3840 x 2160 px, got \(9707"),
             ("degrees.csv", "--landmarks: degrees.csv: points: .* latitude and longitude"),
         )
