@@ -25,8 +25,8 @@ FEW = 8
 """Degrees of freedom below which they are told."""
 
 BELOW = (
-    "The camera is on the side of the landmarks to which z decreases. If z points up, x and y are exchanged: x is east or "
-    "right, y north or ahead. If not, tilt, roll and heading are those of a world that is upside down."
+    "The camera is on the side of the landmarks to which z decreases. If z points up, x and y are exchanged: x is east "
+    "or right, y north or ahead. If not, tilt, roll and heading are those of a world that is upside down."
 )
 IN_WORDS = {
     "tilt": "tilt, degrees below the horizon",
