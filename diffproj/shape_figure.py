@@ -30,7 +30,7 @@ def target_shape(calibration: Calibration) -> Figure:
         >>> import diffproj as dp
         >>> figure = target_shape(dp.calibrate(dp.example_views("left"), dp.Chessboard(), shape="free"))
         >>> figure.axes[0].get_title()[:37]
-        'points off by 0.14 world units (RMS),'
+        'points off by 0.13 world units (RMS),'
     """
     if as_calibration(calibration).views.batch_shape or calibration.shape == "flat":
         raise ValueError("calibration: want one camera, with shape='free' or 'bow', got many, or a flat target")

@@ -120,6 +120,22 @@ def inputs(example: dict[str, Any]) -> dict[str, Any]:
         "theta": torch.tensor(0.3),
         "R": camera.R,
         **evidence(),
+        **surveyed(calibration.cameras[0]),
+        "other": dp.measure(example["pixels"].detach() + 0.1, calibration, plane, view=0, pixel_sigma=0.5),
+        "deviations": torch.tensor([0.5, 0.8], dtype=D).expand(len(example["pixels"]), 2),
+        "latitudes_longitudes": [[40.4168, -3.7038], [40.4169, -3.7038]],
+    }
+
+
+def surveyed(camera: dp.Camera) -> dict[str, Any]:
+    """Points in space that a camera sees."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(12, 3, dtype=D, generator=generator) * torch.tensor([200.0, 125, -80], dtype=D)
+    return {
+        "surveyed": points,
+        "clicked": camera.project(points)[0] + 0.3 * torch.randn(12, 2, dtype=D, generator=generator),
+        "names": [f"post {i}" for i in range(12)],
+        "origin": torch.tensor([100.0, 60, 0], dtype=D),
     }
 
 

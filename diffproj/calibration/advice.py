@@ -118,8 +118,7 @@ def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | 
         faults.append(f"focal length and principal point are known {known} of the focal length")
         remedies.append("more landmarks, near and far, in all parts of the image")
     if spare is not None and spare < FEW_SPARE:
-        many = f"only {spare:.0f} more" if spare >= 1 else "no more"
-        faults.append(f"there are {many} pixel coordinates than unknowns, to test each other")
+        faults.append(f"pixel coordinates outnumber unknowns by {spare:.0f} only, so they hardly test each other")
         remedies.append("more landmarks, near and far, in all parts of the image")
     if OTHER_LENS in remarks:
         faults.append("this lens model does not fit the lens")

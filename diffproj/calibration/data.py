@@ -109,7 +109,9 @@ class Data:
                 "there"
             )
         if bow and not level:
-            raise ValueError("bow: want False for points that are not all on z = 0; a bow is that of a flat board")
+            raise ValueError(
+                "shape: want 'flat' for points that are not all on z = 0, got 'bow', which flat boards have"
+            )
         if shape == "free" and not level:
             raise ValueError(
                 "shape: want 'flat' for points that are not all on z = 0, got 'free'; give Landmarks a sigma instead"

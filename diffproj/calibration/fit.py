@@ -84,7 +84,7 @@ class Fit:
         task, local = self.task, tuple(z.detach() for z in self.solution.local)
         image = replace(task, objective="image").problem.linearise(self.solution.shared.detach(), local)[:, :, -1]
         if task.loss is not None:
-            return _robust_sigma(image, task.used)
+            return _robust_sigma(image, task.used, task.shares)
         if self.knows_noise:
             return self._given_sigma()
         spare = self.degrees_of_freedom()
@@ -241,10 +241,16 @@ def _inliers(task: Task, solution: Solution, limit: float) -> Tensor:
         residual = residual * task.weights.sqrt().unsqueeze(2)
     # With exact corners the residuals are rounding errors, none of which may count as an outlier.
     least = 1e-6 if task.objective == "image" else 1e-9 * float(task.points.abs().amax())
-    sigma = _robust_sigma(residual, task.used).clamp(min=least)
+    sigma = _robust_sigma(residual, task.used, task.shares).clamp(min=least)
     return task.used & (residual.square().sum(2) <= (limit * sigma[:, None, None]).square())
 
 
-def _robust_sigma(residual: Tensor, used: Tensor) -> Tensor:
-    """Robust std `(P,)`: 1.4826 times the median absolute component of residuals `(P, V, 2, N)`."""
-    return 1.4826 * torch.where(used.unsqueeze(2), residual.abs(), torch.nan).flatten(1).nanmedian(-1).values
+def _robust_sigma(residual: Tensor, used: Tensor, shares: Tensor | None) -> Tensor:
+    """Robust std `(P,)`: 1.4826 times the median size of residuals' components `(P, V, 2, N)`, copies counted once."""
+    size = torch.where(used.unsqueeze(2), residual.abs(), torch.nan)
+    if shares is None:
+        return 1.4826 * size.flatten(1).nanmedian(-1).values
+    size, order = size.flatten(1).sort(-1)  # NaN comes last
+    weight = (used * shares.unsqueeze(-1)).unsqueeze(2).expand(residual.shape).flatten(1).gather(1, order).cumsum(-1)
+    middle = (weight >= (0.5 - 1e-12) * weight[:, -1:]).to(torch.uint8).argmax(-1, keepdim=True)
+    return 1.4826 * size.gather(1, middle).squeeze(-1)

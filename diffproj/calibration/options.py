@@ -12,7 +12,7 @@ from diffproj._core.warn import warn_caller
 from diffproj.calibration.constraints import Priors, of_points
 from diffproj.calibration.losses import Loss, check_loss
 from diffproj.calibration.result import Objective
-from diffproj.calibration.shape_name import Shape
+from diffproj.calibration.shape_names import Shape
 
 OUTLIER_LIMIT = 5.0
 """Robust standard deviations beyond which a corner is an outlier: of Gaussian residuals, 4 in a million."""

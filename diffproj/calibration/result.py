@@ -23,7 +23,7 @@ from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.positions import Positions, positions
 from diffproj.calibration.record import Recorded
 from diffproj.calibration.region import covered_region
-from diffproj.calibration.shape_name import Shape
+from diffproj.calibration.shape_names import Shape
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
 from diffproj.targets.residuals import projected_minus_seen

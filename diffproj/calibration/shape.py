@@ -11,8 +11,8 @@ similarity of points and poses leaves the images alone. So the displacements hol
 with G the seven directions of a similarity at the nominal points, `G^T d = 0` ("inner constraints"). They enter as
 a term `kappa |G^T d|^2` of the cost, which is 0 at the minimum whatever kappa is. Against seven coordinates that are
 held, as OpenCV's `calibrateCameraRO` does, the minimum is the same; the points' deviations are the smallest that any
-frame gives, half of those and alike for all points, and no three corners decide for the others. The unit of length is
-that of the nominal points: like the side of a chessboard's square, their size as a whole counts as exact.
+frame gives, and no three corners decide for the others. The unit of length is that of the nominal points: like the
+side of a chessboard's square, their size as a whole counts as exact.
 
 **Prior.** How well the target was printed, a standard deviation of each coordinate about its nominal place.
 

@@ -5,7 +5,7 @@ import functools
 from pathlib import Path
 from typing import get_args
 
-from diffproj.calibration.shape_name import Shape
+from diffproj.calibration.shape_names import Shape
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import add_orientation, camera_file, some_path
 from diffproj.cli.which_board import add_kinds, add_measures, check_board

@@ -108,8 +108,8 @@ def rectify(
         (torch.Size([3, 50, 100]), True)
     """
     image, camera, plane, (origin, along_s, along_t) = _checked("image", image, camera, plane, axes)
-    _check_size(image, camera)
     rows, columns = _shape(extent, resolution)
+    _check_size(image, camera)
     warn_if_rounded(camera, plane)
     low, unit = _corner_and_pixel(extent, (rows, columns), camera.K, north_up)
 

@@ -140,9 +140,9 @@ class AprilGrid:
     @property
     def artwork(self) -> Artwork:
         """What is printed."""
-        return self.artwork_with(BORDER)
+        return self._artwork_with(BORDER)
 
-    def artwork_with(self, border: int) -> Artwork:
+    def _artwork_with(self, border: int) -> Artwork:
         """What is printed, where the tags' black border has so many modules."""
         modules = dictionary_named(FAMILY).markerSize + 2 * border
         cells = modules + 1

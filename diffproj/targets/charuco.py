@@ -125,9 +125,9 @@ class CharucoBoard:
     @property
     def artwork(self) -> Artwork:
         """What is printed."""
-        return self.artwork_with(1)
+        return self._artwork_with(1)
 
-    def artwork_with(self, border: int) -> Artwork:
+    def _artwork_with(self, border: int) -> Artwork:
         """What is printed, where the markers' black border has so many modules."""
         modules = dictionary_named(self.dictionary).markerSize + 2 * border
         margin = (self.square - self.marker) / 2

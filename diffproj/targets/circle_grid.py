@@ -71,7 +71,7 @@ class CircleGrid:
         object.__setattr__(self, "asymmetric", asymmetric)
         if self.diameter >= 0.95 * self.apart:
             raise ValueError(
-                f"diameter: want circles that do not touch, less than {self.apart:g}, got {self.diameter:g}"
+                f"diameter: want circles apart, less than {self.apart:g} at this spacing, got {self.diameter:g}"
             )
 
     def __len__(self) -> int:

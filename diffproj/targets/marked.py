@@ -91,7 +91,7 @@ class _Search:
     def __init__(self, image: Shaped[np.ndarray, "h w"], board: MarkedBoard, border: int) -> None:
         self.image, self.board = image, board
         self.places = board.corners
-        self.patches = patches_of(board.artwork_with(border), self.places, 1.3 * board.reach)
+        self.patches = patches_of(board._artwork_with(border), self.places, 1.3 * board.reach)
 
     def corners(self, markers: list[Marker]) -> Float[np.ndarray, "n 2"] | None:
         """All corners that can be told, from markers that agree."""

@@ -44,7 +44,7 @@ def test_calibrate(square: float, part: float, options: dict[str, Any]) -> None:
         assert abs(away.covariance.deviations[name] / deviation - 1) < 4 * part
     torch.testing.assert_close(away.cameras.R, near.cameras.R, rtol=0, atol=part)
     torch.testing.assert_close(moved(away.cameras), near.cameras.t, rtol=0, atol=10 * part * square)
-    assert torch.equal(away.points, far(board).points)
+    assert torch.equal(away.nominal, far(board).points)
 
 
 @pytest.mark.parametrize(("square", "part"), SQUARES.items())

@@ -376,8 +376,8 @@ def test_other_mistakes_are_named() -> None:
         dp.calibrate(views.hiding(torch.arange(8) > 5), dp.Landmarks(points))
     with pytest.raises(ValueError, match="objective: want 'image' for points that are not all on z = 0"):
         dp.refine(views, dp.Landmarks(points), camera, objective="plane")
-    with pytest.raises(ValueError, match="bow: want False for points that are not all on z = 0"):
-        dp.refine(views, dp.Landmarks(points), camera, bow=True)
+    with pytest.raises(ValueError, match="want .* for points that are not all on z = 0"):
+        dp.refine(views, dp.Landmarks(points), camera, shape="bow")
     with pytest.raises(ValueError, match="pixel_sigma, weights: want one of the two"):
         dp.locate(views, dp.Landmarks(points), camera, pixel_sigma=1.0, weights=1.0)
     with pytest.raises(ValueError, match="plane_residuals|points on z = 0"):

@@ -75,7 +75,7 @@ def test_a_page(tmp_path, capsys):
         (
             ("--circles", "7x5", "--spacing", "20mm", "--diameter", "2m"),
             1,
-            "--diameter: want circles that do not touch",
+            "--diameter: want circles apart",
         ),
         (
             ("--circles", "7x5", "--spacing", "20", "--diameter", "2mm"),

@@ -210,7 +210,7 @@ def test_calibrations_that_are_not_there_are_named(
 
 @pytest.mark.plain
 def test_wrong_arguments_are_named(tmp_path: Path, camera: dp.Camera) -> None:
-    with pytest.raises(TypeError, match="camera: want dp.Camera or dp.Calibration, got Tensor"):
+    with pytest.raises(TypeError, match="camera: want dp.Camera, dp.Calibration or a rig, got Tensor"):
         dp.save_camera(tmp_path / "camera.json", camera.K)
     with pytest.raises(ValueError, match="format: want 'json' or 'numpy' or .* got 'yaml'"):
         dp.save_camera(tmp_path / "camera.json", camera, format="yaml")

@@ -32,7 +32,7 @@ def test_the_view_is_asked_for(calibration: dp.Calibration) -> None:
 
 
 def test_the_noise_is_asked_for(calibration: dp.Calibration) -> None:
-    with pytest.warns(dp.PixelNoiseWarning, match=r"to 0.13 px.*0.5 for points that a hand picked"):
+    with pytest.warns(dp.PixelNoiseWarning, match=r"to 0.12 px.*0.5 for points that a hand picked"):
         silent = dp.measure(CLICKS, calibration, Z, view=0)
     said = dp.measure(CLICKS, calibration, Z, view=0, pixel_sigma="detector")
     assert torch.equal(silent.deviations, said.deviations)

@@ -62,7 +62,7 @@ def test_hidden_circles_are_told():
 
 
 def test_words_and_numbers_that_cannot_be():
-    with pytest.raises(ValueError, match="diameter: want circles that do not touch, less than 20, got 20"):
+    with pytest.raises(ValueError, match="diameter: want circles apart, less than 20 at this spacing, got 20"):
         dp.CircleGrid(7, 5, 20.0, 20.0)
     with pytest.raises(ValueError, match="asymmetric: want False, True, 'rows' or 'columns', got 'both'"):
         dp.CircleGrid(7, 5, 20.0, 10.0, "both")

@@ -1,4 +1,4 @@
-"""`Shape`: what a target's points are taken for. Loads nothing, for the command line."""
+"""The names of a target's shapes: apart, so that the command line can list them without PyTorch."""
 
 from typing import Literal
 
