@@ -100,3 +100,26 @@ def test_training_finds_the_camera(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     assert found["rotation"] < 0.2  # degrees
     assert found["focal"] < 0.5  # per cent
     assert found["improvement"] > 5
+
+
+def test_from_landmarks_to_the_ground(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    found = outcome(
+        "04_from_landmarks_to_the_ground",
+        monkeypatch,
+        tmp_path,
+        beach="beach_difference",
+        inside="inside",
+        river="river_focal",
+        tilt="colony_tilt",
+        height="float(everything.mounting.height)",
+        told="list(adjusted)",
+        missing="missing",
+    )
+    assert found["beach"] < 0.005  # metres, from the demonstration's own
+    assert found["inside"] >= 4
+    assert found["river"] == pytest.approx(1556.5, abs=0.1)
+    assert found["tilt"] == pytest.approx(90 - 83.48, abs=0.02)
+    assert found["height"] == pytest.approx(20.47, abs=0.02)
+    assert "horizon" not in found["told"]
+    assert len(found["told"]) == 5
+    assert found["missing"].startswith("height: no evidence")

@@ -27,6 +27,8 @@ SHOWN = 5
 """Numbers of cameras in a message."""
 NOTHING = 1e-12
 """Deviation, relative to the value, that is rounding: of what was held."""
+ROUNDED = 1e-7
+"""The same relative to the largest deviation of the pose, whose covariance it was computed from."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -60,23 +62,7 @@ class Adjustment(Calibration):
 
         Where the camera looks straight down, roll and heading are not told apart: the heading has what both have.
         """
-        camera = self.cameras[..., 0]
-        middle, pose = self.covariance.middle, self.covariance.about_middle.between(0, 0)
-        lost = pose.diagonal(dim1=-2, dim2=-1).isinf()
-        pose = torch.where(lost.unsqueeze(-1) | lost.unsqueeze(-2), 0.0, pose)
-        batch = pose.shape[:-2]
-        R, t = camera.R.detach().reshape(-1, 3, 3), camera.t.detach().reshape(-1, 3)
-        m = torch.zeros_like(t) if middle is None else middle.expand_as(t)
-        t = t + (R @ m.unsqueeze(-1)).squeeze(-1)
-
-        def mounted(step: Tensor) -> Tensor:
-            again = turned(R, step[..., :3])
-            center = m - (again.mT @ (t + step[..., 3:]).unsqueeze(-1)).squeeze(-1)
-            return torch.cat([torch.stack(mounting_from_rotation(again), dim=-1), center], dim=-1)
-
-        J = jacobian(mounted, t.new_zeros(len(t), POSE))[1].permute(1, 2, 0)
-        C = (J @ pose.reshape(-1, POSE, POSE) @ J.mT).reshape(*batch, POSE, POSE)
-        return C + torch.diag_embed(torch.where(lost, torch.inf, 0.0).to(C))
+        return mounting_covariance(self)
 
     @property
     def mounting_deviations(self) -> Mounting:
@@ -160,15 +146,16 @@ class Adjustment(Calibration):
             raise ValueError(f"summary: want one camera, got batch shape {tuple(self.views.batch_shape)}; see message")
         values = {**dict(zip(self.parameters.names, self.shared.tolist(), strict=True)), **self._mounting_values()}
         spreads = self._spreads()
+        rounding = ROUNDED * max((spreads[name] for name in MOUNTING if spreads[name] < torch.inf), default=0.0)
         unit = f" {self.unit}" if self.unit else ""
         lines = []
         for name, value in values.items():
             spread = spreads.get(name, 0.0)
-            spread = spread if spread > NOTHING * max(1.0, abs(value)) else 0.0
+            spread = spread if spread > NOTHING * max(1.0, abs(value)) + (name in MOUNTING) * rounding else 0.0
             if name in MOUNTING or spread:
                 kind = " degrees" if name in MOUNTING[:3] else unit if name in MOUNTING else ""
                 known = " (not known)" if spread == torch.inf else f" ± {spread:.4f}" if spread else " (fixed)"
-                lines.append(f"{name:<16}{value:12.4f}{known}{kind}")
+                lines.append(f"{name:<16}{value:z12.4f}{known}{kind}")
         for one, part in zip(self.observations, self.parts, strict=True):
             rms = float(part.detach().square().mean().sqrt())
             lines.append(f"{type(one).__name__:<16}{part.shape[-2]:5d} seen, residuals {rms:.2f} deviations")
@@ -245,6 +232,27 @@ class Adjustment(Calibration):
 
     def _note(self) -> str:
         return self.verdict
+
+
+def mounting_covariance(calibration: Calibration, view: int = 0) -> Float[Tensor, "*batch 6 6"]:
+    """The covariance of tilt, roll, heading in degrees, x, y and height in a view: see `Adjustment`."""
+    camera = calibration.cameras[..., view]
+    middle, pose = calibration.covariance.middle, calibration.covariance.about_middle.between(view, view)
+    lost = pose.diagonal(dim1=-2, dim2=-1).isinf()
+    pose = torch.where(lost.unsqueeze(-1) | lost.unsqueeze(-2), 0.0, pose)
+    batch = pose.shape[:-2]
+    R, t = camera.R.detach().reshape(-1, 3, 3), camera.t.detach().reshape(-1, 3)
+    m = torch.zeros_like(t) if middle is None else middle.expand_as(t)
+    t = t + (R @ m.unsqueeze(-1)).squeeze(-1)
+
+    def mounted(step: Tensor) -> Tensor:
+        again = turned(R, step[..., :3])
+        center = m - (again.mT @ (t + step[..., 3:]).unsqueeze(-1)).squeeze(-1)
+        return torch.cat([torch.stack(mounting_from_rotation(again), dim=-1), center], dim=-1)
+
+    J = jacobian(mounted, t.new_zeros(len(t), POSE))[1].permute(1, 2, 0)
+    C = (J @ pose.reshape(-1, POSE, POSE) @ J.mT).reshape(*batch, POSE, POSE)
+    return C + torch.diag_embed(torch.where(lost, torch.inf, 0.0).to(C))
 
 
 def pose_covariance(names: tuple[str, ...], joint: Tensor, arm: Tensor, middle: Tensor, unknown: Tensor) -> Covariance:

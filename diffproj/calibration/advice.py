@@ -114,11 +114,11 @@ def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | 
     """
     faults, remedies = [], []
     if unsure is not None and unsure > UNSURE_OF_LANDMARKS:
-        known = f"only to {100 * unsure:.1g} %" if math.isfinite(unsure) else "not at all"
+        known = f"only to {_percent(unsure)} %" if math.isfinite(unsure) else "not at all"
         faults.append(f"focal length and principal point are known {known} of the focal length")
         remedies.append("more landmarks, near and far, in all parts of the image")
     if spare is not None and spare < FEW_SPARE:
-        faults.append(f"{spare:.0f} more pixel coordinates than unknowns test each other")
+        faults.append(f"pixel coordinates outnumber unknowns by {spare:.0f} only, so they hardly test each other")
         remedies.append("more landmarks, near and far, in all parts of the image")
     if OTHER_LENS in remarks:
         faults.append("this lens model does not fit the lens")
@@ -126,6 +126,11 @@ def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | 
         known = f"; focal length and principal point are known to {100 * unsure:.1g} %" if unsure else ""
         return f"Good: {count} landmarks are met to {sigma:.2g} px in each coordinate{known}."
     return f"Weak: {'; '.join(faults)}." + f" Next: {'; '.join(dict.fromkeys(remedies))}." * bool(remedies)
+
+
+def _percent(part: float) -> str:
+    """A part in per cent, to its first digit, or to the per cent from ten on."""
+    return f"{100 * part:.0f}" if part >= 0.095 else f"{100 * part:.1g}"
 
 
 def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:

@@ -182,7 +182,10 @@ def _check_points(points: Tensor) -> None:
         raise ValueError("target: want finite points, got others")
     if len(points) < 4:
         why = ", for three leave up to four poses open" if len(points) == 3 else ""
-        raise ValueError(f"target: want at least 4 points{why}, got {len(points)}")
+        raise ValueError(
+            f"target: want at least 4 points{why}, got {len(points)}; dp.adjust takes fewer, as dp.Seen, along with "
+            "other evidence"
+        )
     points = points - points.mean(0)  # far from the origin squares of coordinates cancel
     apart = torch.cdist(points, points) + torch.eye(len(points), dtype=points.dtype, device=points.device).mul(1e300)
     extent = points.abs().amax()

@@ -132,7 +132,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
         elif bool(misfits[p].any()):
             what, remedy = ("board", "are its columns and rows right, and are its corners in order?")
             if isinstance(board, Landmarks):
-                what, remedy = ("landmarks", f"{LANDMARKS_REMEDY}{' and is the camera right?' * held}")
+                what, remedy = ("landmarks", f"{LANDMARKS_REMEDY}{'; is the camera right?' * held}")
             causes[p] = f"the corners of {_joined_names(names, misfits[p])} do not match the {what}: {remedy}"
         elif bool(mirrored[p].any()):
             causes[p] = (

@@ -19,6 +19,7 @@ COMMANDS = {
     "board": "write a page with a board to print at true scale",
     "calibrate": "find a camera from photographs of a board, and write a camera file",
     "measure": "measure points, lengths and an area on a plane in a photograph, with error bars",
+    "locate": "find where a camera stood from surveyed landmarks that a photograph shows",
     "convert": "turn a camera file of one program into that of another",
     "info": "tell what is in a camera file, and whether it can be right",
     "experiment": "calibrate, put corners back on the board, and print the errors (the paper's Table 1 and Fig. 7)",

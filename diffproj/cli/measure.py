@@ -14,8 +14,9 @@ lengths between successive points, and from three points on the area that they
 enclose in their order, each with its standard deviation and 95 % interval.
 
 Where the camera stood is taken from a board in the photograph (--board and
---square, or another board), or from a view that the camera was calibrated with
-(--view).
+--square, or another board), or from a view that the camera file knows (--view):
+one that it was calibrated with, or the one that 'diffproj locate' found from
+landmarks.
 """
 
 EPILOG = """\
@@ -29,7 +30,8 @@ pixels:
 the plane:
   It is the board's face, unless --height or --plane say another. Heights count
   from the face towards the camera: --height 12 is the top of a box 12 high that
-  lies on the board, and --height -3 the table below a board 3 thick.
+  lies on the board, and --height -3 the table below a board 3 thick. For a file
+  from 'diffproj locate' it is z = 0 in the landmarks' world, --height 7 z = 7.
 
 the board's frame, for --plane and for the points:
   The origin is the first inner corner, x runs to the right along the board's
@@ -45,6 +47,7 @@ examples:
       --points 210.5,133 402,140.5 395,300 --draw measured.png
   diffproj measure --camera camera.json --view left01.jpg \\
       --points 210,133 402,140
+  diffproj measure --camera located.json --view mast.jpg --points 2000,1000
   diffproj measure photo.jpg --camera camera.yaml --board 9x6 --square 25mm \\
       --points-file points.csv --height 12 --pixel-sigma 0.7 --csv > box.csv
 

@@ -64,9 +64,12 @@ def document(
         remarks.append("The area is below three deviations: it cannot be told from 0.")
     if scene.calibration.has_alternatives and bool(scene.calibration.ambiguous[scene.view]):
         ratio = float(scene.calibration.likelihood_ratio[scene.view])
+        what, remedy = "board's corners", "A photograph with the board larger or more tilted tells"
+        if scene.has_landmarks:
+            what, remedy = "landmarks", "More of them, or some that are not on their plane, tell"
         remarks.append(
-            f"The board's corners fit two poses, and the one taken is only {ratio:.2g} times likelier than the other; "
-            "the deviations hold the doubt. A photograph with the board larger or more tilted tells them apart."
+            f"The {what} fit two poses, and the one taken is only {ratio:.2g} times likelier than the other; the "
+            f"deviations hold the doubt. {remedy} them apart."
         )
     height = height_above_face(scene, plane)
     return {
@@ -75,10 +78,10 @@ def document(
         "view": scene.calibration.views.names[scene.view],
         "view_rms": _known(float(scene.calibration.view_rms[scene.view])),
         "unit": scene.square.unit,
-        "square": scene.square.value,
+        "square": None if scene.has_landmarks else scene.square.value,
         "plane": [*normal, float(plane.offset)],
         "height": height,
-        "plane_in_words": described(plane, height, scene.square.unit),
+        "plane_in_words": described(plane, None if scene.has_landmarks else height, scene.square.unit),
         "pixel_sigma": noise.sigma,
         "pixel_sigma_from": noise.source,
         "deviations_include": list(scene.includes),

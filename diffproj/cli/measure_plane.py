@@ -1,4 +1,7 @@
-"""The plane that is measured on: by its equation, or by its height above the board's face, and the same in words."""
+"""The plane that is measured on: by its equation, or by its height above the board's face, and the same in words.
+
+Where the camera was found from landmarks, heights count from z = 0 towards z.
+"""
 
 import torch
 
@@ -66,6 +69,8 @@ def equation(plane: list[float]) -> str:
 def _face(scene: Scene) -> tuple[float, float] | None:
     """The z of the board's face, and 1 or -1 for the side of it that the camera is on: it sees no board from behind."""
     calibration: Calibration = scene.calibration
+    if scene.has_landmarks:
+        return 0.0, 1.0
     heights = calibration.points[:, 2]
     size = float((calibration.points.amax(0) - calibration.points.amin(0)).max())
     if float(heights.max() - heights.min()) > FLAT * size:

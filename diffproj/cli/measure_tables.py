@@ -16,7 +16,7 @@ such a coordinate is."""
 NOISE = {
     "hand": "{} px for each pixel, as for points picked by hand (--pixel-sigma)",
     "option": "{} px for each pixel",
-    "detector": "{} px for each pixel, as for the board's corners",
+    "detector": "{} px for each pixel, as for those that the pose was found from",
 }
 """The noise of the pixels that were measured, by where it comes from."""
 

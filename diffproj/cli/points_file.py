@@ -1,11 +1,9 @@
 """Files with points to measure: a line `name,u,v` for each, as spreadsheets write them."""
 
-import csv
-import io
 from pathlib import Path
 from typing import NamedTuple
 
-from diffproj.cli.inputs import LARGEST_NUMBER
+from diffproj.cli.spreadsheet import Spreadsheet
 
 
 class Pixel(NamedTuple):
@@ -27,54 +25,32 @@ def read_points(path: Path) -> list[Pixel]:
         ValueError: a line is none of these, a name stands twice, or there is no point; the line is named.
         OSError: the file cannot be read.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise ValueError(f"--points-file: want a text file in UTF-8, got something else in {path}") from None
-    separator = next((mark for mark in ";\t" if mark in text), ",")
+    table = Spreadsheet("--points-file", path, "lines of name,u,v")
     points: list[Pixel] = []
-    reader = csv.reader(io.StringIO(text), delimiter=separator, skipinitialspace=True)
     first = True
-    try:
-        for row in reader:
-            cells = [cell.strip() for cell in row]
-            if not any(cells) or cells[0].startswith("#"):
-                continue
-            point = _point(cells, separator, len(points) + 1)
-            if point is None and not (first and _titles(cells)):
-                raise ValueError(
-                    f"--points-file: want lines of name,u,v, got {separator.join(cells)!r} in line {reader.line_num} "
-                    f"of {path}"
-                )
-            first = False
-            if point is None:
-                continue
-            if any(point.name == other.name for other in points):
-                raise ValueError(
-                    f"--points-file: want each name once, got {point.name!r} again in line {reader.line_num} of {path}"
-                )
-            points.append(point)
-    except csv.Error as error:
-        raise ValueError(f"--points-file: want lines of name,u,v, got something else in {path} ({error})") from None
+    for line, cells in table.lines():
+        point = _point(cells, table, len(points) + 1)
+        if point is None and not (first and _titles(cells)):
+            raise ValueError(
+                f"--points-file: want lines of name,u,v, got {table.joined(cells)!r} in line {line} of {path}"
+            )
+        first = False
+        if point is None:
+            continue
+        if any(point.name == other.name for other in points):
+            raise ValueError(f"--points-file: want each name once, got {point.name!r} again in line {line} of {path}")
+        points.append(point)
     if not points:
         raise ValueError(f"--points-file: want lines of name,u,v, found none in {path}")
     return points
 
 
-def _point(cells: list[str], separator: str, number: int) -> Pixel | None:
+def _point(cells: list[str], table: Spreadsheet, number: int) -> Pixel | None:
     """The point of a line; `None` where it is none."""
     if len(cells) not in (2, 3):
         return None
-    name, (u, v) = cells[0] if len(cells) == 3 else "", (_number(cell, separator) for cell in cells[-2:])
+    name, (u, v) = cells[0] if len(cells) == 3 else "", (table.number(cell) for cell in cells[-2:])
     return None if u is None or v is None or not name.isprintable() else Pixel(name or str(number), u, v)
-
-
-def _number(text: str, separator: str) -> float | None:
-    try:
-        value = float(text if separator == "," else text.replace(",", "."))
-    except ValueError:
-        return None
-    return value if abs(value) <= LARGEST_NUMBER else None
 
 
 def _titles(cells: list[str]) -> bool:

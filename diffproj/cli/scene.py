@@ -29,7 +29,7 @@ class Scene:
         view: the number of the view.
         includes: whose uncertainty the standard deviations include: pixels, pose, camera.
         title: where the pose comes from, and how well it fits.
-        square: the side of the board's squares; its unit is the world's.
+        square: the side of the board's squares; its unit is the world's. Without a board the unit alone counts.
         unit_in_words: the world's unit for headings, also where it is not known.
     """
 
@@ -47,6 +47,11 @@ class Scene:
         """The camera at its pose."""
         return self.calibration.cameras[self.view]
 
+    @property
+    def has_landmarks(self) -> bool:
+        """Whether the pose was found from landmarks and not from a board."""
+        return self.calibration.landmarks is not None
+
 
 def stored_view(options: argparse.Namespace) -> Scene:
     """The pose of a view that the camera was calibrated with.
@@ -55,7 +60,7 @@ def stored_view(options: argparse.Namespace) -> Scene:
         ValueError: the file holds no such view, or more than one, or no pose of it.
     """
     path, name = options.camera, options.view
-    _, calibration = _loaded(path)
+    _, calibration = loaded(path)
     if calibration is None:
         raise ValueError(
             f"--view: want a .json with a whole calibration, got a camera without views in {path}; give a photograph "
@@ -88,7 +93,7 @@ def new_photograph(options: argparse.Namespace) -> Scene:
     Raises:
         ValueError: no single photograph, no board in it, another size than the camera's, or no pose that fits.
     """
-    camera, calibration = _loaded(options.camera)
+    camera, calibration = loaded(options.camera)
     board, side, option = given_board(options)
     square = Length(_first_step(board.points), side.unit)
     if calibration is not None:
@@ -102,12 +107,7 @@ def new_photograph(options: argparse.Namespace) -> Scene:
         raise ValueError(f"PHOTO: want one photograph, got {len(sources)} of the form {options.photograph}")
     with progress_bars() as bars:
         views = find_corners(sources, board, bars, orientation=options.orientation)
-    if camera.size is not None and camera.size != views.size:
-        (w, h), (width, height) = views.size or (0, 0), camera.size
-        raise ValueError(
-            f"PHOTO: want {width} x {height} px as in {options.camera}, got {w} x {h} px in {options.photograph}; take "
-            "it with the camera as it was calibrated, and do not resize or crop it"
-        )
+    check_size(camera, views.size, options.camera, options.photograph)
     try:
         found = locate(views, board, camera if calibration is None else calibration)
     except CalibrationError as error:
@@ -123,8 +123,13 @@ def new_photograph(options: argparse.Namespace) -> Scene:
     return Scene(options.camera, Path(str(sources[0])), found, 0, includes, title, square, unit)
 
 
-def _loaded(path: Path) -> tuple[Camera, Calibration | None]:
-    """The one camera in a file, and the calibration where the file holds one."""
+def loaded(path: Path) -> tuple[Camera, Calibration | None]:
+    """The one camera in a file, and the calibration where the file holds one.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it holds no camera, or several.
+    """
     found = load(path)
     if isinstance(found, RigCalibration):
         raise ValueError(  # noqa: TRY004
@@ -137,8 +142,25 @@ def _loaded(path: Path) -> tuple[Camera, Calibration | None]:
     return camera, calibration
 
 
+def check_size(camera: Camera, size: tuple[int, int] | None, path: Path, photograph: Path) -> None:
+    """Check that a photograph has the size of the camera's images.
+
+    Raises:
+        ValueError: it has not.
+    """
+    if camera.size is not None and camera.size != size:
+        (w, h), (width, height) = size or (0, 0), camera.size
+        raise ValueError(
+            f"PHOTO: want {width} x {height} px as in {path}, got {w} x {h} px in {photograph}; take it with the "
+            "camera as it was calibrated, and do not resize or crop it"
+        )
+
+
 def _calibrated_square(calibration: Calibration) -> Length:
-    """The side of the squares of the board that a camera was calibrated with: from its first corner to its second."""
+    """The side of the squares of the board that a camera was calibrated with: from its first corner to its second.
+
+    Landmarks have no such side: only the unit counts.
+    """
     return Length(_first_step(calibration.points), calibration.unit)
 
 

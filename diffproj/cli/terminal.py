@@ -42,12 +42,13 @@ def counted(count: int, thing: str) -> str:
 
 def in_options(text: str) -> str:
     """What the library says, with the command's options in place of Python's, and without what it has not."""
-    text = re.sub(r"^(calibrate|locate|measure): ", "", text)
+    text = re.sub(r"^(calibrate|refine|locate|measure): ", "", text)
     text = re.sub(r", or (let fixed or priors hold|fix) the principal point and the lens( \([^)]*\))?", "", text)
     return (
         text.replace("distortion=", "--distortion ")
         .replace("shape=", "--shape ")
         .replace("skew=True", "--skew")
+        .replace("reject_outliers=True", "--reject-outliers")
         .replace("'auto'", "auto")
         .replace("give legacy=True", "give --legacy")
         .replace("give legacy=False", "leave --legacy out")

@@ -26,7 +26,8 @@ class Landmarks(Copied, Shown):
     They may lie on the ground z = 0, on any other plane, or anywhere in space, and as far from the origin as UTM, State
     Plane or earth-centred coordinates are; distances and a right-handed frame are what they must have. Four of them
     that do not lie on a line tell where a known camera stands; six and more that do not lie on a plane tell a focal
-    length too. In `Views` each has a pixel, in the landmarks' order, or is not visible.
+    length too; fewer, and be it one, are evidence beside other for `adjust`, as `Seen`. In `Views` each has a pixel, in
+    the landmarks' order, or is not visible.
 
     Attributes:
         points: in the world `(N, 3)`, in the caller's unit, such as metres.
@@ -65,8 +66,8 @@ class Landmarks(Copied, Shown):
 
         Raises:
             TypeError: points are no numbers, or names no strings.
-            ValueError: shapes do not fit, fewer than 4 points or some alike or not finite, float32 where it does not
-                hold them, latitude and longitude, or a sigma that is negative or no covariance.
+            ValueError: shapes do not fit, no point or some not finite, float32 where it does not hold them, latitude
+                and longitude, or a sigma that is negative or no covariance.
         """
         given = tensor_of("points", points)
         if given.ndim != 2 or given.shape[-1] not in (2, 3):
@@ -99,10 +100,8 @@ class Landmarks(Copied, Shown):
 def _check_values(points: Tensor) -> None:
     if points.is_meta:
         raise ValueError("points: want values, got a tensor on the device meta")
-    count = len(points)
-    if count < 4:
-        why = ", for three leave up to four poses open" if count == 3 else ""
-        raise ValueError(f"points: want at least 4{why}, got {count}")
+    if len(points) == 0:
+        raise ValueError("points: want at least 1, got none")
     lost = ~points.isfinite().all(-1)
     if bool(lost.any()):
         raise ValueError(f"points: want finite coordinates, got others in row {int(lost.nonzero()[0])}")
@@ -118,7 +117,8 @@ def _check_values(points: Tensor) -> None:
     middle = along.mean(0).abs()
     angles = bool((middle <= middle.new_tensor([180.0, 180.0])).all()) and bool((middle <= 90).any())
     small = (spread[:2] < DEGREES_SPREAD).all() & (spread[:2] < DEGREES_PART * middle.amax()).all()
-    if angles and bool(small) and extent > 0 and float(middle.amax()) > 1 and float(middle.amin()) > 0:
+    upright = len(points) < 4 and bool(spread[2] > spread[:2].amax())  # the foot and the top of a mast
+    if angles and bool(small) and not upright and extent > 0 and float(middle.amax()) > 1 and float(middle.amin()) > 0:
         raise ValueError(
             f"points: want metres or another unit of length, got what looks like latitude and longitude in degrees "
             f"({along[0, 0]:.5f}, {along[0, 1]:.5f}): convert them, to UTM with pyproj; if they are lengths, subtract "

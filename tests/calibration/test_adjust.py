@@ -57,6 +57,11 @@ def test_colony_of_penguins() -> None:
         assert float(getattr(value, name)) == pytest.approx(truth, abs=0.02), name
         assert float(getattr(spread, name)) == pytest.approx(deviation, rel=0.05), name
     assert "Heights (2.0 times)" in found.doubts  # penguins are less alike than 3 cm
+    lines = found.summary().splitlines()
+    assert [line.split() for line in lines if line[0] in "xy"] == [
+        ["x", "0.0000", "(fixed)"],
+        ["y", "0.0000", "(fixed)"],
+    ]
 
 
 VANISHING = [[1136.941176, 209.411765], [-1842.891566, 174.939760]]
@@ -163,6 +168,54 @@ def test_intervals_hold_the_truth(which: str) -> None:
     assert 0.93 <= sum(parts) / len(parts) <= 0.97
     assert all(0.92 <= part <= 0.98 for part in parts), parts
     assert float(found.consistency.mean()) == pytest.approx(1, abs=0.1)
+
+
+def test_landmarks_are_seen_with_their_own_sigma() -> None:
+    """The same as their points with that sigma, which one that is given replaces; names and the order do not matter."""
+    spread = torch.linspace(0.02, 0.3, 18, dtype=D).reshape(6, 3)
+    pixels = seen() + torch.linspace(-1.5, 1.5, 12, dtype=D).reshape(6, 2)
+    named = dp.Landmarks(LANDMARKS, names=["mast", "gate", "kerb", "post", "drain", "roof"], sigma=spread)
+    one, other = (
+        dp.adjust(START, dp.Seen(points, pixels, pixel_sigma=1.2, **given))  # type: ignore[arg-type]
+        for points, given in ((named, {}), (LANDMARKS, {"sigma": spread}))
+    )
+    assert torch.allclose(one.cameras.t, other.cameras.t, atol=1e-12)
+    assert torch.allclose(one.mounting_covariance, other.mounting_covariance, rtol=1e-9, atol=0)
+    exact = dp.adjust(START, dp.Seen(named, pixels, pixel_sigma=1.2, sigma=0.0))
+    assert bool((exact.mounting_deviations.height < one.mounting_deviations.height).all())
+    # A covariance that is not along the axes: the world turned by 40 degrees about z, the landmarks and it along.
+    turn = (
+        dp.Camera.mounted(1.0, 90.0, heading_deg=40.0, focal=1.0, size=(2, 2)).R * torch.tensor([1.0, -1, -1])[:, None]
+    )
+    around = dp.Landmarks(LANDMARKS @ turn.mT, sigma=turn @ torch.diag_embed(spread.square()) @ turn.mT)
+    turned = dp.adjust(START, dp.Seen(around, pixels, pixel_sigma=1.2))
+    assert float(turned.mounting.height) == pytest.approx(float(one.mounting.height), abs=1e-7)
+    assert float(turned.mounting_deviations.height) == pytest.approx(float(one.mounting_deviations.height), rel=1e-6)
+    # The last residuals are the landmarks' and agree with `locate`, which carries their sigma too.
+    views = dp.Views(pixels.unsqueeze(0), size=TRUE.size)
+    located = dp.locate(views, named, START, pixel_sigma=1.2)
+    assert torch.allclose(located.cameras.center[0], one.cameras.center[0], atol=0.05)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_or_two_landmarks_are_evidence(count: int) -> None:
+    """With the horizon and the height: two tell the rest, one the heading, where the camera's place is known."""
+    known = dp.Landmarks(LANDMARKS[:count], names=["mast", "gate"][:count], sigma=0.05)
+    pieces = [dp.Seen(known, seen(points=LANDMARKS[:count]), pixel_sigma=0.5), dp.Horizon(_horizon(), 1.0)]
+    place = {"position": 0.02} if count == 1 else {}
+    start = made(tilt_deg=25.0, roll_deg=0.0, heading_deg=20.0, height=6.1)
+    found = dp.adjust(start, pieces, priors={"height": 0.5, **place})
+    assert float(found.mounting.heading) == pytest.approx(30.0, abs=0.05)
+    assert float(found.mounting.height) == pytest.approx(6.0, abs=0.05)
+    assert bool(found.mounting_covariance.isfinite().all())
+
+
+def _horizon() -> torch.Tensor:
+    """Two pixels on the horizon of `TRUE`, at its left and at its right."""
+    ahead = torch.tensor([20.0, 40.0], dtype=D).deg2rad()
+    far = 1e7 * torch.stack([ahead.sin(), ahead.cos(), torch.zeros(2, dtype=D)], dim=-1)
+    pixels, _ = TRUE.project(far + torch.tensor([0.0, 0, 6], dtype=D))
+    return pixels
 
 
 def test_priors_weigh_as_measurements() -> None:

@@ -95,6 +95,7 @@ def test_missing_matplotlib_is_found_before_the_work(
             "--square: want the side",
         ),
         (["calibrate", "photo.png", "--board", "9x6", "--square", "25km"], 2, "--square: want one of the units"),
+        (["locate", "--help"], 0, "Four landmarks that do not lie on a line are enough"),
     ],
 )
 def test_help_and_mistakes_wait_for_nothing(arguments: list[str], code: int, text: str) -> None:

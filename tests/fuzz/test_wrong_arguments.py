@@ -641,6 +641,7 @@ NOT_CALLED = {
     "Cauchy.value",
     "Huber.weight",
     "figures.content",  # for the command line, which looked at what is drawn
+    "figures.landmarks",
     "figures.measured",
     "Lens.distort",
     "Lens.undistort",

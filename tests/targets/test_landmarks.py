@@ -53,8 +53,7 @@ def test_the_line_is_short() -> None:
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        (SQUARE[:3], "want at least 4, for three leave up to four poses open, got 3"),
-        (SQUARE[:2], "want at least 4, got 2"),
+        (np.zeros((0, 3)), "want at least 1, got none"),
         (np.zeros((4, 4)), r"want shape \(N, 3\), or \(N, 2\) for points on z = 0, got \(4, 4\)"),
         ([[0, 0, np.nan]] + [[1.0, 2.0, 3.0]] * 3, "want finite coordinates, got others in row 0"),
         (
@@ -84,6 +83,20 @@ def test_points_that_cannot_be(points: object, message: str) -> None:
 def test_lengths_are_not_taken_for_degrees(points: np.ndarray) -> None:
     """Nor refused for being far away."""
     assert dp.Landmarks(points).points.shape == (4, 3)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_fewer_than_four_are_landmarks_too(count: int) -> None:
+    """For `adjust`; what needs more says so."""
+    mast = dp.Landmarks([[12.5, 40.2, 0.0], [12.51, 40.2, 3.0], [12.5, 40.21, 6.0]][:count], sigma=0.1)
+    assert len(mast) == count
+    views = dp.Views(torch.arange(2.0 * count, dtype=torch.float64).reshape(1, count, 2))
+    camera = dp.Camera.mounted(5.0, 10.0, focal=800.0, size=(1280, 720))
+    for task in (dp.locate, dp.refine):
+        with pytest.raises(ValueError, match=f"target: want at least 4 points.*, got {count}; dp.adjust takes fewer"):
+            task(views, mast, camera)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=f"target: want at least 4 points.*, got {count}; dp.adjust takes fewer"):
+        dp.calibrate(views, mast)
 
 
 @pytest.mark.parametrize(

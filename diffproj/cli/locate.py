@@ -1,0 +1,142 @@
+"""The command line of `diffproj locate`; `locating.py` does the work."""
+
+import argparse
+from pathlib import Path
+
+from diffproj.cli.drawing import drawing
+from diffproj.cli.inputs import add_orientation, numbers, some_path
+from diffproj.cli.units import METRES
+
+DESCRIPTION = """\
+Finds where a camera stood from surveyed points that a photograph shows: on the
+ground, on a facade, anywhere in space. Prints its position, tilt, roll and
+heading with their standard deviations, and how far off each landmark is.
+Four landmarks that do not lie on a line are enough where the camera is known.
+"""
+
+EPILOG = """\
+the landmarks:
+  A CSV file whose first line has the titles of the columns, in any order:
+
+    name,u,v,x,y,z
+    mast,2521.9,483.7,902062.638,274683.639,7.432
+
+  u, v     the pixel that shows it, u to the right and v down; 0,0 is the middle
+           of the first pixel. Both empty: not in this photograph
+  x, y, z  where it is, in any unit and as far from the origin as UTM is; x
+           east or right, y north or ahead, z up. Without z all lie on z = 0
+  name, sigma or sigma_x,sigma_y,sigma_z, pixel_sigma
+           may be there: its name, how well it is known (standard deviations in
+           the unit of x), and how well the pixel is. Other columns are passed
+           over; semicolons or tabs may separate, with decimal commas
+
+the focal length:
+  --free focal lets it be another than in the camera file, and --free focal,k1
+  the first coefficient of the lens too. Both need six landmarks or more that do
+  not lie on a plane; what they do not tell is said.
+
+examples:
+  diffproj locate beach.jpg --camera drone.yaml --landmarks survey.csv \\
+      -o located.json --draw located.png
+  diffproj locate river.jpg --camera camera.yaml --landmarks gcp.csv \\
+      --free focal,k1 --pixel-sigma 2
+  diffproj measure --camera located.json --view beach.jpg --points 2000,1000
+
+The file that -o writes is the camera at its place, with its error bars, for
+'diffproj measure' and dp.load_calibration; the last example measures on z = 0.
+
+exit codes: 0 done; 1 it failed, one line says why, nothing is written; 2 the
+command was not understood
+"""
+
+
+def add_options(command: argparse.ArgumentParser) -> None:
+    """Give the command its description and its options."""
+    command.description, command.epilog = DESCRIPTION, EPILOG
+    command.formatter_class = argparse.RawDescriptionHelpFormatter
+    command.usage = "%(prog)s [PHOTO] --camera FILE --landmarks FILE [options]"
+    photograph = command.add_argument(
+        "photograph",
+        type=some_path,
+        metavar="PHOTO",
+        help="the photograph: its size is compared with the camera's, and --draw draws into it; not needed otherwise",
+    )
+    # Not nargs="?": argparse would fill that with nothing as soon as an option comes before the photograph.
+    photograph.required = False
+    command.add_argument(
+        "--camera",
+        type=some_path,
+        required=True,
+        metavar="FILE",
+        help="the camera file, in any format that 'diffproj info' reads. A .json from 'diffproj calibrate' brings the "
+        "camera's own uncertainty along; other programs' files do not (required)",
+    )
+    command.add_argument(
+        "--landmarks",
+        type=some_path,
+        required=True,
+        metavar="FILE",
+        help="a CSV file with columns name, u, v, x, y, z (required)",
+    )
+    more = command.add_argument_group("how")
+    more.add_argument(
+        "--free",
+        type=_names,
+        default=(),
+        metavar="NAMES",
+        help="what else is to be found, with commas between: focal, f_x, f_y, principal_point, or coefficients of the "
+        "lens such as k1 (default: the pose alone)",
+    )
+    more.add_argument(
+        "--pixel-sigma",
+        type=_pixel_sigma,
+        metavar="S",
+        help="standard deviation of u and of v in px, for landmarks without one of their own in the file (default: the "
+        "residuals tell it)",
+    )
+    more.add_argument(
+        "--reject-outliers",
+        action="store_true",
+        help="leave out landmarks that lie more than 5 standard deviations off, and name them",
+    )
+    more.add_argument(
+        "--unit", choices=METRES, metavar="UNIT", help="unit of x, y and z, for tables and the file, such as m"
+    )
+    add_orientation(more)
+    output = command.add_argument_group("what comes out")
+    output.add_argument(
+        "-o",
+        "--output",
+        type=_located_file,
+        metavar="FILE",
+        help="write the camera at its place with its error bars: a .json, replaced if there is one",
+    )
+    output.add_argument("--json", action="store_true", help="print one JSON document, with null for what is not known")
+    output.add_argument(
+        "--draw",
+        type=drawing,
+        metavar="FILE",
+        help="draw the landmarks, and where the camera sees them, into the photograph: a .png, .svg or .pdf, replaced "
+        "if there is one",
+    )
+    command.set_defaults(work="locating")
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
+    if not all(name.isidentifier() for name in names):
+        raise argparse.ArgumentTypeError(f"want names with commas between, such as focal or focal,k1, got {text!r}")
+    return names
+
+
+def _pixel_sigma(text: str) -> float:
+    values = numbers(text, 1)
+    if values is None or not 1e-6 <= values[0] <= 1e6:
+        raise argparse.ArgumentTypeError(f"want a positive number of pixels, such as 0.5, got {text!r}")
+    return values[0]
+
+
+def _located_file(text: str) -> Path:
+    if Path(text).suffix.lower() != ".json":
+        raise argparse.ArgumentTypeError(f"want a file ending in .json, which holds the pose too, got {text!r}")
+    return Path(text)
