@@ -1,5 +1,7 @@
 """A calibration with one lens: a start in closed form, refined, looked at twice, kept from folding, points freed."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -12,6 +14,7 @@ from diffproj.calibration.options import Options
 from diffproj.calibration.outcome import outcome
 from diffproj.calibration.own_frame import are_solid
 from diffproj.calibration.parametrisation import Parametrisation, Pose
+from diffproj.calibration.restraint import unfolded
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.second_look import lower_fit
 from diffproj.calibration.space_start import space_starts
@@ -40,7 +43,11 @@ def calibrated(
     every = torch.arange(len(data.pixels), device=data.pixels.device)
     for other in starts[1:]:
         found = lower_fit(found, _from_start(data, chosen, parameters, other, straight), every, chosen.outlier_limit)
-    found, _ = with_free_points(found, data, chosen, None)
+    if chosen.shape == "free":
+        flat = found
+        found, _ = with_free_points(flat, data, chosen, None)
+        limits: dict[str, Any] = {name: getattr(chosen, name) for name in ("max_iterations", "tolerance")}
+        found = unfolded(found, flat, views.size, reject=chosen.outlier_limit, **limits)
     return outcome(who, data, found, views.size, chosen.throw)
 
 

@@ -109,6 +109,26 @@ def restrained(
     return best
 
 
+def unfolded(
+    freed: Fit, flat: Fit, size: tuple[int, int], *, reject: float | None, max_iterations: int, tolerance: float
+) -> Fit:
+    """The fit with free points, with the lenses that folded only once the points were freed restrained again.
+
+    They are drawn to their terms of the fit to the flat target, which did not fold. Other cameras stay to the bit.
+    """
+    shared, task = flat.solution.shared, freed.task
+    if not any(name in task.names for name in DENOMINATOR):
+        return freed
+    rows = folds_at_corners(task, freed.solution.shared, freed.solution.local).nonzero().flatten()
+    if len(rows) == 0:
+        return freed
+    start = torch.nn.functional.pad(shared, (0, freed.solution.shared.shape[-1] - shared.shape[-1]))[rows]
+    poses = flat.part(rows).solution.local
+    limits: dict[str, Any] = {"reject": reject, "max_iterations": max_iterations, "tolerance": tolerance}
+    held = restrained(freed.part(rows), start, poses, size, **limits)
+    return _put(freed, rows, held, torch.ones_like(rows, dtype=torch.bool))
+
+
 def _reached(found: Fit, size: tuple[int, int]) -> Tensor:
     """Which part of the image's border the lens reaches `(P,)`; -1 where not even its own corners, or no minimum."""
     task, solution = found.task, found.solution

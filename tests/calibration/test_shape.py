@@ -449,3 +449,19 @@ def test_a_prior_for_each_axis_and_point(axis: int) -> None:
     each[5] = 1e-6
     found = dp.calibrate(views, BOARD, shape="free", priors={"points": each})
     assert float(found.displacements[5].abs().amax()) < 1e-6
+
+
+@pytest.mark.slow
+def test_a_rational_lens_that_folds_once_the_points_are_free_is_restrained_again():
+    left, right = dp.example_views("left"), dp.example_views("right")
+    found = dp.calibrate(left, BOARD, distortion="brown8", shape="free")
+    poorer = dp.calibrate(left, BOARD, distortion="brown5", shape="free")
+    assert found.status == dp.Status.CONVERGED
+    assert found.rms <= poorer.rms * 1.002
+    assert bool(found.used.all())
+    # beside it, a camera that does not fold is what it is alone
+    both = dp.calibrate(
+        dp.Views(torch.stack([left.pixels, right.pixels]), size=left.size), BOARD, distortion="brown8", shape="free"
+    )
+    alone = dp.calibrate(right, BOARD, distortion="brown8", shape="free")
+    assert float(both.rms[1]) == pytest.approx(float(alone.rms), rel=1e-6)
