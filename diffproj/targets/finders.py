@@ -13,9 +13,12 @@ from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.circles import find_circles
 from diffproj.targets.corners import refine_grid
 from diffproj.targets.images import as_8_bit
-from diffproj.targets.marked import find_marked
+from diffproj.targets.marked import find_marked, shows_rather
 from diffproj.targets.numbering import in_order
 from diffproj.targets.search import find_pattern
+
+OTHER_SPACING = 0.15
+"""How far the gaps between tags may be from what was given, relative to it."""
 
 
 class Found(NamedTuple):
@@ -39,8 +42,7 @@ def find(image: Shaped[np.ndarray, "h w"], target: Board) -> Found:
     if isinstance(target, Chessboard):
         return _chessboard(image, target)
     if isinstance(target, AprilGrid):
-        corners = find_marked(image, as_8_bit(image), target)
-        return Found(None if corners is None else corners.reshape(*target.shape, 2))
+        return _april_grid(image, target)
     if isinstance(target, CircleGrid):
         centres = find_circles(image, as_8_bit(image), target)
         return Found(None if centres is None else centres.reshape(*target.shape, 2))
@@ -57,12 +59,39 @@ def _chessboard(image: Shaped[np.ndarray, "h w"], board: Chessboard) -> Found:
     return Found(in_order(refined.grid, image, board), board.size)
 
 
-def _charuco(image: Shaped[np.ndarray, "h w"], board: CharucoBoard) -> Found:
+def _april_grid(image: Shaped[np.ndarray, "h w"], board: AprilGrid) -> Found:
     corners = find_marked(image, as_8_bit(image), board)
-    if corners is not None:
-        return Found(corners.reshape(*board.shape, 2))
+    if corners is None:
+        return Found(None)
+    grid = corners.reshape(*board.shape, 2)
+    # Tags are read whatever their distance is said to be: their corners tell what it is.
+    spacing = _spacing_of(grid)
+    if abs(spacing - board.spacing) > OTHER_SPACING * board.spacing:
+        return Found(None, hint=f"one whose tags stand {spacing:.2f} of their side apart: give spacing={spacing:.2f}")
+    return Found(grid)
+
+
+def _spacing_of(grid: Float[np.ndarray, "rows columns 2"]) -> float:
+    """The gaps between tags relative to the sides of the tags beside them: the median; NaN where no pair is seen."""
+    ratios = []
+    for lines in (grid, grid.swapaxes(0, 1)):
+        steps = np.linalg.norm(np.diff(lines, axis=1), axis=-1)
+        ratios.append((2 * steps[:, 1::2] / (steps[:, :-2:2] + steps[:, 2::2])).ravel())
+    known = np.concatenate(ratios)
+    known = known[np.isfinite(known)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _charuco(image: Shaped[np.ndarray, "h w"], board: CharucoBoard) -> Found:
+    grey = as_8_bit(image)
+    corners = find_marked(image, grey, board)
     other = with_other_start(board)
-    if other is not None and find_marked(image, as_8_bit(image), other) is not None:
+    # With an odd number of columns most markers stand to each other alike on both, one square further on: those at the
+    # ends of rows tell which it is. Where none of them is in view, it is the one that was asked for.
+    alike = other if board.columns % 2 == 1 else None
+    if corners is not None and not (alike is not None and shows_rather(grey, alike, board)):
+        return Found(corners.reshape(*board.shape, 2))
+    if other is not None and find_marked(image, grey, other) is not None:
         kind = "legacy" if other.legacy else "ordinary"
         return Found(None, hint=f"one of the {kind} pattern: give legacy={other.legacy}")
     return Found(None)

@@ -37,7 +37,7 @@ RIVALS = 0.3
 """Share of markers that stand amid those that agree, and elsewhere on the board, from which none is believed."""
 
 FEWEST = 6
-"""Corners that a view must show, on at least two rows and two columns."""
+"""Corners that a view must show, on at least two rows and two columns; all of a board that has no more."""
 
 ENOUGH = 8
 """Markers that agree from which no other copy of the image is searched: corners lead to the rest of the board."""
@@ -85,6 +85,15 @@ def find_marked(
     return None
 
 
+def shows_rather(grey: UInt8[np.ndarray, "h w"], other: CharucoBoard, board: CharucoBoard) -> bool:
+    """Whether more markers stand to each other as on the other board, in the first copy in which the two differ."""
+    for small in _copies(grey):
+        one, two = (len(_consistent(_read(small, grey, each, 1), each.pitch)) for each in (other, board))
+        if one != two:
+            return one > two
+    return False
+
+
 class _Search:
     """The corners of one board in one image."""
 
@@ -116,7 +125,7 @@ class _Search:
                 break
             sources = self.places[good], known[good]
         rows, columns = (len(np.unique(np.round(self.places[good, axis], 9))) for axis in (1, 0))
-        if good.sum() < FEWEST or min(rows, columns) < 2:
+        if good.sum() < min(FEWEST, len(known)) or min(rows, columns) < 2:
             return None
         return known
 

@@ -187,3 +187,31 @@ def test_photographs_of_a_real_board(folder, legacy, corners, rms):
     calibration = dp.calibrate(found, board)
     assert int(found.visible.sum()) >= corners
     assert float(calibration.rms) <= rms
+
+
+@pytest.mark.parametrize("legacy", [True, False])
+def test_the_other_pattern_is_told_where_it_is_the_same_one_square_further_on(legacy):
+    board = dp.CharucoBoard(7, 4, square=20.0, marker=15.0, dictionary="4X4_1000", legacy=legacy)
+    photo = photographed(camera_before(board, 3, side_px=28, tilt_deg=20), board)
+    camera = camera_before(board, 3, side_px=28, tilt_deg=20)
+    assert errors(dp.detect(photo, board), camera, board)[0].max() < 0.2
+    other = dp.CharucoBoard(7, 4, 20.0, 15.0, "4X4_1000", legacy=not legacy)
+    with pytest.raises(dp.BoardNotFoundError, match=f"give legacy={legacy}"):
+        dp.detect(photo, other)
+
+
+@pytest.mark.parametrize(("given", "true"), [(0.2, 0.3), (0.5, 0.3), (0.3, 0.2), (0.25, 0.3)])
+def test_another_spacing_of_tags_is_told(given, true):
+    board = dp.AprilGrid(4, 3, tag=20.0, spacing=true)
+    photo = photographed(camera_before(board, 1, side_px=40, tilt_deg=20), board)
+    assert dp.detect(photo, board).visible.sum() > 30
+    with pytest.raises(dp.BoardNotFoundError, match=rf"give spacing={true:.2f}|found none"):
+        dp.detect(photo, dp.AprilGrid(4, 3, tag=20.0, spacing=given))
+
+
+def test_the_smallest_board_is_found():
+    board = dp.CharucoBoard(3, 3, square=20.0, marker=15.0, dictionary="4X4_50")
+    camera = camera_before(board, 2, side_px=40, tilt_deg=20)
+    found = dp.detect(photographed(camera, board), board)
+    assert int(found.visible.sum()) == 4
+    assert errors(found, camera, board)[0].max() < 0.1
