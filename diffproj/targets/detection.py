@@ -59,8 +59,8 @@ def detect(
 
     A `CharucoBoard` or an `AprilGrid` is found by its markers, as much of it as is in view. Each corner is placed by
     fitting the whole print around it; corners that do not fit, or lie off the surface through their neighbours, are
-    hidden (`Views.visible`). At least 6 must be visible, on two rows and two columns, or all of a board of 4. Each is known by itself, however
-    the board is turned.
+    hidden (`Views.visible`). At least 6 must be visible, on two rows and two columns, or all of a board of 4. Each is
+    known by itself, however the board is turned.
 
     A `CircleGrid` is found as dark ellipses on a lattice, of which up to a quarter may be hidden. The pixels are the
     middles of the ellipses; `calibrate` knows that a centre is seen elsewhere. Its order is never mirrored, and where
@@ -217,12 +217,12 @@ def _advice(labels: list[str], found: list[Found], target: Board) -> str:
 _CHECKS: dict[type, str] = {
     Chessboard: "the numbers count inner corners (one less than the squares each way), that the whole board is in view "
     "with a margin around it, and that the photographs are sharp and evenly lit",
-    CharucoBoard: "the numbers count squares, columns first, that marker, dictionary and legacy are those that the board "
-    "was made with, and that the photographs are sharp and evenly lit, with markers of 15 px or more",
+    CharucoBoard: "the numbers count squares, columns first, that marker, dictionary and legacy are those that the "
+    "board was made with, and that the photographs are sharp and evenly lit, with markers of 15 px or more",
     AprilGrid: "the numbers count tags, columns first, that the tags are of the family 36h11 and begin with number 0, "
     "and that the photographs are sharp and evenly lit, with tags of 25 px or more",
     CircleGrid: "the numbers count circles, columns first, that every second line is shifted where asymmetric says so, "
-    "that the circles are dark on light, that the whole board is in view, and that the photographs are sharp and evenly "
-    "lit, with circles of 6 px or more",
+    "that the circles are dark on light, that the whole board is in view, and that the photographs are sharp and "
+    "evenly lit, with circles of 6 px or more",
 }
 """What may be wrong where a target is in no photograph."""
