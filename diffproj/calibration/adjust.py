@@ -85,6 +85,8 @@ def adjust(
     tied, through = flag("tied_focal", tied_focal), flag("differentiable", differentiable)
     steps = whole_number("max_iterations", max_iterations, "a whole number of steps", least=0)
     throw = flag("throw", throw)
+    if 0 in start.batch_shape:
+        raise ValueError(f"camera: want at least one, got batch shape {tuple(start.batch_shape)}")
     start = start.to(torch.float64)
     known_of = knowledge(start, priors, fixed, free, tied)
     batch = _batch(start, pieces, known_of)
@@ -98,7 +100,8 @@ _WANT = "observations such as [dp.Seen(landmarks, pixels), dp.Horizon(pixels)]"
 
 
 def _checked(observation: object) -> Observation:
-    if isinstance(observation, type) or not isinstance(observation, Observation):
+    residuals = getattr(observation, "residuals", None)
+    if isinstance(observation, type) or not isinstance(observation, Observation) or not callable(residuals):
         raise TypeError(f"observations: want {_WANT}, got {called(observation)}")
     check_loss(getattr(observation, "loss", None))
     return observation

@@ -65,7 +65,10 @@ class Coplanar(Observed):
         self.places = valued("places", places, "M", 2)
         if self.places.ndim != 2 or len(self.places) < 3 or not bool(self.places.detach().isfinite().all()):
             raise ValueError(f"places: want x and y of at least 3 points (M, 2), got {tuple(self.places.shape)}")
-        self.pixels = checked_pixels("pixels", pixels, len(self.places), 2)
+        try:
+            self.pixels = checked_pixels("pixels", pixels, len(self.places), 2)
+        except ValueError as error:
+            raise ValueError(f"{error}; one for each of places") from None
         self.pixel_sigma = checked_deviation("pixel_sigma", pixel_sigma, "a deviation in px")
         check_broadcast("pixel_sigma", self.pixel_sigma, "the pixels", self.pixels.shape[:-1])
         self.level = number("level", level, "a height in world units")

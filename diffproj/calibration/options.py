@@ -189,5 +189,5 @@ def _with_defaults(who: str, given: Mapping[str, Any], defaults: Mapping[str, An
         raise ValueError("pixel_sigma, weights: want one of the two, for weights are 1 / pixel_sigma^2")
     if not isinstance(options.reject_outliers, bool | np.bool_):
         want = "True or a number above 0"
-        options.reject_outliers = number("reject_outliers", options.reject_outliers, want, least=0)
+        options.reject_outliers = number("reject_outliers", options.reject_outliers, want, least=0, most=1e6)
     return options

@@ -164,7 +164,7 @@ def bootstrap(
         True
     """
     _check_views(views)
-    draws = whole_number("draws", draws, "a whole number of at least 2", least=2)
+    draws = whole_number("draws", draws, "a whole number of at least 2 and at most a million", least=2, most=10**6)
     _check_lens(distortion)
     chosen = calibration_options("bootstrap", options)
     if "weights" in options:

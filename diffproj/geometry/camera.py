@@ -201,6 +201,8 @@ class Camera(
         """
         offset = check_tensor("offset", offset, 3, like=self.K)
         check_same_kind(camera=self.K, offset=offset)
+        if has_values(offset) and not bool(offset.isfinite().all()):
+            raise ValueError("offset: want finite values, got NaN or infinity")
         return self._with(t=self.t + dot(self.R, offset.unsqueeze(-2)))
 
     # ------------------------------------------------------------------------------------------- points and pixels

@@ -80,6 +80,8 @@ def degrees_from_metres(points: Float[Tensor, "*batch n d"] | Array, crs: str) -
 def _checked(name: str, value: Tensor | Array) -> Tensor:
     """Two or three float64 numbers a point."""
     found = check_tensor(name, value, "N", "2 or 3")
+    if found.is_meta:
+        raise ValueError(f"{name}: want values, got a tensor on the device meta")
     if found.shape[-1] not in (2, 3):
         raise ValueError(f"{name}: want shape (*B, N, 2) or (*B, N, 3), got {tuple(found.shape)}")
     if found.dtype != torch.float64:

@@ -25,6 +25,8 @@ from diffproj.geometry.intrinsics import intrinsic_matrix
 from diffproj.lens.protocol import Lens
 
 C = TypeVar("C", bound="Mounted")
+LARGEST_SIDE = 10**6
+"""Of an image in px, and more than any camera has."""
 
 Number = Float[Tensor, "*#batch"] | Array | float
 """One for all cameras, or one each `(*B,)`."""
@@ -111,6 +113,8 @@ class Mounted(CameraParts):
         sides = checked_size(size)
         if sides is None:
             raise TypeError("size: want (width, height) of the image in px, got None")
+        if max(sides) > LARGEST_SIDE:
+            raise ValueError(f"size: want (width, height) of at most {LARGEST_SIDE:,} px, got {size}")
         kind = meeting(
             *(
                 one
@@ -131,6 +135,9 @@ class Mounted(CameraParts):
         middle = [(side - 1) / 2 for side in sides] if principal_point is None else principal_point
         center = check_tensor("principal_point", middle, 2, like=kind)
         place = check_tensor("position", (0.0, 0.0) if position is None else position, 2, like=kind)
+        for name, part in (("principal_point", center), ("position", place)):
+            if has_values(part) and not bool(part.isfinite().all()):
+                raise ValueError(f"{name}: want finite numbers, got {part.tolist()}")
         parts = {"height": height, "tilt_deg": tilt, "roll_deg": roll, "heading_deg": heading, "focal": f_x}
         check_same_kind(**parts, principal_point=center, position=place)
         shapes = {name: part.shape for name, part in parts.items()}

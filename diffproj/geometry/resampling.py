@@ -56,6 +56,8 @@ def resampled(
         return _finished(total, share)
     with torch.no_grad():
         places, valid = look_up_of(None)((corners + 0.5).reshape(-1, 2))
+        if 0 in (*source.shape[:-3], *valid.shape[:-1]):  # of no images
+            return _finished(*_mean(source, look_up_of(None), corners, (1, 1)))
         shown = (valid & inside(places, _size(source))).unflatten(-1, shape)
         footprints = _footprints(look_up_of(None), corners, places.unflatten(-2, shape), shown)
         between = any(bool(((more > 0) & (more < 1)).any()) for _, more in map(_numbers, footprints))

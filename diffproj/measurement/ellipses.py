@@ -42,7 +42,7 @@ class Ellipses(Copied, Shown):
             TypeError: count is no whole number.
             ValueError: it is below 3.
         """
-        count = whole_number("count", count, "a whole number of at least 3", least=3)
+        count = whole_number("count", count, "a whole number from 3 to 10,000", least=3, most=10_000)
         turn = torch.arange(count, dtype=self.center.dtype, device=self.center.device) * (2 * math.pi / count)
         around = torch.stack([turn.cos(), turn.sin()], dim=-1)
         return self.center.unsqueeze(-2) + (around * self.half_axes.unsqueeze(-2)) @ self.directions

@@ -61,7 +61,7 @@ class AprilGrid:
             raise ValueError(f"spacing: want {want}, got {spacing:g}; it is a ratio, not a length")
         object.__setattr__(self, "spacing", spacing)
         if self.columns * self.rows > most:
-            raise ValueError(f"rows: want at most {most} tags, got {self.columns} x {self.rows}")
+            raise ValueError(f"columns, rows: want at most {most} tags, got {self.columns} x {self.rows}")
 
     def __len__(self) -> int:
         """The number of tags' corners, N."""

@@ -64,7 +64,9 @@ class CharucoBoard:
         object.__setattr__(self, "legacy", flag("legacy", self.legacy))
         need, there = len(self._marked()), marker_count(self.dictionary)
         if need > there:
-            raise ValueError(f"dictionary: want one of at least {need} markers, got {self.dictionary} with {there}")
+            raise ValueError(
+                f"dictionary: want one of at least {need} markers, as columns x rows need, got {self.dictionary} with {there}"
+            )
 
     def __len__(self) -> int:
         """The number of inner corners, N."""

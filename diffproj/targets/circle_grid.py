@@ -1,7 +1,7 @@
 """The circle grid: black discs in rows and columns, or with every second line shifted."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -62,9 +62,7 @@ class CircleGrid:
         for name in ("spacing", "diameter"):
             object.__setattr__(self, name, number(name, getattr(self, name), "a positive, finite length", above=0))
         asymmetric = bool(self.asymmetric) if isinstance(self.asymmetric, np.bool_) else self.asymmetric
-        if asymmetric not in (False, True, "rows", "columns") or isinstance(asymmetric, int | float) != isinstance(
-            asymmetric, bool
-        ):
+        if not isinstance(asymmetric, bool) and not (isinstance(asymmetric, str) and asymmetric in get_args(Lines)):
             raise ValueError(f"asymmetric: want False, True, 'rows' or 'columns', got {self.asymmetric!r}")
         if asymmetric is True:
             asymmetric = "columns" if self.columns > self.rows else "rows"

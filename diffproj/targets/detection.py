@@ -209,9 +209,8 @@ def _advice(labels: list[str], found: list[Found], target: Board) -> str:
     hints = [one.hint for one in found if one.hint]
     if hints:
         there = f" There is {hints[0]}."
-    return (
-        f"photographs: want a {target.title}, found none in {_named(labels)}.{there} Check that {_CHECKS[type(target)]}"
-    )
+    return f"photographs: want a {target.title}, found none in {_named(labels)}.{there} "
+        f"Check target, and that {_CHECKS[type(target)]}"
 
 
 _CHECKS: dict[type, str] = {
