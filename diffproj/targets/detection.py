@@ -209,8 +209,10 @@ def _advice(labels: list[str], found: list[Found], target: Board) -> str:
     hints = [one.hint for one in found if one.hint]
     if hints:
         there = f" There is {hints[0]}."
-    return f"photographs: want a {target.title}, found none in {_named(labels)}.{there} "
-        f"Check target, and that {_CHECKS[type(target)]}"
+    return (
+        f"photographs: want a {target.title}, found none in {_named(labels)}.{there} Check target, and that "
+        f"{_CHECKS[type(target)]}"
+    )
 
 
 _CHECKS: dict[type, str] = {
