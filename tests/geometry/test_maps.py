@@ -114,15 +114,13 @@ def test_points_on_both_sides_of_the_date_line_are_neighbours() -> None:
     [
         ([[45.0, 3.0]], "EPSG:3857"),  # Web Mercator: 1.41 of a metre
         ([[40.0, -75.0]], "EPSG:32633"),  # a zone of another continent
-        ([[52.0, 5.0], [52.0, 40.0]], None),
+        ([[5.0, 5.0], [5.0, 60.0]], None),
         ([[40.0, 3.0]], "EPSG:4326"),  # degrees
     ],
 )
 def test_a_map_whose_metres_are_none_is_refused(degrees: list[list[float]], crs: str | None) -> None:
     pytest.importorskip("pyproj")
-    with pytest.raises(
-        ValueError, match="crs: want a map (in metres|whose metres are those on the ground), .*got 'EPSG"
-    ):
+    with pytest.raises(ValueError, match="crs: want a map (in|whose) metres.*, got .EPSG"):
         dp.metres_from_degrees(degrees, crs)
     for system in ("EPSG:2154", "EPSG:3035"):  # national and European grids
         dp.metres_from_degrees([[45.0, 3.0]], system)
