@@ -451,6 +451,16 @@ def test_turns_are_known_of_a_camera_that_looks_straight_down() -> None:
         (lambda: dp.VanishingPoints(["up"], pixels=[[1.0, 2.0]]), "directions: want 'x', 'y', 'z' or vectors"),
         (lambda: dp.VanishingPoints(["x"]), "pixels: want pixels or segments, got neither"),
         (lambda: dp.VanishingPoints("x", pixels=[[1.0, 2.0]]), "directions: want one for each line"),
+        (lambda: dp.Seen(LANDMARKS[:2], seen()[:2], [1.0, -2.0]), "more than 0 and finite, got -2 at 1"),
+        (
+            lambda: dp.Lengths([[1.0, 2], [3, 4]], [[1.0, 1], [3, 4]], 1.0, 0.1),
+            "ends: want other pixels .* at 1; leave",
+        ),
+        (lambda: dp.Heights([[1.0, 2.0]], [[1.0, 2.0]], 1.0, 0.1), "tops: want other pixels than the feet"),
+        (
+            lambda: dp.VanishingPoints(["x"], segments=[[[1.0, 2], [1, 2]]]),
+            "segments: want other pixels than the first",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_sentence(call: Any, text: str) -> None:
