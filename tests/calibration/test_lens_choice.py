@@ -51,7 +51,7 @@ def test_a_lens_of_180_degrees() -> None:
     assert found.rms < 0.3
 
 
-@pytest.mark.parametrize("views", [2, 3])
+@pytest.mark.parametrize("views", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_few_views_are_judged_by_their_corners(views: int) -> None:
     found = dp.calibrate(dp.example_views("left")[2 : 2 + views], BOARD, "auto")
     assert found.comparison is not None

@@ -47,6 +47,7 @@ def test_every_board_is_found_dark_and_light_exchanged_too(size, side):
         assert distance.min(axis=1).max() < side / 3
 
 
+@pytest.mark.slow
 def test_a_strongly_bent_board():
     """A lens that moves the outermost corners by more than a square."""
     board = Chessboard(9, 6, 1.0)
@@ -133,7 +134,13 @@ def test_patterns_of_a_chessboard_are_one_pattern():
 # ------------------------------------------------------------------------------------------- boards that look alike
 
 
-@pytest.mark.parametrize(("size", "roll"), [((8, 6), 70), ((7, 5), 70), ((7, 7), 70), ((6, 6), 30)])
+@pytest.mark.parametrize(
+    ("size", "roll"),
+    [
+        ((7, 5), 70),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (((8, 6), 70), ((7, 7), 70), ((6, 6), 30))),
+    ],
+)
 def test_a_sequence_keeps_its_origin(size, roll):
     """The board rolls all the way round, step by step: every corner keeps its number."""
     board = Chessboard(*size, 1.0)
