@@ -220,7 +220,8 @@ class Account(Shown):
             lines.append(
                 f"{'image':<16}{100 * (1 - share):.0f} % of its border lies beyond the fold of the lens: no rays"
             )
-        remarks = [*self.remarks[0].split("; "), "" if self.status else self.doubts]
+        doubts = "" if self.status else self.doubts
+        remarks = [text for text in self.remarks[0].split("; ") if text not in doubts] + [doubts]
         return "\n".join([*lines, self._ends()[0], *filter(None, remarks), self.verdict])
 
     def _shape(self) -> str:

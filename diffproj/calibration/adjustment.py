@@ -27,6 +27,10 @@ SHOWN = 5
 """Numbers of cameras in a message."""
 NOTHING = 1e-12
 """Deviation, relative to the value, that is rounding: of what was held."""
+VERTICAL = 3.0
+"""Deviations of the tilt within which an axis may be vertical."""
+ANY_ANGLE = 180 / 3**0.5
+"""Deviation of an angle in degrees of which nothing is known."""
 ROUNDED = 1e-7
 """The same relative to the largest deviation of the pose, whose covariance it was computed from."""
 
@@ -60,7 +64,8 @@ class Adjustment(Calibration):
     def mounting_covariance(self) -> Float[Tensor, "*batch 6 6"]:
         """The covariance of tilt, roll and heading in degrees and of x, y and height, `(*B, 6, 6)`.
 
-        Where the camera looks straight down, roll and heading are not told apart: the heading has what both have.
+        Where the camera looks straight down, roll and heading are not told apart: the heading has what both have. Where
+        it may well look straight down, each of them may be any angle, and is told as 104 degrees off or more.
         """
         return mounting_covariance(self)
 
@@ -251,8 +256,21 @@ def mounting_covariance(calibration: Calibration, view: int = 0) -> Float[Tensor
         return torch.cat([torch.stack(mounting_from_rotation(again), dim=-1), center], dim=-1)
 
     J = jacobian(mounted, t.new_zeros(len(t), POSE))[1].permute(1, 2, 0)
-    C = (J @ pose.reshape(-1, POSE, POSE) @ J.mT).reshape(*batch, POSE, POSE)
+    C = _any_angle(J @ pose.reshape(-1, POSE, POSE) @ J.mT, mounting_from_rotation(R)[0]).reshape(*batch, POSE, POSE)
     return C + torch.diag_embed(torch.where(lost, torch.inf, 0.0).to(C))
+
+
+def _any_angle(C: Tensor, tilt: Tensor) -> Tensor:
+    """The covariance `(P, 6, 6)` where the vertical is among the likely directions of the axis.
+
+    Roll and heading may be any angle there, which slopes do not tell; what they make together stays as well known.
+    """
+    spread = C.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+    near = (tilt.abs() < 90) & (90 - tilt.abs() < VERTICAL * spread[:, 0])
+    lost = near & (spread[:, 1:3].amin(-1) > ANY_ANGLE / (2 * VERTICAL))
+    both = torch.zeros_like(C[:, 0])
+    both[:, 1], both[:, 2] = 1.0, tilt.sign()
+    return C + torch.where(lost, ANY_ANGLE**2, 0.0).to(C)[:, None, None] * both.unsqueeze(-1) * both.unsqueeze(-2)
 
 
 def pose_covariance(names: tuple[str, ...], joint: Tensor, arm: Tensor, middle: Tensor, unknown: Tensor) -> Covariance:

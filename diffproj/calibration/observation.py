@@ -107,9 +107,30 @@ def checked_deviation(name: str, value: Any, want: str, *, zero: bool = False) -
         raise TypeError(f"{name}: want {want}, got {called(value)}")
     sigma = valued(name, value)
     known = sigma.detach()
-    if not bool(((known >= 0 if zero else known > 0) & known.isfinite()).all()):
-        raise ValueError(f"{name}: want {want}, {'at least' if zero else 'more than'} 0 and finite, got others")
+    lost = ~((known >= 0 if zero else known > 0) & known.isfinite())
+    if bool(lost.any()):
+        least = "at least" if zero else "more than"
+        raise ValueError(f"{name}: want {want}, {least} 0 and finite, got {float(known[lost][0]):g}{_at(lost)}")
     return sigma
+
+
+def check_apart(name: str, ends: Tensor, like: str, others: Tensor, remedy: str) -> None:
+    """Check that the two pixels `(*B, M, 2)` of each item are not the same.
+
+    Raises:
+        ValueError: some are.
+    """
+    alike = (ends.detach() == others.detach()).all(-1)
+    if bool(alike.any()):
+        raise ValueError(f"{name}: want other pixels than {like}, got the same ones{_at(alike)}; {remedy}")
+
+
+def _at(which: Tensor) -> str:
+    """The place of the first item, where there are several."""
+    if which.numel() < 2:
+        return ""
+    place = which.nonzero()[0].tolist()
+    return f" at {place[0] if len(place) == 1 else tuple(place)}"
 
 
 def check_broadcast(name: str, tensor: Tensor, like: str, shape: torch.Size) -> None:

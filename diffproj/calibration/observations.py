@@ -15,6 +15,7 @@ from diffproj.calibration.observation import (
     Deviation,
     Observed,
     batched,
+    check_apart,
     check_broadcast,
     checked_deviation,
     checked_pixels,
@@ -220,6 +221,7 @@ class Heights(Observed):
         if self.feet.shape[-2] != self.tops.shape[-2]:
             raise ValueError(f"tops: want one for each of {self.feet.shape[-2]} feet, got {self.tops.shape[-2]}")
         shape = broadcast_batches(feet=self.feet.shape[:-1], tops=self.tops.shape[:-1])
+        check_apart("tops", self.tops, "the feet", self.feet, "leave such objects out")
         self.height = checked_deviation("height", height, "a height in world units")
         self.deviation = checked_deviation("deviation", deviation, "a deviation in world units")
         self.pixel_sigma = checked_deviation("pixel_sigma", pixel_sigma, "a deviation in px", zero=True)
@@ -296,6 +298,7 @@ class Lengths(Observed):
         if self.starts.shape[-2] != self.ends.shape[-2]:
             raise ValueError(f"ends: want one for each of {self.starts.shape[-2]} starts, got {self.ends.shape[-2]}")
         shape = broadcast_batches(starts=self.starts.shape[:-1], ends=self.ends.shape[:-1])
+        check_apart("ends", self.ends, "the starts", self.starts, "leave such lengths out")
         self.length = checked_deviation("length", length, "a length in world units")
         self.deviation = checked_deviation("deviation", deviation, "a deviation in world units")
         self.pixel_sigma = checked_deviation("pixel_sigma", pixel_sigma, "a deviation in px", zero=True)

@@ -179,7 +179,14 @@ class Calibration(Account, Copied, Recorded):
         """How it ended, in a sentence, and the remarks; for many cameras, how many converged and why others did not."""
         ends = self._ends()
         if not self.views.batch_shape:
-            return "; ".join([ends[0], *filter(None, [*self.remarks, "" if self.status else self.doubts])])
+            doubts = "" if self.status else self.doubts
+            return "; ".join(
+                [
+                    ends[0],
+                    *(text for text in self.remarks if text and text not in doubts),
+                    *([doubts] if doubts else []),
+                ]
+            )
         failed = [f"camera {i}: {ends[i]}" for i in self.status.flatten().nonzero().flatten().tolist()]
         count = f"{len(ends) - len(failed)} of {len(ends)} cameras converged"
         return "; ".join([count, *failed, *filter(None, [self.doubts])])
@@ -188,10 +195,23 @@ class Calibration(Account, Copied, Recorded):
     def doubts(self) -> str:
         """What makes the poses doubtful, in words; empty where nothing does, or where it is not known.
 
-        Views that are `ambiguous`; and, of a calibration that `locate` found with another, views that this one does
-        not fit: see `mismatch`.
+        Views that are `ambiguous`; of a calibration that `locate` found with another, views that this one does not fit:
+        see `mismatch`; and where poses alone were found, residuals that the `pixel_sigma` that was said does not
+        explain.
         """
-        return "; ".join(filter(None, [self.ambiguity, mismatches.described(self.mismatch, self.views.names)]))
+        misfit = mismatches.described(self.mismatch, self.views.names)
+        return "; ".join(filter(None, [self.ambiguity, misfit, self.contradiction]))
+
+    @property
+    def contradiction(self) -> str:
+        """Where poses alone were found, what residuals say against the `pixel_sigma`, in words; empty where nothing."""
+        if not (self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics)):
+            return ""
+        if not self.views.batch_shape:
+            return self.remarks[0]
+        many = [camera for camera, text in enumerate(self.remarks) if text]
+        which = ", ".join(map(str, many))
+        return f"the residuals of cameras {which} are larger than pixel_sigma says: see remarks" if many else ""
 
     @property
     def ambiguity(self) -> str:

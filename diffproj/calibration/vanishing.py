@@ -13,6 +13,7 @@ from diffproj.calibration.observation import (
     Deviation,
     Observed,
     batched,
+    check_apart,
     check_broadcast,
     checked_deviation,
     checked_pixels,
@@ -72,6 +73,9 @@ class VanishingPoints(Observed):
         M = len(self.directions)
         self.pixels = None if pixels is None else checked_pixels("pixels", pixels, "M", 2)
         self.segments = None if segments is None else checked_pixels("segments", segments, "M", 2, 2)
+        if self.segments is not None:
+            first, second = self.segments.unbind(-2)
+            check_apart("segments", second, "the first of each line", first, "take two far apart")
         seen = self.pixels if self.segments is None else self.segments[..., 0, :]
         if seen.shape[-2] != M:  # type: ignore[union-attr]
             what = "segments" if pixels is None else "pixels"

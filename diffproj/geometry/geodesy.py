@@ -15,6 +15,8 @@ from diffproj._core.arguments import Array, called
 from diffproj._core.numerics import check_tensor
 
 WGS84 = "EPSG:4326"
+STRETCHED = 0.05
+"""The part by which a map may stretch lengths; more is a map far from the points, or one such as Web Mercator."""
 
 
 def metres_from_degrees(
@@ -34,7 +36,7 @@ def metres_from_degrees(
     Raises:
         TypeError: no numbers, or a system that is no text.
         ValueError: degrees out of their range, as when the two are exchanged, a system that pyproj does not know, that
-            is not in metres, or that does not reach the points.
+            is not in metres, or whose metres are none where the points are, by more than a twentieth.
         ModuleNotFoundError: pyproj is not installed.
 
     Example:
@@ -50,8 +52,12 @@ def metres_from_degrees(
             "or metres already?"
         )
     if crs is None:
-        crs = _utm(float(latitude.mean()), float(longitude.mean()))
-    east, north = _transformed(WGS84, crs, latitude, longitude, swap=True)
+        first = longitude.flatten()[:1]  # The middle is near the points on either side of the date line too.
+        crs = _utm(float(latitude.mean()), float((first + (longitude - first + 180) % 360 - 180).mean()))
+    pyproj = _pyproj()
+    system = _map(pyproj, crs)
+    east, north = _transformed(pyproj, WGS84, system, latitude, longitude, swap=True)
+    _check_lengths(pyproj, crs, system, latitude, longitude)
     return torch.stack([east, north, *degrees[..., 2:].unbind(-1)], dim=-1), crs
 
 
@@ -73,7 +79,8 @@ def degrees_from_metres(points: Float[Tensor, "*batch n d"] | Array, crs: str) -
         [40.41678, -3.70379, 650.0]
     """
     points = _checked("points", points)
-    latitude, longitude = _transformed(crs, WGS84, points[..., 0], points[..., 1], swap=False)
+    pyproj = _pyproj()
+    latitude, longitude = _transformed(pyproj, _map(pyproj, crs), WGS84, points[..., 0], points[..., 1], swap=False)
     return torch.stack([latitude, longitude, *points[..., 2:].unbind(-1)], dim=-1)
 
 
@@ -103,30 +110,47 @@ def _pyproj() -> Any:
     return pyproj
 
 
-def _transformed(source: str, target: str, first: Tensor, second: Tensor, swap: bool) -> tuple[Tensor, Tensor]:
+def _transformed(
+    pyproj: Any, source: Any, target: Any, first: Tensor, second: Tensor, swap: bool
+) -> tuple[Tensor, Tensor]:
     """Two coordinates from one system to another, east before north, latitude before longitude."""
-    pyproj = _pyproj()
-    systems = [_system(pyproj, name) for name in (source, target)]
-    transformer = pyproj.Transformer.from_crs(*systems, always_xy=True)
+    transformer = pyproj.Transformer.from_crs(source, target, always_xy=True)
     given = (second, first) if swap else (first, second)
     found = transformer.transform(*(part.detach().cpu().numpy() for part in given))
     x, y = (torch.as_tensor(part, dtype=first.dtype, device=first.device).reshape(first.shape) for part in found)
     if not bool((x.isfinite() & y.isfinite()).all()):
-        raise ValueError(f"crs: want a coordinate reference system that reaches the points, got {source} to {target}")
+        other = target if source == WGS84 else source
+        raise ValueError(
+            f"crs: want a coordinate reference system that reaches the points, got {getattr(other, 'name', other)}"
+        )
     return (x, y) if swap else (y, x)
 
 
-def _system(pyproj: Any, name: str) -> Any:
+def _map(pyproj: Any, name: str) -> Any:
     if not isinstance(name, str):
         raise TypeError(f"crs: want a coordinate reference system such as 'EPSG:32630', got {called(name)}")
     try:
         system = pyproj.CRS.from_user_input(name)
     except pyproj.exceptions.CRSError as error:
         raise ValueError(f"crs: want a coordinate reference system such as 'EPSG:32630', got {name!r}") from error
-    metres = all(axis.unit_name == "metre" for axis in system.axis_info[:2])
-    if name != WGS84 and not (system.is_projected and metres):
+    if not (system.is_projected and all(axis.unit_name == "metre" for axis in system.axis_info[:2])):
         raise ValueError(f"crs: want a map in metres, as UTM is, got {name!r} ({system.name})")
     return system
+
+
+def _check_lengths(pyproj: Any, name: str, system: Any, latitude: Tensor, longitude: Tensor) -> None:
+    """Check that a metre on the map is about one on the ground, in every direction."""
+    flat = (part.detach().cpu().numpy().ravel() for part in (longitude, latitude))
+    factors = pyproj.Proj(system).get_factors(*flat)
+    for scale in (factors.tissot_semimajor, factors.tissot_semiminor):
+        off = torch.as_tensor(scale, dtype=torch.float64, device="cpu") - 1
+        worst = off[off.abs().argmax()] if len(off) else off.sum()
+        if not float(worst.abs()) <= STRETCHED:
+            raise ValueError(
+                f"crs: want a map whose metres are those on the ground, got {name!r} ({system.name}), where a metre on "
+                f"the ground is {1 + float(worst):.4g} at the points; leave crs out for the UTM zone of their middle, "
+                "or take points that lie closer together"
+            )
 
 
 def _utm(latitude: float, longitude: float) -> str:
@@ -136,8 +160,9 @@ def _utm(latitude: float, longitude: float) -> str:
     place = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
     zones = pyproj.database.query_utm_crs_info(datum_name="WGS 84", area_of_interest=place)
     if not zones:
+        polar = "EPSG:3413" if latitude > 0 else "EPSG:3031"
         raise ValueError(
-            f"crs: want a coordinate reference system, such as 'EPSG:3031', got none, and no UTM zone holds latitude "
+            f"crs: want a coordinate reference system, such as {polar!r}, got none, and no UTM zone holds latitude "
             f"{latitude:g}, longitude {longitude:g}"
         )
     return f"EPSG:{zones[0].code}"

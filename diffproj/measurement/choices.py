@@ -100,7 +100,7 @@ def doubts(calibration: Calibration, view: int) -> str:
     if misfit:
         warn_caller(f"measure: {misfit}", CameraMismatchWarning)
     two = ambiguity.described(calibration.ambiguous[..., only], name) if calibration.has_alternatives else ""
-    evidence = calibration.doubts if isinstance(calibration, Adjustment) else ""
+    evidence = calibration.doubts if isinstance(calibration, Adjustment) else calibration.contradiction
     return "; ".join(filter(None, [misfit, two, evidence]))
 
 

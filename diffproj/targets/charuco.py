@@ -65,8 +65,8 @@ class CharucoBoard:
         need, there = len(self._marked()), marker_count(self.dictionary)
         if need > there:
             raise ValueError(
-                f"dictionary: want one of at least {need} markers, as columns x rows need, got {self.dictionary} with "
-                f"{there}"
+                f"dictionary: want one of at least {need} markers, got {self.dictionary} with {there}; it has to have "
+                "one for every second square of columns x rows"
             )
 
     def __len__(self) -> int:

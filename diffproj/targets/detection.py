@@ -210,8 +210,8 @@ def _advice(labels: list[str], found: list[Found], target: Board) -> str:
     if hints:
         there = f" There is {hints[0]}."
     return (
-        f"photographs: want a {target.title}, found none in {_named(labels)}.{there} "
-        f"Check target, and that {_CHECKS[type(target)]}"
+        f"photographs: want a {target.title}, found none in {_named(labels)}.{there} Check target, and that "
+        f"{_CHECKS[type(target)]}"
     )
 
 

@@ -407,6 +407,24 @@ def test_forty_frames_of_a_drone_in_one_call() -> None:
     assert ground.points.shape == (F, 4, 3)
 
 
+def test_roll_and_heading_may_be_any_angle_near_the_vertical() -> None:
+    random = torch.Generator().manual_seed(5)
+    for tilt in (89.9, -89.9):
+        drone = dp.Camera.mounted(50.0, tilt, 20.0, 90.0, focal=1000.0, size=(1280, 960))
+        pixels = torch.tensor([[100.0, 100], [1100, 100], [600, 900], [200, 800]], dtype=D)
+        plane = dp.Plane.z(0.0 if tilt > 0 else 100.0)
+        points, _ = dp.back_project(pixels, drone, plane)
+        found = dp.adjust(drone, [dp.Seen(points, pixels + torch.randn(200, 4, 2, dtype=D, generator=random))])
+        spread, truth = found.mounting_deviations, drone.mounting()
+        assert within(found.mounting.heading, truth.heading, spread.heading) >= 0.93
+        assert within(found.mounting.roll, truth.roll, spread.roll) >= 0.93
+        both = torch.tensor([0.0, 1, -1 if tilt > 0 else 1, 0, 0, 0], dtype=D)  # what the two make together
+        sum_of_both = (both @ found.mounting_covariance @ both).sqrt()
+        total = found.mounting.roll + both[2] * found.mounting.heading
+        assert float(sum_of_both.amax()) < 1
+        assert within(total, truth.roll + both[2] * truth.heading, sum_of_both) >= 0.9
+
+
 def test_turns_are_known_of_a_camera_that_looks_straight_down() -> None:
     drone = dp.Camera.mounted(60.0, 90.0, focal=2000.0, size=(4000, 3000))
     with pytest.raises(ValueError, match="priors: want turn_x, turn_y and turn_z"):
@@ -451,6 +469,16 @@ def test_turns_are_known_of_a_camera_that_looks_straight_down() -> None:
         (lambda: dp.VanishingPoints(["up"], pixels=[[1.0, 2.0]]), "directions: want 'x', 'y', 'z' or vectors"),
         (lambda: dp.VanishingPoints(["x"]), "pixels: want pixels or segments, got neither"),
         (lambda: dp.VanishingPoints("x", pixels=[[1.0, 2.0]]), "directions: want one for each line"),
+        (lambda: dp.Seen(LANDMARKS[:2], seen()[:2], [1.0, -2.0]), "more than 0 and finite, got -2 at 1"),
+        (
+            lambda: dp.Lengths([[1.0, 2], [3, 4]], [[1.0, 1], [3, 4]], 1.0, 0.1),
+            "ends: want other pixels .* at 1; leave",
+        ),
+        (lambda: dp.Heights([[1.0, 2.0]], [[1.0, 2.0]], 1.0, 0.1), "tops: want other pixels than the feet"),
+        (
+            lambda: dp.VanishingPoints(["x"], segments=[[[1.0, 2], [1, 2]]]),
+            "segments: want other pixels than the first",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_sentence(call: Any, text: str) -> None:

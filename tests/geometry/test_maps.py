@@ -100,6 +100,32 @@ def test_degrees_that_are_none_are_refused_by_name() -> None:
         dp.metres_from_degrees([[89.0, 0.0]])
 
 
+def test_points_on_both_sides_of_the_date_line_are_neighbours() -> None:
+    pytest.importorskip("pyproj")
+    for degrees in ([[-18.0, 179.999], [-18.0, -179.999]], [[-18.0, -179.999], [-18.0, 179.999], [-18.0, 180.0]]):
+        points, crs = dp.metres_from_degrees(degrees)
+        assert crs in ("EPSG:32701", "EPSG:32760")
+        # A degree of the parallel is 105.9 km there, and UTM stretches it by 1.0010 at a zone's edge.
+        assert float((points[1] - points[0])[:2].norm()) == pytest.approx(0.002 * 105_905 * 1.001, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "crs"),
+    [
+        ([[45.0, 3.0]], "EPSG:3857"),  # Web Mercator: 1.41 of a metre
+        ([[40.0, -75.0]], "EPSG:32633"),  # a zone of another continent
+        ([[5.0, 5.0], [5.0, 60.0]], None),
+        ([[40.0, 3.0]], "EPSG:4326"),  # degrees
+    ],
+)
+def test_a_map_whose_metres_are_none_is_refused(degrees: list[list[float]], crs: str | None) -> None:
+    pytest.importorskip("pyproj")
+    with pytest.raises(ValueError, match="crs: want a map (in|whose) metres.*, got .EPSG"):
+        dp.metres_from_degrees(degrees, crs)
+    for system in ("EPSG:2154", "EPSG:3035"):  # national and European grids
+        dp.metres_from_degrees([[45.0, 3.0]], system)
+
+
 @pytest.mark.plain
 def test_without_pyproj_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyproj", None)

@@ -1,0 +1,44 @@
+"""Poses found with a known noise: where residuals contradict it, whatever is measured from them says so."""
+
+import torch
+
+import diffproj as dp
+
+D = torch.float64
+CAMERA = dp.Camera.mounted(8.0, 20.0, 5.0, 30.0, focal=(1000.0, 1100.0), size=(1280, 960), position=[3.0, 4.0])
+PIXELS = torch.tensor([[200.0, 500], [1100, 450], [600, 800], [640, 900], [900, 700], [300, 850]], dtype=D)
+POINTS = dp.back_project(PIXELS, CAMERA, dp.Plane.z(0.0))[0]
+NOISE = 0.5 * torch.randn(6, 2, generator=torch.Generator().manual_seed(1), dtype=D)
+WRONG = torch.zeros(6, 2, dtype=D).index_fill(0, torch.tensor([2]), 25.0)
+WORDS = "times what pixel_sigma says"
+
+
+def located(pixels: torch.Tensor, pixel_sigma: float | None) -> dp.Calibration:
+    views = dp.Views(pixels.unsqueeze(-3), size=(1280, 960))
+    return dp.locate(views, dp.Landmarks(POINTS), CAMERA, pixel_sigma=pixel_sigma)
+
+
+def test_a_wrong_landmark_is_a_doubt_of_pose_and_measurement() -> None:
+    found = located(PIXELS + NOISE + WRONG, 1.0)
+    assert WORDS in found.doubts
+    assert WORDS in found.verdict
+    assert found.message.count(WORDS) == 1
+    assert found.summary().count(WORDS) == 2  # as a doubt, and in the verdict
+    measured = dp.measure([[600.0, 800.0]], found, dp.Plane.z(0.0), view=0, pixel_sigma=1.0)
+    assert WORDS in measured.doubts
+    assert WORDS in measured.summary()
+
+
+def test_nothing_is_said_of_noise_that_is_as_known_or_is_estimated() -> None:
+    for pixels, pixel_sigma in ((PIXELS + NOISE, 1.0), (PIXELS, 1.0), (PIXELS + NOISE + WRONG, None)):
+        found = located(pixels, pixel_sigma)
+        assert not found.doubts
+        assert not dp.measure([[600.0, 800.0]], found, dp.Plane.z(0.0), view=0, pixel_sigma=1.0).doubts
+        assert "nothing speaks against" in found.verdict
+
+
+def test_of_many_cameras_those_are_named() -> None:
+    found = located(torch.stack([PIXELS + NOISE, PIXELS + NOISE + WRONG, PIXELS]), 1.0)
+    assert "cameras 1 are larger than pixel_sigma says" in found.doubts
+    measured = dp.measure([[600.0, 800.0]], found, dp.Plane.z(0.0), view=0, pixel_sigma=1.0)
+    assert measured.doubts == found.doubts
