@@ -66,7 +66,7 @@ def test_bad_input_is_refused_by_name() -> None:
         dp.cross_validate(batch, BOARD)
     with pytest.raises(ValueError, match="views: want those of one camera"):
         dp.bootstrap(batch, BOARD)
-    with pytest.raises(ValueError, match="draws: want a whole number of at least 2, got 1"):
+    with pytest.raises(ValueError, match="draws: want a whole number of at least 2.* got 1"):
         dp.bootstrap(views, BOARD, draws=1)
     with pytest.raises(ValueError, match="views: want some that show the board differently, got one"):
         dp.bootstrap(views[:1], BOARD, draws=4)
@@ -97,7 +97,7 @@ def test_wrong_numbers_and_lenses_are_named() -> None:
     views, board = dp.example_views("left"), dp.Chessboard()
     with pytest.raises(TypeError, match="folds: want a whole number from 2 to"):
         dp.cross_validate(views, board, folds=2.5)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match=r"draws: want a whole number of at least 2, got 2\.5"):
+    with pytest.raises(TypeError, match=r"draws: want a whole number of at least 2.* got 2\.5"):
         dp.bootstrap(views, board, draws=2.5)  # type: ignore[arg-type]
     for function in (dp.cross_validate, dp.bootstrap):
         with pytest.raises(ValueError, match="distortion: want the name of a lens, got 'auto'; calibrate with it"):

@@ -58,7 +58,7 @@ WRONG: list[Case] = [
     (TypeError, "distortion: want a lens .* got the class BrownConrady", lambda _: dp.Camera(CAMERA.K, distortion=dp.BrownConrady)),
     (TypeError, "pinhole: want kornia's PinholeCamera, got Camera", lambda _: dp.Camera.from_kornia(CAMERA)),
     # Options.
-    (TypeError, "draws: want a whole number of at least 2, got 2.5", lambda _: dp.bootstrap(VIEWS, BOARD, draws=2.5)),
+    (TypeError, "draws: want a whole number of at least 2.* got 2.5", lambda _: dp.bootstrap(VIEWS, BOARD, draws=2.5)),
     (TypeError, "bow: want True or False, got 'x'", lambda _: dp.calibrate(VIEWS, BOARD, bow="x")),
     (TypeError, "throw: want True or False, got 'x'", lambda _: dp.locate(VIEWS, BOARD, CAMERA, throw="x")),
     (TypeError, "progress: want a function .* got 3", lambda _: dp.calibrate(VIEWS, BOARD, progress=3)),
