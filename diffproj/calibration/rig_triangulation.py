@@ -166,7 +166,7 @@ def _checked(rig: Rig, pixels_by_camera: Any, pixel_sigma: Any) -> tuple[dict[st
             if known is None or not bool(known > 0):
                 raise ValueError(f"pixel_sigma: want a standard deviation in px, for that of {name!r} is not known")
             given = float(known)
-        sigma[name] = number("pixel_sigma", given, "a positive number of px, or one by camera", above=0)
+        sigma[name] = number("pixel_sigma", given, "a positive number of px, or one by camera", above=0, most=1e100)
     return pixels, sigma
 
 

@@ -147,7 +147,7 @@ def _listed(name: str, given: Any, count: int) -> list[str]:
     if wrong is not None:
         raise TypeError(f"moments[{name!r}]: want names or whole numbers, got {called(wrong)}")
     if len(given) != count:
-        raise ValueError(f"moments[{name!r}]: want {count}, one for each view, got {len(given)}")
+        raise ValueError(f"moments[{name!r}]: want {count}, one for each of its views_by_camera, got {len(given)}")
     return [str(item) for item in given]
 
 

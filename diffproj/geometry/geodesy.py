@@ -89,6 +89,8 @@ def _checked(name: str, value: Tensor | Array) -> Tensor:
     found = check_tensor(name, value, "N", "2 or 3")
     if found.is_meta:
         raise ValueError(f"{name}: want values, got a tensor on the device meta")
+    if found.numel() == 0:
+        raise ValueError(f"{name}: want at least one point, got shape {tuple(found.shape)}")
     if found.shape[-1] not in (2, 3):
         raise ValueError(f"{name}: want shape (*B, N, 2) or (*B, N, 3), got {tuple(found.shape)}")
     if found.dtype != torch.float64:
