@@ -151,7 +151,7 @@ def _check_lengths(pyproj: Any, name: str, system: Any, latitude: Tensor, longit
             raise ValueError(
                 f"crs: want a map whose metres are those on the ground, got {name!r} ({system.name}), where a metre on "
                 f"the ground is {1 + float(worst):.4g} at the points; leave crs out for the UTM zone of their middle, "
-                "look whether latitude and longitude of the degrees are exchanged, or take points that lie closer together"
+                "look whether the degrees are exchanged, or take points that lie closer together"
             )
 
 

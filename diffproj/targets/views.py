@@ -212,7 +212,7 @@ def _check_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:
     if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
         raise TypeError(f"names: want {count} strings, got {called(names)}")
     if len(names) != count:
-        raise ValueError(f"names: want {count}, one for each view, got {len(names)}")
+        raise ValueError(f"names: want {count}, one for each view of pixels, got {len(names)}")
     return tuple(names)
 
 
@@ -245,7 +245,9 @@ def _positions(index: Any, count: int) -> list[int]:
         return []
     if array.dtype == np.bool_:
         if array.shape != (count,):
-            raise IndexError(f"index: want a mask of {count} booleans, one for each view, got shape {array.shape}")
+            raise IndexError(
+                f"index: want a mask of {count} booleans, one for each view of pixels, got shape {array.shape}"
+            )
         return np.flatnonzero(array).tolist()
     if not np.issubdtype(array.dtype, np.integer) or array.ndim > 1:
         raise IndexError(f"index: want a number, a slice, a list of numbers or a mask, got {called(index)}")

@@ -269,7 +269,7 @@ PIXELS = torch.ones(2, 3, 2)
         ({"visible": torch.ones(3, 3, dtype=torch.bool)}, ValueError, r"visible: want shape \(\*B, 2, 3\)"),
         ({"visible": torch.ones(3, dtype=torch.bool)}, ValueError, "visible: want shape"),
         ({"visible": torch.ones(2, 3, dtype=torch.bool, device="meta")}, ValueError, "visible: want device cpu"),
-        ({"names": ["left"]}, ValueError, "names: want 2, one for each view, got 1"),
+        ({"names": ["left"]}, ValueError, "names: want 2, one for each view of pixels, got 1"),
         ({"names": "ab"}, TypeError, "names: want 2 strings, got 'ab'"),
         ({"names": [1, 2]}, TypeError, "names"),
         ({"names": 2}, TypeError, "names"),
