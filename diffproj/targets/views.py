@@ -245,9 +245,7 @@ def _positions(index: Any, count: int) -> list[int]:
         return []
     if array.dtype == np.bool_:
         if array.shape != (count,):
-            raise IndexError(
-                f"index: want a mask of {count} booleans, one for each view of pixels, got shape {array.shape}"
-            )
+            raise IndexError(f"index: want a mask of {count} booleans, one for each view, got shape {array.shape}")
         return np.flatnonzero(array).tolist()
     if not np.issubdtype(array.dtype, np.integer) or array.ndim > 1:
         raise IndexError(f"index: want a number, a slice, a list of numbers or a mask, got {called(index)}")
