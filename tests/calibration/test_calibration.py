@@ -681,7 +681,7 @@ def test_bow_is_unbiased_and_its_deviation_is_true() -> None:
 def test_bundled_boards_are_bowed() -> None:
     for side in ("left", "right"):
         flat, bowed = (dp.calibrate(dp.example_views(side), BOARD, shape=shape) for shape in ("flat", "bow"))
-        assert 0.03 < 1 - bowed.rms / flat.rms < 0.1  # measured: .060 and .081
+        assert 0.03 < 1 - bowed.rms / flat.rms < 0.1  # measured: .065 and .081
         assert bowed.bow[1].item() == pytest.approx(-0.17, abs=0.03)
 
 
