@@ -6,7 +6,10 @@ estimate and its covariance are
     y = C sum_c C_c^-1 y_c        C^-1 = sum_c C_c^-1
 
 where a camera that did not see a point adds nothing about it, and what it knows of the others still counts. The errors
-of different cameras are taken to be independent, as they are where each was calibrated and located by itself.
+of different cameras are taken to be independent, as they are where each was calibrated and located by itself. Several
+photographs of one calibrated camera share the errors of its intrinsics, in ways that are not known here: each of n
+counts by an nth of its information, which no correlation makes too much (covariance intersection, Julier and Uhlmann
+1997). So does a measurement that is given twice.
 
 Whether the cameras agree is tested: each camera against the estimate of all others, by the chi-square of the difference
 (by F's distribution where deviations were estimated from few residuals). The camera that disagrees most is named, then
@@ -22,6 +25,7 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from diffproj._core.arguments import called
 from diffproj._core.numerics import broadcast_batches
@@ -119,7 +123,8 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
     both = seen.repeat_interleave(2, dim=-1)
     y = torch.where(both, y, 0.0)
     C = torch.stack([_along(one.joint().expand(*batch, 3 * N, 3 * N), T) for one in found], dim=-3)
-    C = without(C, both)
+    sharing = torch.tensor(_sharing(found), dtype=C.dtype, device=C.device)
+    C = without(sharing[:, None, None] * C, both)
     information, sound = inverse(C)
     if not bool(sound.all()):
         who = next(name for name, bad in zip(names, _of_any(~sound), strict=True) if bad)
@@ -216,6 +221,19 @@ def _same(a: Plane, b: Plane) -> bool:
         )
     except RuntimeError:  # of shapes that do not meet
         return False
+
+
+def _sharing(found: Sequence[Measurement]) -> list[int]:
+    """For each measurement how many of them have its errors in common: those of one calibration, and copies."""
+    return [sum(one is other or _one_calibration(one, other) for other in found) for one in found]
+
+
+def _one_calibration(one: Measurement, other: Measurement) -> bool:
+    """Whether the intrinsics' errors of both are those of one calibration: its numbers are nobody else's."""
+    if not (one.includes_intrinsics and other.includes_intrinsics):
+        return False
+    a, b = ((camera.K, *tree_leaves(camera.distortion)) for camera in (one._sight.camera, other._sight.camera))
+    return len(a) == len(b) and all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
 def _seen(one: Measurement) -> Tensor:

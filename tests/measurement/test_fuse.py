@@ -189,3 +189,15 @@ def test_wrong_types_are_named() -> None:
     for wrong in (None, 3, "measurements", [1, 2], {"a": 1, "b": 2}):
         with pytest.raises(TypeError, match="measurements: want what dp.measure gives for each camera"):
             dp.fuse(wrong)
+
+
+def test_photographs_of_one_calibration_share_its_errors() -> None:
+    """Twice the same tells no more than once; two photographs of one camera tell at most as if they were independent."""
+    calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+    pixels = calibration.views.pixels[:2, ::9]
+    one, other = (dp.measure(pixels[v], calibration, GROUND, view=v, pixel_sigma="detector") for v in (0, 1))
+    twice = dp.fuse([one, one])
+    torch.testing.assert_close(twice.covariance, one.covariance, rtol=1e-6, atol=1e-12)
+    both = dp.fuse([one, other])
+    least = torch.minimum(one.deviations, other.deviations)[:, :2]
+    assert bool((both.deviations[:, :2] > 0.9 * least).all())
