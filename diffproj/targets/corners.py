@@ -203,13 +203,15 @@ def _trusted(
     use &= ((grid >= 1) & (grid <= np.array(image.shape[::-1]) - 2)).all(axis=-1)
     if use.sum() < FEWEST:
         return use
+    # Noise alone misfits a fainter corner by more of its own contrast: that is not to look worse.
+    worse = misfit * np.minimum(contrast, 1.0) >= WORSE * usual + 0.01
     spacing = spacing_of(np.where(np.isfinite(grid), grid, 0.0))
     weight, off, limit = use.astype(float), np.zeros(use.shape), np.ones(use.shape)
     for _ in range(4):
         surface = predicted(grid, weight)
         off = np.linalg.norm(np.where(use[..., None], grid - surface.grid, 0.0), axis=-1) / surface.spread
         scale = DEVIATIONS * float(np.median(off[use]))
-        limit = np.maximum(scale, np.where(misfit < WORSE * usual + 0.01, LOOSE, TIGHT) * spacing + LEAST)
+        limit = np.maximum(scale, np.where(worse, TIGHT, LOOSE) * spacing + LEAST)
         if (off[use] < 0.5 * limit[use]).all():
             break
         weight = use / (1 + (off / (0.5 * limit)) ** 4)
