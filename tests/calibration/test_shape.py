@@ -180,7 +180,8 @@ def test_errors_of_camera_and_points_are_what_their_covariance_says(case: str) -
     ratio = (error[:, few:].abs() / deviation)[:, free]
     assert 0.65 < float((ratio < 1).to(D).mean()) < 0.74
     assert 0.93 < float((ratio < 1.96).to(D).mean()) < 0.97
-    assert float(found.pixel_sigma.mean()) == pytest.approx(0.1 if case != "Huber" else 0.087, rel=0.02)
+    # A median takes no parameters off: 0.1 sqrt(1 - 224 / 1080), of 9 + 162 - 7 + 60 parameters.
+    assert float(found.pixel_sigma.mean()) == pytest.approx(0.1 if case != "Huber" else 0.089, rel=0.02)
     assert float(found.covariance.dispersion.mean()) < 1.3
 
 
@@ -407,9 +408,12 @@ def test_outliers_are_found_against_the_shape() -> None:
     views = dp.example_views("left")
     pixels = views.pixels.clone()
     pixels[3, 7] += torch.tensor([0.9, -0.9], dtype=D)  # within 5 deviations of the flat board's residuals
-    found = dp.calibrate(dp.Views(pixels, size=views.size), BOARD, shape="free", reject_outliers=True)
-    assert bool(found.rejected[3, 7])
-    assert int(found.rejected.sum()) < 12
+    options: dict[str, Any] = {"shape": "free", "reject_outliers": True}
+    usual = dp.calibrate(views, BOARD, **options).rejected  # 23 of 702, measured: few residuals, with a long tail
+    found = dp.calibrate(dp.Views(pixels, size=views.size), BOARD, **options).rejected
+    assert bool(found[3, 7])
+    assert not bool(usual[3, 7])
+    assert int((found ^ usual).sum()) <= 3
 
 
 def test_what_cannot_be_is_refused() -> None:
