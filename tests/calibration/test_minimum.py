@@ -305,12 +305,12 @@ def test_locate_along_rays_far_off_the_axis(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-8, 1.0, 1e8])
-@pytest.mark.parametrize("objective", ["image", "plane"])
-def test_the_verdict_does_not_depend_on_the_unit_of_weights(unit: float, objective: str) -> None:
+@pytest.mark.parametrize(("objective", "rms"), [("image", 0.1583), ("plane", 0.1601)])
+def test_the_verdict_does_not_depend_on_the_unit_of_weights(unit: float, objective: str, rms: float) -> None:
     views = dp.example_views("left")
     weights = torch.tensor(unit, dtype=D)
     good = dp.calibrate(views, BOARD, weights=weights, objective=objective)  # type: ignore[arg-type]
-    assert good.rms == pytest.approx(0.1766, abs=2e-3)
+    assert good.rms == pytest.approx(rms, abs=2e-4)
     mixed = views.pixels.clone()
     mixed[4] = mixed[4].reshape(6, 9, 2).transpose(0, 1).reshape(54, 2)
     with pytest.raises(dp.CalibrationError, match=r"left05\.jpg do not match the board"):
