@@ -114,7 +114,7 @@ def broadcast_batches(**shapes: Sequence[int]) -> torch.Size:
         ValueError: the shapes do not broadcast.
     """
     first, *others = map(torch.Size, shapes.values())
-    if all(other == first for other in others):  # the usual case, and twenty times as fast
+    if all(len(other) == len(first) and other == first for other in others):  # the usual case, and 20 times as fast
         return first
     try:
         return torch.broadcast_shapes(*shapes.values())
@@ -253,9 +253,11 @@ def in_blocks(
     Returns:
         What `function(points)` returns.
     """
+    if wants_derivative(points, *parameters):  # a graph is not to depend on lengths, which are not even asked for here
+        return function(points)
     batch = max(1, points.shape[:-2].numel())
     length = max(1, block_points(points.device) // batch)
-    if wants_derivative(points, *parameters) or points.shape[-2] <= length:  # a graph is not to depend on the length
+    if points.shape[-2] <= length:
         return function(points)
     axis = points.ndim - 2
     results: list[Any] = []

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import torch
 
 F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
 
 
 def in_functional_transform() -> bool:
@@ -34,3 +35,23 @@ def constant_in_graphs(function: F) -> F:
     """
     function._dynamo_marked_constant = True  # type: ignore[attr-defined]
     return function
+
+
+def traced_beside(tensor: torch.Tensor) -> bool:
+    """Whether `torch.export` traces here, and the tensor is none of its inputs: a constant, whose values are there.
+
+    Only where it traces by running the code (`strict=False`, which is the default): Dynamo shows no values.
+    """
+    return (
+        torch.compiler.is_exporting()
+        and not torch.compiler.is_dynamo_compiling()
+        and not in_functional_transform()
+        and type(tensor) in (torch.Tensor, torch.nn.Parameter)
+        and not tensor.is_meta
+    )
+
+
+def outside_of_tracing(function: Callable[[], T]) -> T:
+    """What a function gives where nothing is traced: its results are constants of the graph."""
+    with torch.utils._python_dispatch._disable_current_modes():
+        return function()

@@ -76,7 +76,7 @@ def tensors_from_kornia(pinhole: PinholeCamera) -> tuple[Tensor, Tensor, Tensor,
         sizes = {(int(w), int(h)) for w, h in zip(pinhole.width, pinhole.height, strict=True)}
         if len(sizes) > 1:
             raise ValueError(f"camera: want one image size for the batch, got {sorted(sizes)}; convert them one by one")
-        size = sizes.pop()
+        size = sizes.pop() if sizes else None
     return at_least_float32(K), at_least_float32(R), at_least_float32(t), size
 
 

@@ -168,9 +168,13 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
     # ------------------------------------------------------------------------------------------------- as a tensor
 
     def to(self, *args: Any, **kwargs: Any) -> "Plane":
-        """The plane in another dtype or on another device, which it then has for itself; see `Batched.to`."""
+        """The plane in another dtype or on another device; see `Batched.to`.
+
+        One made of Python numbers goes on taking on others' dtype unless a dtype is asked for.
+        """
         plane = super().to(*args, **kwargs)
-        return self.unchecked(plane.normal, plane.offset, self.is_per_point)
+        kinds = {torch.empty(0, dtype=kind, device="cpu").to(*args, **kwargs).dtype for kind in _TWO_KINDS}
+        return self.unchecked(plane.normal, plane.offset, self.is_per_point, self.adopts and len(kinds) > 1)
 
     def like(self, tensor: Tensor) -> "Plane":
         """The plane ready to meet `tensor`: one made of Python numbers takes on its dtype and device."""
@@ -282,6 +286,10 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         squared = (distance / size).square().mean(dim=-1)
         some = squared > 0  # the root's slope at 0 is infinite
         return torch.where(some, torch.where(some, squared, 1.0).sqrt(), 0.0) * size.squeeze(-1)
+
+
+_TWO_KINDS = (torch.float32, torch.float64)
+"""Of which one stays what it is where no dtype is asked for."""
 
 
 def as_plane(plane: Plane) -> Plane:

@@ -30,6 +30,8 @@ TOLERANCE = {torch.float32: 1.0, torch.float64: 2.0}
 """Largest residual of a solution, in units of the equations' rounding error."""
 TILT_FACTOR = 0.5
 """Factor of this tolerance for lenses with tilt, which amplifies errors."""
+GRAPH_STEPS = 8
+"""Newton steps in float64 in an exported graph, which holds the same steps for all points."""
 FINAL_TOLERANCE = 4
 """The same for `_solve_remaining`, whose rounding error includes that of storing the solution."""
 
@@ -74,7 +76,8 @@ def search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, Te
     target = x, y
     rho_squared = torch.addcmul(x * x, y, y)
     ratio = InverseTable(plan.rho_max, plan.ratio).ratio_at(x, y, rho_squared.sqrt())
-    x, y = newton(terms, target, x * ratio, y * ratio, steps=NEWTON_STEPS[x.dtype])
+    start_x, start_y = x * ratio, y * ratio
+    x, y = newton(terms, target, start_x, start_y, steps=NEWTON_STEPS[x.dtype])
     limit = (plan.reach * plan.reach).clamp_max(torch.finfo(x.dtype).max).unsqueeze(-1)
     possible = rho_squared <= limit if possible is None else possible & (rho_squared <= limit)
     domain_squared = squared_domain(plan.domain)
@@ -84,8 +87,12 @@ def search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, Te
     solved = _solves(terms, target, x, y, domain_squared, tolerance_squared) & possible
     batch = points.shape[:-2]
     lens = coefficients.expand(*batch, -1), plan.domain.expand(batch), plan.noise.expand(batch)
+    left = possible & ~solved
+    if torch.compiler.is_exporting():
+        x_again, y_again, found = _solved_in_graph(*lens, points, start_x, start_y)
+        return torch.where(solved, x, x_again), torch.where(solved, y, y_again), solved | (found & left)
     again = _solve_remaining if has_values(points, coefficients) else _solve_remaining_op
-    x, y, found = again(*lens, points, x, y, possible & ~solved)
+    x, y, found = again(*lens, points, x, y, left)
     return x, y, solved | found
 
 
@@ -132,6 +139,23 @@ def _solve_remaining(
     return x.index_put(index, found_x), y.index_put(index, found_y), left.index_put(index, solved)
 
 
+def _solved_in_graph(
+    coefficients: Tensor, domain: Tensor, noise: Tensor, points: Tensor, x: Tensor, y: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Solve all points `(*B, N)` by `GRAPH_STEPS` steps in float64: plain operations that any runtime has.
+
+    For some points within a hundredth of the radius of a fold they are too few, and these are not valid.
+    """
+    terms = Terms.of(in_float64(coefficients))
+    target, radius = untilted(terms, in_float64(points)), in_float64(domain).unsqueeze(-1)
+    kind, x, y = x.dtype, in_float64(x), in_float64(y)
+    for _ in range(GRAPH_STEPS):
+        inwards = (radius * (1 - EDGE_MARGIN) / torch.hypot(x, y)).clamp_max(1).nan_to_num(1.0)
+        x, y = ((part * inwards).nan_to_num(0.0, 0.0, 0.0) for part in (x, y))
+        x, y = newton(terms, target, x, y, steps=1)
+    return _rounded_and_checked(terms, target, domain, noise, kind, x, y)
+
+
 def _solved_by_newton(
     coefficients: Tensor, domain: Tensor, noise: Tensor, points: Tensor, x: Tensor, y: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -140,7 +164,7 @@ def _solved_by_newton(
     target = untilted(terms, in_float64(points).unsqueeze(-2))
     start = in_float64(x).unsqueeze(-1), in_float64(y).unsqueeze(-1)
     found = newton(terms, target, *start, steps=2)
-    x_found, y_found, solved = _rounded_and_checked(terms, target, domain, noise, x.dtype, *found)
+    x_found, y_found, solved = _one_by_one(_rounded_and_checked(terms, target, domain, noise, x.dtype, *found))
     if found[0].dtype != x.dtype:  # before rounding, the error must be below it
         off_x, off_y, _ = bend_off(terms, target, *found)
         limit = torch.finfo(x.dtype).eps / 2 * torch.hypot(*target)
@@ -159,13 +183,19 @@ def _solved_globally(
     start_x, start_y = (in_float64(part).unsqueeze(-1).nan_to_num(0.0, 0.0, 0.0) for part in (x, y))
     radius = in_float64(domain).unsqueeze(-1)
     found = _global_newton(terms, (goal_x, goal_y), start_x, start_y, radius, enough)
-    return _rounded_and_checked(terms, target, domain, noise, x.dtype, *found)
+    return _one_by_one(_rounded_and_checked(terms, target, domain, noise, x.dtype, *found))
+
+
+def _one_by_one(columns: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """`(n, 1)` as `(n,)`."""
+    x, y, solved = (column.squeeze(-1) for column in columns)
+    return x, y, solved
 
 
 def _rounded_and_checked(
     terms: Terms, target: Pair, domain: Tensor, noise: Tensor, kind: torch.dtype, x: Tensor, y: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Points `(n, 1)` rounded to dtype `kind`, as `(n,)`, and whether they are solutions inside the domain."""
+    """Points `(*B, N)` rounded to dtype `kind`, and whether they are solutions inside the domain."""
     x_rounded, y_rounded = x.to(kind), y.to(kind)
     x, y = in_float64(x_rounded), in_float64(y_rounded)
     off_x, off_y, slope = bend_off(terms, target, x, y)
@@ -175,7 +205,7 @@ def _rounded_and_checked(
     rounding = torch.finfo(kind).eps * (growth * torch.hypot(*target) + steepest * distance)
     radius = in_float64(domain).unsqueeze(-1)
     solved = (torch.hypot(off_x, off_y) <= FINAL_TOLERANCE * rounding) & (distance <= radius) & (radius > 0)
-    return x_rounded.squeeze(-1), y_rounded.squeeze(-1), solved.squeeze(-1)
+    return x_rounded, y_rounded, solved
 
 
 @torch.library.custom_op("diffproj::solve_remaining_brown_conrady", mutates_args=())

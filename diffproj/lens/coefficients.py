@@ -11,10 +11,14 @@ from torch import Tensor
 from diffproj._core.arguments import Array
 from diffproj._core.batched import Batched, Rearrange
 from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, has_values
+from diffproj._core.torch_private import outside_of_tracing, traced_beside
 from diffproj.lens.plan import AXES, Plan, Recipe, domain_of, plan_of, register_recipe
 from diffproj.lens.protocol import distorted, undistorted
 
 L = TypeVar("L", bound="CoefficientLens")
+
+MOST_STEPS = 16
+"""Rearrangements in a row through which a plan is followed back to where it was worked out."""
 
 
 class CoefficientLens(Batched, ABC):
@@ -40,7 +44,9 @@ class CoefficientLens(Batched, ABC):
         self.coefficients = coefficients
         # The version of the coefficients, their domain and perhaps their plan: replaced as a whole, for threads.
         self._known: tuple[int, Tensor, Plan | None] | None = None
-        self._origin: tuple[CoefficientLens, Callable[[Tensor, int], Tensor]] | None = None
+        # Of a rearranged lens: whose coefficients these are, their version at the time, and what was done to them.
+        self._origin: tuple[CoefficientLens, int, tuple[Rearrange, ...]] | None = None
+        self._given: Plan | None = None
 
     @classmethod
     def unchecked(cls: type[L], coefficients: Any) -> L:
@@ -49,8 +55,22 @@ class CoefficientLens(Batched, ABC):
         lens._assign(coefficients)
         return lens
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self).unchecked, (self.coefficients,)
+    @classmethod
+    def planned(cls: type[L], coefficients: Any, plan: Plan) -> L:
+        """A lens of these coefficients with a plan that was worked out for them before; both without a look."""
+        lens = cls.unchecked(coefficients)
+        lens._given = plan
+        return lens
+
+    def plan(self) -> Plan:
+        """All that was worked out for the coefficients; see `Plan`."""
+        return self._plan()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"coefficients": self.coefficients}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._assign(state["coefficients"])
 
     def _facts(self) -> list[str]:
         return [f"coefficients {tuple(self.coefficients.shape)}", str(self.dtype), str(self.device)]
@@ -62,7 +82,19 @@ class CoefficientLens(Batched, ABC):
     def _rearranged(self: L, rearrange: Rearrange, part: Callable[[Any], Any]) -> L:  # noqa: ARG002
         """The same coefficients in another arrangement: the plan is this lens's, rearranged the same way."""
         lens = self.unchecked(rearrange(self.coefficients, 1))
-        lens._origin = self, rearrange
+        if self._given is not None:
+            lens._given = _rearranged_plan(self._given, (rearrange,))
+        else:
+            root, version, steps = self._origin or (self, _version(self.coefficients), ())
+            if len(steps) < MOST_STEPS:  # further on it works its plan out anew
+                lens._origin = root, version, (*steps, rearrange)
+        return lens
+
+    def detach(self: L) -> L:
+        """The same cut off from the graph, with all that is known of it."""
+        lens = self.unchecked(self.coefficients.detach())
+        lens._known, lens._given = self._known, self._given
+        lens._origin = self._origin or (self, _version(self.coefficients), ())
         return lens
 
     # ----------------------------------------------------------------------------------------------------- the plan
@@ -118,20 +150,33 @@ class CoefficientLens(Batched, ABC):
 
     def _domain(self) -> Tensor:
         """The domain, all that the way forward needs; remembered for as long as nobody writes to the coefficients."""
+        if self._given is not None:
+            return self._given.domain
         if not has_values(self.coefficients):
+            if traced_beside(self.coefficients):
+                return outside_of_tracing(lambda: self._plan_of_values().domain)
             return domain_of(self._key, self.coefficients)
-        if self._origin is not None:
-            origin, rearrange = self._origin
-            return rearrange(origin._domain(), 0)
+        origin = self._root()
+        if origin is not None:
+            root, steps = origin
+            return _rearranged_part(root._remembered()[1], steps, 0)
         return self._remembered()[1]
 
     def _plan(self) -> Plan:
         """The whole plan, which the way back needs, remembered likewise."""
+        if self._given is not None:
+            return self._given
         if not has_values(self.coefficients):
+            if traced_beside(self.coefficients):
+                return outside_of_tracing(self._plan_of_values)
             return plan_of(self._key, self.coefficients, self._domain())
-        if self._origin is not None:
-            origin, rearrange = self._origin
-            return Plan(*(rearrange(part, axes) for part, axes in zip(origin._plan(), AXES, strict=True)))
+        return self._plan_of_values()
+
+    def _plan_of_values(self) -> Plan:
+        origin = self._root()
+        if origin is not None:
+            root, steps = origin
+            return _rearranged_plan(root._plan_of_values(), steps)
         version, domain, plan = self._remembered()
         if plan is None:
             with torch.inference_mode(False), torch.no_grad():
@@ -139,8 +184,15 @@ class CoefficientLens(Batched, ABC):
             self._known = version, domain, plan
         return plan
 
+    def _root(self) -> "tuple[CoefficientLens, tuple[Rearrange, ...]] | None":
+        """Whose coefficients these are and how they were rearranged, if nobody has written to them since."""
+        if self._origin is None:
+            return None
+        root, version, steps = self._origin
+        return (root, steps) if _version(root.coefficients) == version else None
+
     def _remembered(self) -> tuple[int, Tensor, Plan | None]:
-        version = 0 if self.coefficients.is_inference() else self.coefficients._version
+        version = _version(self.coefficients)
         known = self._known
         if known is None or known[0] != version:
             with torch.inference_mode(False), torch.no_grad():
@@ -157,3 +209,19 @@ class CoefficientLens(Batched, ABC):
         check_same_kind(coefficients=self.coefficients, **{name: points})
         batch = broadcast_batches(lens=self.batch_shape, **{name: points.shape[:-2]})
         return points.expand(*batch, *points.shape[-2:])
+
+
+def _version(tensor: Tensor) -> int:
+    """How often a tensor was written to, as far as PyTorch counts; 0 where its values cannot be read."""
+    readable = has_values(tensor) or traced_beside(tensor)
+    return tensor._version if readable and not tensor.is_inference() else 0
+
+
+def _rearranged_part(part: Tensor, steps: tuple[Rearrange, ...], axes: int) -> Tensor:
+    for rearrange in steps:
+        part = rearrange(part, axes)
+    return part
+
+
+def _rearranged_plan(plan: Plan, steps: tuple[Rearrange, ...]) -> Plan:
+    return Plan(*(_rearranged_part(part, steps, axes) for part, axes in zip(plan, AXES, strict=True)))

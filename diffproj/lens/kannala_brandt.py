@@ -35,6 +35,8 @@ NEWTON_STEPS = 4
 """Newton steps from the table's estimate to full precision, except for points next to a fold."""
 MAX_STEPS = 60
 """Maximum number of steps for those."""
+GRAPH_STEPS = 12
+"""Steps in float64 in an exported graph, which holds the same steps for all points."""
 GRID_ANGLES = 512
 """Angles of the coarse grid on which the end of the domain is searched."""
 TOLERANCE = 16
@@ -247,8 +249,12 @@ def _search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, T
     settled = _settled(k, plan.noise.unsqueeze(-1), rho_squared, sigma)
     batch = points.shape[:-2]
     lens = coefficients.expand(*batch, -1), plan.domain.expand(batch), plan.noise.expand(batch)
-    again = _solve_remaining if has_values(points, coefficients) else _solve_remaining_op
-    sigma, found = again(*lens, rho, sigma, possible & ~settled)
+    left = possible & ~settled
+    if torch.compiler.is_exporting():
+        sigma, found = _solved_in_graph(*lens, rho, sigma, left)
+    else:
+        again = _solve_remaining if has_values(points, coefficients) else _solve_remaining_op
+        sigma, found = again(*lens, rho, sigma, left)
     valid = possible & (settled | found) & (sigma * rho <= plan.domain.unsqueeze(-1))
     return torch.where(valid, sigma, 1), valid
 
@@ -289,6 +295,20 @@ def _solve_remaining(
     solution = _bracketed(columns, radius * radius, in_float64(sigma[index]).minimum(highest), highest, MAX_STEPS)
     sigma = sigma.index_put(index, solution.to(sigma.dtype).minimum(highest.to(sigma.dtype)))
     return sigma, left.index_put(index, _settled(columns, noise[index[:-1]], radius * radius, solution))
+
+
+def _solved_in_graph(
+    coefficients: Tensor, domain: Tensor, noise: Tensor, rho: Tensor, sigma: Tensor, left: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The same by `GRAPH_STEPS` steps for every point: plain operations that any runtime has."""
+    columns = list(in_float64(coefficients).unsqueeze(-2).unbind(-1))
+    radius = in_float64(rho)
+    highest = _highest(in_float64(domain).unsqueeze(-1), radius)
+    start = in_float64(sigma).nan_to_num(1.0).minimum(highest)
+    solution = _bracketed(columns, radius * radius, start, highest, GRAPH_STEPS)
+    solved = left & _settled(columns, in_float64(noise).unsqueeze(-1), radius * radius, solution)
+    rounded = solution.to(sigma.dtype).minimum(highest.to(sigma.dtype))
+    return torch.where(solved, rounded, sigma), solved
 
 
 @torch.library.custom_op("diffproj::solve_remaining_kannala_brandt", mutates_args=())

@@ -12,6 +12,7 @@ from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.models import coefficients_of, model_of
+from diffproj.lens.plan import Plan
 from diffproj.nn.partial import GeometryModule, add_kind
 from diffproj.nn.plane import check_one_plane
 
@@ -19,10 +20,10 @@ from diffproj.nn.plane import check_one_plane
 class FixedMap(GeometryModule):
     """The `PlaneMap` of a camera and a plane, built once; calling it gives the map.
 
-    Everything that the map depends on is a buffer: its matrix, and the tensors of camera and plane, all of which are in
-    the `state_dict`. So whatever swaps or writes a module's state, such as `functional_call`, `stack_module_state` or
-    DistributedDataParallel, swaps or writes the whole map. The matrix is built again, in full precision, where the
-    dtype or device changes (`.to`), and behind `load_state_dict`.
+    Everything that the map depends on is a buffer: its matrix, the tensors of camera and plane, and what was worked out
+    for the lens, all of which are in the `state_dict`. So whatever swaps or writes a module's state, such as `functional_call`, `stack_module_state` or
+    DistributedDataParallel, swaps or writes the whole map. Matrix and plan are built again, in full precision, where
+    the dtype or device changes (`.to`), and behind `load_state_dict`.
 
     Args:
         camera: of batch shape `*B`. Its tensors are copied, without gradients.
@@ -38,6 +39,9 @@ class FixedMap(GeometryModule):
         >>> points, valid = fixed()(torch.tensor([[370.0, 240.0]]))
         >>> points.tolist(), [name for name, _ in fixed.named_buffers()]
         ([[100.0, 0.0, 0.0]], ['K', 'R', 't', 'coefficients', 'normal', 'offset', 'matrix', 'kind'])
+
+    Behind a lens there are also those of its plan, `domain`, `reach`, `noise`, `rho_max` and `ratio`, so that a compiled
+    or exported map works out nothing about the lens.
     """
 
     K: Tensor
@@ -62,8 +66,11 @@ class FixedMap(GeometryModule):
             for name, tensor in tensors.items():
                 self.register_buffer(name, tensor.detach().clone(memory_format=torch.contiguous_format))
         add_kind(self, camera)
-        # The lens of the current coefficients, kept because it remembers what it works out about itself.
-        self._lens: CoefficientLens | None = None
+        self._planned_for: tuple[_Mark, _Mark] | None = None
+        if self._model.kind is not None:
+            for name in Plan._fields:
+                self.register_buffer(name, None)
+            self._plan_again()
         self.register_load_state_dict_post_hook(_rebuild)
 
     @property
@@ -84,15 +91,33 @@ class FixedMap(GeometryModule):
         return Plane.unchecked(self.normal, self.offset)
 
     def _current_lens(self) -> CoefficientLens | None:
-        """The lens of the coefficients as they are: of the buffer, or of what stands in its place at the moment."""
+        """The lens of the coefficients and the plan as they are: of the buffers, or of what stands in their place.
+
+        Where the coefficients alone were swapped or written to, the plan is no longer theirs, and worked out anew.
+        """
         if self._model.kind is None:
             return None
-        lens, coefficients = self._lens, self.coefficients
-        if torch.compiler.is_compiling() or lens is None or lens.coefficients is not coefficients:
-            lens = self._model.lens(coefficients)
-            if has_values(coefficients):
-                self._lens = lens
-        return lens
+        if not torch.compiler.is_compiling() and self._planned_for is not None:
+            before = self._planned_for
+            now = _mark(self.coefficients), _mark(self.domain)
+            if now[0] != before[0] and now[1] == before[1]:
+                return self._model.lens(self.coefficients)
+        return self._model.kind.planned(self.coefficients, Plan(*(getattr(self, name) for name in Plan._fields)))
+
+    def _plan_again(self) -> None:
+        """Work out the plan of the coefficients."""
+        with torch.inference_mode(False), torch.no_grad():
+            lens = self._model.lens(self.coefficients)
+            if lens is None:
+                return
+            for name, part in lens.plan()._asdict().items():
+                setattr(self, name, part.detach().clone(memory_format=torch.contiguous_format))
+        self._planned_for = _mark(self.coefficients), _mark(self.domain)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        if self._planned_for is not None:  # copied, or read from a file: the tensors are others
+            self._planned_for = _mark(self.coefficients), _mark(self.domain)
 
     def _apply(self, fn, recurse: bool = True):  # type: ignore[override]
         super()._apply(fn, recurse)
@@ -102,7 +127,16 @@ class FixedMap(GeometryModule):
     def rebuild(self) -> None:
         """Build the matrix again from the tensors of camera and plane, in the precision that they have now."""
         with torch.inference_mode(False), torch.no_grad():
+            self._plan_again()
             self.matrix = PlaneMap(self.camera(), self.plane()).matrix
+
+
+_Mark = tuple[int, int]
+
+
+def _mark(tensor: Tensor) -> _Mark:
+    """Which tensor it is, and how often it was written to, as far as that is known."""
+    return id(tensor), tensor._version if has_values(tensor) and not tensor.is_inference() else 0
 
 
 def _rebuild(fixed: FixedMap, _: Any) -> None:
