@@ -8,7 +8,7 @@ from torch import Tensor
 
 from diffproj._core.numerics import has_values, in_float64
 from diffproj.lens.brown_equations import Jacobian, Terms, bend, bend_off, newton_direction, term_growth, tilted
-from diffproj.lens.compiling import coordinates, with_batch_in_front
+from diffproj.lens.compiling import coordinates, length_of, with_batch_in_front
 from diffproj.lens.plan import Plan
 from diffproj.lens.table import InverseTable
 
@@ -150,7 +150,7 @@ def _solved_in_graph(
     target, radius = untilted(terms, in_float64(points)), in_float64(domain).unsqueeze(-1)
     kind, x, y = x.dtype, in_float64(x), in_float64(y)
     for _ in range(GRAPH_STEPS):
-        inwards = (radius * (1 - EDGE_MARGIN) / torch.hypot(x, y)).clamp_max(1).nan_to_num(1.0)
+        inwards = (radius * (1 - EDGE_MARGIN) / length_of(x, y)).clamp_max(1).nan_to_num(1.0)
         x, y = ((part * inwards).nan_to_num(0.0, 0.0, 0.0) for part in (x, y))
         x, y = newton(terms, target, x, y, steps=1)
     return _rounded_and_checked(terms, target, domain, noise, kind, x, y)
@@ -199,12 +199,12 @@ def _rounded_and_checked(
     x_rounded, y_rounded = x.to(kind), y.to(kind)
     x, y = in_float64(x_rounded), in_float64(y_rounded)
     off_x, off_y, slope = bend_off(terms, target, x, y)
-    steepest = torch.hypot(torch.hypot(slope.xx, slope.xy), torch.hypot(slope.yx, slope.yy))
-    distance = torch.hypot(x, y)
+    steepest = length_of(length_of(slope.xx, slope.xy), length_of(slope.yx, slope.yy))
+    distance = length_of(x, y)
     growth = in_float64(noise).unsqueeze(-1).maximum(term_growth(terms, distance * distance))
-    rounding = torch.finfo(kind).eps * (growth * torch.hypot(*target) + steepest * distance)
+    rounding = torch.finfo(kind).eps * (growth * length_of(*target) + steepest * distance)
     radius = in_float64(domain).unsqueeze(-1)
-    solved = (torch.hypot(off_x, off_y) <= FINAL_TOLERANCE * rounding) & (distance <= radius) & (radius > 0)
+    solved = (length_of(off_x, off_y) <= FINAL_TOLERANCE * rounding) & (distance <= radius) & (radius > 0)
     return x_rounded, y_rounded, solved
 
 

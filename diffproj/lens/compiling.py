@@ -40,6 +40,11 @@ def coordinates(points: Tensor) -> tuple[Tensor, Tensor]:
     return x, y
 
 
+def length_of(x: Tensor, y: Tensor) -> Tensor:
+    """`torch.hypot`; in an exported graph of operations that ONNX has, which overflow from 1e19 on in float32."""
+    return torch.addcmul(x * x, y, y).sqrt() if torch.compiler.is_exporting() else torch.hypot(x, y)
+
+
 @torch.library.custom_op("diffproj::deinterleave", mutates_args=())
 def _deinterleaved(points: Tensor) -> Tensor:
     return points.movedim(-1, 0).clone(memory_format=torch.contiguous_format)

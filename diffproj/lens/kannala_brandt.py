@@ -24,7 +24,7 @@ from torch import Tensor
 from diffproj._core.arguments import Array
 from diffproj._core.numerics import has_values, in_blocks, in_float64, least_depth
 from diffproj.lens.coefficients import CoefficientLens
-from diffproj.lens.compiling import coordinates, derivative_wanted, with_batch_in_front
+from diffproj.lens.compiling import coordinates, derivative_wanted, length_of, with_batch_in_front
 from diffproj.lens.domain import first_failure
 from diffproj.lens.plan import Plan
 from diffproj.lens.polynomial import polynomial
@@ -222,7 +222,7 @@ def _largest_component(direction: Tensor) -> Tensor:
 def _within(domain: Tensor, direction: Tensor) -> Tensor:
     """Whether directions lie in the domain and have a unique projection: not 0, nor backwards to within rounding."""
     x, y, z = (direction / _largest_component(direction)).unbind(-1)
-    side = torch.hypot(x, y)
+    side = length_of(x, y)
     within = torch.atan2(side, z) <= domain.unsqueeze(-1)
     eps = torch.finfo(side.dtype).eps
     aside = (side > eps) | (z > eps)
@@ -239,7 +239,7 @@ def _search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, T
     """`sigma` without autograd, 1 where there is no solution in the domain; and whether there is one."""
     k = list(coefficients.unsqueeze(-2).unbind(-1))
     x, y = coordinates(points)
-    rho = torch.hypot(x, y)
+    rho = length_of(x, y)
     possible = (rho <= plan.reach.unsqueeze(-1)) & (plan.domain > 0).unsqueeze(-1)
     rho = torch.where(possible, rho, 0)
     rho_squared = rho * rho

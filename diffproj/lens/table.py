@@ -41,7 +41,10 @@ class InverseTable(NamedTuple):
         along_mean = torch.addcmul(tiny, rho, mean)
         along_ray = torch.addcmul(torch.addcmul(along_mean, x, cosine), y, sine)
         out = rho * rho / along_ray
-        position = torch.fmax(1 - out, torch.zeros_like(mean)).clamp_max_(1).sqrt_().mul_(NODES - 1)  # 0 for NaN
+        if torch.compiler.is_exporting():  # of operations that ONNX has
+            position = torch.where(out < 1, 1 - out, 0.0).clamp_max(1).sqrt() * (NODES - 1)
+        else:
+            position = torch.fmax(1 - out, torch.zeros_like(mean)).clamp_max_(1).sqrt_().mul_(NODES - 1)  # 0 for NaN
         index = position.long()
         ratio = _interpolated(self.ratio, index, position - index)
         return torch.addcmul(ratio, ratio * out, along_mean / along_ray - 1)

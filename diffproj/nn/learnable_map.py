@@ -4,9 +4,10 @@ import math
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from diffproj._core.numerics import has_values
+from diffproj._core.torch_private import in_forward_mode
 from diffproj.geometry.back_projection import PlaneMap
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
@@ -16,6 +17,9 @@ from diffproj.nn.plane import LearnablePlane
 
 class LearnableMap(nn.Module):
     """A `LearnableCamera` and a `LearnablePlane`; calling it builds their `PlaneMap`, which carries gradients.
+
+    Where no parameter asks for a gradient (`requires_grad_(False)`) the map is built once, and again where a value of
+    the module's has changed, in whatever way it was written: on a CPU, for on a GPU looking would take longer.
 
     Args:
         camera: the starting camera, of batch shape `*B`.
@@ -40,6 +44,7 @@ class LearnableMap(nn.Module):
         self, camera: Camera, plane: Plane, learn: dict[str, Any], tied_intrinsics: bool | None = None
     ) -> None:
         super().__init__()
+        self._kept: tuple[list[Tensor], PlaneMap] | None = None
         PlaneMap(camera, plane)  # checks that they fit together
         plane = plane.like(camera.K)
         distance = plane.distance(camera.center.unsqueeze(-2)).abs()
@@ -56,4 +61,32 @@ class LearnableMap(nn.Module):
 
     def forward(self) -> PlaneMap:
         """The map with the current values of the parameters."""
-        return PlaneMap.quietly(self.camera(), self.plane())
+        kept = self.frozen()
+        return PlaneMap.quietly(self.camera(), self.plane()) if kept is None else kept
+
+    def frozen(self) -> PlaneMap | None:
+        """The map if nothing is learned at the moment, kept for as long as no value changes; `None` otherwise."""
+        state = [
+            tensor
+            for module in (self.camera, self.plane)
+            for tensors in (module._parameters, module._buffers)
+            for tensor in tensors.values()
+            if tensor is not None
+        ]
+        if torch.compiler.is_compiling() or in_forward_mode() or any(tensor.requires_grad for tensor in state):
+            return None
+        if self.device.type != "cpu" or not has_values(*state):
+            return None
+        kept = self._kept
+        if kept is None or not all(map(_same, state, kept[0])):
+            with torch.inference_mode(False), torch.no_grad():
+                values = [tensor.detach().clone() for tensor in state]
+                kept = self._kept = values, PlaneMap.quietly(self.camera().detach(), self.plane().detach())
+        return kept[1]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_kept": None}
+
+
+def _same(now: Tensor, before: Tensor) -> bool:
+    return now.dtype == before.dtype and torch.equal(now, before)

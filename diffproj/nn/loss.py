@@ -2,15 +2,29 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from diffproj._core.arguments import Array, booleans
+from diffproj._core.arguments import Array, booleans, number
 from diffproj._core.numerics import check_tensor, has_values
 from diffproj.calibration.losses import Loss, check_loss
+
+
+class CountedLoss(NamedTuple):
+    """A loss, and how many points it was about.
+
+    Attributes:
+        loss: a tensor without axes.
+        invalid: the number of points that were not valid, a tensor without axes.
+        total: the number of all points.
+    """
+
+    loss: Float[Tensor, ""]
+    invalid: Int[Tensor, ""]
+    total: int
 
 
 class PlaneLoss(nn.Module):
@@ -19,23 +33,32 @@ class PlaneLoss(nn.Module):
     The sum over the valid points is divided by the number of all points, valid or not. So when a point becomes invalid,
     its own term goes, and neither the terms nor the gradients of the others change.
 
+    A batch without a valid point would then look like a perfect one. With `pull`, each invalid point adds the angle by
+    which its ray misses the plane (`PlaneProjector.miss`), whose gradient leads back to the plane; `counted` says how
+    many points are not valid.
+
     Args:
         loss: a robust loss such as `dp.Huber(5.0)`, its scale in world units (in pixels with `resolution`); squared
             distances if left out.
+        pull: what an invalid point adds for each radian by which its ray misses the plane, in the unit of the loss.
 
     Raises:
-        TypeError: `loss` is not a robust loss (`diffproj.calibration.losses.Loss`).
+        TypeError: `loss` is not a robust loss (`diffproj.calibration.losses.Loss`), or `pull` no number.
+        ValueError: `pull` is negative or not finite.
 
     Example:
         >>> points = torch.tensor([[3.0, 4.0, 0.0], [9.0, 9.0, 9.0]])
         >>> PlaneLoss()(points, torch.zeros(2, 3), torch.tensor([True, False]))
         tensor(12.5000)
+        >>> PlaneLoss(pull=8.0)(points, torch.zeros(2, 3), torch.tensor([True, False]), miss=torch.tensor([0.0, 0.5]))
+        tensor(14.5000)
     """
 
-    def __init__(self, loss: Loss | None = None) -> None:
+    def __init__(self, loss: Loss | None = None, pull: float = 0.0) -> None:
         super().__init__()
         check_loss(loss)
         self.loss = loss
+        self.pull = number("pull", pull, "a number that is not negative, of the loss for each radian", least=0)
 
     def forward(
         self,
@@ -44,6 +67,7 @@ class PlaneLoss(nn.Module):
         valid: Bool[Tensor, "*#batch n"] | Array | None = None,
         weights: Float[Tensor, "*#batch n"] | Array | None = None,
         resolution: Float[Tensor, "*#batch n"] | Array | None = None,
+        miss: Float[Tensor, "*#batch n"] | Array | None = None,
     ) -> Float[Tensor, ""]:
         """The loss, a tensor without axes, in squared world units (in squared pixels with `resolution`).
 
@@ -55,6 +79,8 @@ class PlaneLoss(nn.Module):
             resolution: world units per pixel at each point `(*B, N)`, positive, as `ground_resolution` gives it:
                 distances are divided by it, so that far points, which one pixel moves further, count as much as near
                 ones. No gradient flows through it.
+            miss: the angles in radians by which rays miss the plane `(*B, N)`, as `PlaneProjector.miss` and
+                `PlaneMap.miss` give them; needed with `pull`, and looked at where a point is not valid.
 
         Weights and resolution may be anything where a point does not count. Their values are checked on a CPU, outside
         of `torch.compile` and `vmap`; a GPU would have to be waited for.
@@ -65,7 +91,25 @@ class PlaneLoss(nn.Module):
             TypeError: points, target, weights or resolution that are no floating-point tensors, or a mask that is not
                 boolean.
             ValueError: points or target without three coordinates, something that does not broadcast to the points, or
-                weights or a resolution that cannot be, at a point that counts.
+                weights or a resolution that cannot be, at a point that counts; or no `miss` for a loss that pulls.
+        """
+        return self.counted(points, target, valid, weights, resolution, miss).loss
+
+    def counted(
+        self,
+        points: Float[Tensor, "*batch n 3"] | Array,
+        target: Float[Tensor, "*#batch n 3"] | Array,
+        valid: Bool[Tensor, "*#batch n"] | Array | None = None,
+        weights: Float[Tensor, "*#batch n"] | Array | None = None,
+        resolution: Float[Tensor, "*#batch n"] | Array | None = None,
+        miss: Float[Tensor, "*#batch n"] | Array | None = None,
+    ) -> CountedLoss:
+        """The loss, and how many points are not valid; arguments as for the call.
+
+        Example:
+            >>> points = torch.zeros(4, 3)
+            >>> PlaneLoss().counted(points, points, torch.tensor([True, False, False, True]))
+            CountedLoss(loss=tensor(0.), invalid=tensor(2), total=4)
         """
         points = check_tensor("points", points, "N", 3, like=target if isinstance(target, Tensor) else None)
         target = _fitting("target", check_tensor("target", target, "N", 3, like=points), points, points.shape)
@@ -87,7 +131,13 @@ class PlaneLoss(nn.Module):
             weights = torch.where(counts, weights, 0.0)
             _check_values("weights", weights, 0.0, "finite numbers that are not negative")
             value = value * weights.to(value)
-        return value.sum() / max(value.numel(), 1)
+        if self.pull:
+            if miss is None:
+                raise ValueError("miss: want angles (*B, N) for a loss that pulls, got None; projector.miss(pixels)")
+            miss = _fitting("miss", check_tensor("miss", miss, like=points), points, each)
+            value = value + self.pull * torch.where(counts, 0.0, miss.to(value))
+        total = value.numel()
+        return CountedLoss(value.sum() / max(total, 1), (~counts).expand(each).sum(), total)
 
     if TYPE_CHECKING:  # PyTorch types the call of a module as Any
         __call__ = forward

@@ -103,10 +103,31 @@ class PlaneProjector(nn.Module):
         """
         device = self.geometry.device.type
         with torch.autocast("cpu" if device == "meta" else device, enabled=False):
-            if warp is None and plane is None:
-                return self.geometry()(pixels)
-            camera = self.camera if warp is None else self.camera.warped_by("warp", warp)
-            return PlaneMap(camera, self.plane if plane is None else plane)(pixels)
+            return self._map_of(warp, plane)(pixels)
+
+    def _map_of(self, warp: Tensor | Array | None, plane: Plane | None) -> PlaneMap:
+        """The map of samples whose images were warped, or that lie on a plane of their own."""
+        if warp is None and plane is None:
+            return self.geometry()
+        # Of a frozen camera the one that has been worked out, whose lens remembers its plan.
+        frozen = self.geometry.frozen() if isinstance(self.geometry, LearnableMap) else None
+        camera = self.camera if frozen is None else frozen.camera
+        camera = camera if warp is None else camera.warped_by("warp", warp)
+        return PlaneMap(camera, self.plane if plane is None else plane)
+
+    def miss(
+        self,
+        pixels: Float[Tensor, "*#batch n 2"] | Array,
+        warp: Float[Tensor, "*#batch 3 3"] | Array | None = None,
+        plane: Plane | None = None,
+    ) -> Float[Tensor, "*#batch n"]:
+        """The angles in radians by which rays miss the plane `(*B, N)`, 0 where they meet it, for `PlaneLoss(pull=...)`.
+
+        See `PlaneMap.miss`; arguments as for the call.
+        """
+        device = self.geometry.device.type
+        with torch.autocast("cpu" if device == "meta" else device, enabled=False):
+            return self._map_of(warp, plane).miss(pixels)
 
     if TYPE_CHECKING:  # PyTorch types the call of a module as Any
         __call__ = forward
