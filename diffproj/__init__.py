@@ -119,6 +119,7 @@ __all__ = [
     "bootstrap",
     "calibrate",
     "calibrate_rig",
+    "collate",
     "cross_validate",
     "cross_validate_rig",
     "degrees_from_metres",
@@ -148,6 +149,7 @@ __all__ = [
     "rotation_from_euler",
     "run_experiment",
     "save_camera",
+    "stack",
 ]
 
 

@@ -49,6 +49,8 @@ from diffproj.geometry.back_projection import back_project as back_project
 from diffproj.geometry.back_projection import explain as explain
 from diffproj.geometry.back_projection import ground_resolution as ground_resolution
 from diffproj.geometry.camera import Camera as Camera
+from diffproj.geometry.collating import collate as collate
+from diffproj.geometry.collating import stack as stack
 from diffproj.geometry.euler import euler_from_rotation as euler_from_rotation
 from diffproj.geometry.euler import rotation_from_euler as rotation_from_euler
 from diffproj.geometry.geodesy import degrees_from_metres as degrees_from_metres

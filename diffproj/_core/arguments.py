@@ -273,7 +273,12 @@ def tensor_of(name: str, value: object, like: Kind | None = None) -> Tensor:
     """
     if isinstance(value, Tensor):
         return value
-    if torch.compiler.is_compiling() and type(value) in (float, int, list, tuple):  # which NumPy would make constants of
+    if torch.compiler.is_compiling() and type(value) in (
+        float,
+        int,
+        list,
+        tuple,
+    ):  # which NumPy would make constants of
         kind, device = (torch.float64, torch.device("cpu")) if like is None else (like.dtype, like.device)
         return torch.tensor(value, dtype=kind, device=device)
     _check_unmasked(name, value)

@@ -3,7 +3,8 @@
 A subclass names its tensors, with how many axes each has behind those of the batch, the parts that are batched
 themselves, and its constants; it says how to build one without checks (`unchecked`). In return it can be converted,
 moved, detached, indexed, expanded and stacked, all in one way, and is a PyTree: `vmap`, `torch.func`, `torch.compile`
-and `torch.export` carry it. `torch.load(weights_only=True)` reads it once one public name of the package was used. Inside such a transformation the tensors are tracers, placeholders or plain `object()`s,
+and `torch.export` carry it. `torch.load(weights_only=True)`
+reads it once one public name of the package was used. Inside such a transformation the tensors are tracers, placeholders or plain `object()`s,
 whose values nobody can read: this is why a PyTree is rebuilt by `unchecked`.
 """
 
@@ -106,6 +107,13 @@ class Batched(Copied, Shown):
     def detach(self: B) -> B:
         """The same cut off from the graph."""
         return self._rearranged(lambda tensor, _: tensor.detach(), lambda part: part.detach())
+
+    def pin_memory(self: B) -> B:
+        """The same in memory that a GPU copies from fast: what `DataLoader(pin_memory=True)` calls."""
+        return self._rearranged(
+            lambda tensor, _: tensor.pin_memory(),
+            lambda part: part.pin_memory() if hasattr(part, "pin_memory") else part,
+        )
 
     def expand(self: B, *batch_shape: int | Sequence[int]) -> B:
         """The same with its batch axes broadcast to `batch_shape`, as `torch.Tensor.expand`: nothing is copied.

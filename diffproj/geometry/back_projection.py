@@ -17,7 +17,6 @@ centred before they meet `M`, which keeps float32 accurate; `M` itself is built 
 """
 
 import enum
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -41,7 +40,6 @@ from diffproj._core.numerics import (
     interleaved,
     linear,
     rounding,
-    transform,
 )
 from diffproj._core.shown import Shown
 from diffproj._core.warn import warn_caller
@@ -49,6 +47,7 @@ from diffproj.geometry import description
 from diffproj.geometry.camera import Camera, as_camera, meeting_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.geometry.intrinsics import pixel_to_normalized
+from diffproj.geometry.map_views import MapViews
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.lens.slopes import by_direction
 
@@ -70,7 +69,7 @@ class Reason(enum.IntEnum):
     """The ray meets the plane behind the camera."""
 
 
-class PlaneMap(Copied, Shown):
+class PlaneMap(MapViews, Copied, Shown):
     """The map from pixels to points of a plane, built once for a camera and a plane and then applied at will.
 
     `back_project` builds one for each call; keep one where camera and plane stay as they are. It is a PyTree.
@@ -158,63 +157,6 @@ class PlaneMap(Copied, Shown):
         """`Reason` codes `(*B, N)` of pixels `(*B, N, 2)`; see the function `explain`."""
         (reasons,) = in_blocks(self._explain, self._checked(pixels), self.matrix, *self.camera.tensors())
         return reasons.squeeze(-1) if self.is_per_point else reasons
-
-    def miss(self, pixels: Float[Tensor, "*#batch n 2"] | Array) -> Float[Tensor, "*#batch n"]:
-        """The angle in radians by which each pixel's ray misses the plane `(*B, N)`; 0 where it meets it.
-
-        That is the angle between the ray and the plane where the ray leads away from it, 0 at the horizon and growing
-        from there, with a gradient that leads back. A pixel that the lens does not see has no ray; its angle is that
-        from the optical axis of the ray that a pinhole would have. It is 0, without a gradient, of a pixel that is
-        not finite, and of a camera that lies in the plane.
-
-        Args:
-            pixels: `(*B, N, 2)`.
-
-        Raises:
-            TypeError: as `back_project`.
-            ValueError: as `back_project`.
-
-        Example:
-            >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
-            >>> floor = PlaneMap(Camera(K), Plane([0.0, 1.0, 0.0], 1.5))  # 1.5 below a camera that looks to the horizon
-            >>> floor.miss(torch.tensor([[320.0, 300.0], [320.0, 240.0], [320.0, 190.0]])).rad2deg()
-            tensor([0.0000, 0.0000, 5.7106])
-        """
-        rows = entries(self.matrix)
-
-        def miss(pixels: Tensor) -> tuple[Tensor]:
-            return (self._miss(pixels, rows),)
-
-        (found,) = in_blocks(miss, self._checked(pixels), self.matrix, *self.camera.tensors())
-        return found.squeeze(-1) if self.is_per_point else found
-
-    def _miss(self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]) -> Tensor:
-        sight, seen = self._sight(pixels)
-        denominator, threshold = _denominator(self.matrix, rows[3], sight)
-        finite = (pixels.abs() < torch.finfo(pixels.dtype).max ** 0.25).all(-1)
-        off_plane = (self.matrix[..., 3, :] != 0).any(-1, keepdim=True)
-        seen = finite if seen is None else finite & seen
-        meets = (denominator > threshold) & seen
-        # The ray in the camera frame, and the normal, turned to where rays that meet the plane lead.
-        xy = transform(pixel_to_normalized(self.camera.K), torch.where(finite.unsqueeze(-1), pixels, 0.0) - self._center())
-        pinhole = torch.nn.functional.pad(xy, (0, 1), value=1.0)
-        normal = self.matrix[..., 3, :]
-        if self.camera.distortion is None:
-            ray = pinhole
-            F = self.camera.K[..., :2, :2]
-            normal = torch.cat([(F * normal[..., :2, None]).sum(-2), normal[..., 2:]], dim=-1)
-        else:
-            x, y, z = sight
-            ray = torch.stack([x, y, torch.ones_like(x) if z is None else z], dim=-1)  # type: ignore[list-item]
-        axis = torch.tensor([0.0, 0.0, 1.0], dtype=ray.dtype, device=ray.device)
-        normal = torch.where(off_plane, normal, axis).unsqueeze(-2)
-        away = -_angle(torch.where(seen.unsqueeze(-1), ray, axis), normal)
-        outside = math.pi / 2 - _angle(pinhole, axis)
-        found = torch.where(seen, torch.where(off_plane, away.clamp_min(0.0), 0.0), outside)
-        return torch.where(meets | ~finite, 0.0, found)
-
-    def _center(self) -> Tensor:
-        return self.camera.K[..., None, :2, 2]
 
     def _facts(self) -> list[str]:
         planes = "a plane for each point" if self.is_per_point else ""
@@ -423,15 +365,6 @@ def _largest_singular_value(by_u: Tensor, by_v: Tensor) -> Tensor:
     squared = (a + c) / 2 + spread
     some = squared > 0
     return torch.where(some, torch.where(some, squared, 1.0).sqrt(), 0.0) * size
-
-
-def _angle(ray: Tensor, normal: Tensor) -> Tensor:
-    """The angle between rays `(*B, N, 3)` and the plane of a normal, from -pi/2 to pi/2, positive along the normal."""
-    ray = ray / ray.detach().abs().amax(-1, keepdim=True)
-    normal = normal / normal.detach().abs().amax(-1, keepdim=True)
-    across = torch.linalg.cross(ray, normal.expand_as(ray), dim=-1).square().sum(-1)
-    some = across > 0  # the root's slope at 0 is infinite
-    return torch.atan2((ray * normal).sum(-1), torch.where(some, torch.where(some, across, 1.0).sqrt(), 0.0))
 
 
 def _denominator(matrix: Tensor, b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:

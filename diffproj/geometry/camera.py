@@ -40,6 +40,7 @@ from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounded_pixels
 from diffproj.geometry.grid import checked_size, inside
 from diffproj.geometry.intrinsics import check_intrinsics, pixel_to_normalized
 from diffproj.geometry.mounting import Mounted
+from diffproj.geometry.placement import Placed
 from diffproj.lens.protocol import Lens
 
 ROTATION_TOLERANCE = 1e-5
@@ -52,6 +53,7 @@ SQUARED = 0.45
 class Camera(
     ChangedImages,
     Exchange,
+    Placed,
     Mounted,
     Batched,
     tensors={"K": 2, "R": 2, "t": 1},

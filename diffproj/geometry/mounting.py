@@ -131,7 +131,7 @@ class Mounted(CameraParts):
             _number(name, angle, kind, "degrees", lambda x: x.isfinite())
             for name, angle in (("roll_deg", roll_deg), ("heading_deg", heading_deg))
         )
-        f_x, f_y = _focal(sides, kind, focal, fov_deg, focal_mm, sensor_mm)
+        f_x, f_y = focal_lengths(sides, kind, focal, fov_deg, focal_mm, sensor_mm)
         middle = [(side - 1) / 2 for side in sides] if principal_point is None else principal_point
         center = check_tensor("principal_point", middle, 2, like=kind)
         place = check_tensor("position", (0.0, 0.0) if position is None else position, 2, like=kind)
@@ -203,7 +203,7 @@ def mounting_from_rotation(
     return tilt.rad2deg(), roll.rad2deg(), torch.where(heading < 0, heading + 360, heading)
 
 
-def _focal(
+def focal_lengths(
     size: tuple[int, int],
     kind: Any,
     focal: Any,

@@ -16,6 +16,7 @@ lens included, and sampled there as `resampling.py` says. Both are differentiabl
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
@@ -68,7 +69,7 @@ def rectify(
     image: Float[Tensor, "*batch c h w"],
     camera: Camera | PinholeCamera,
     plane: Plane,
-    extent: Sequence[float],
+    extent: Sequence[float] | Tensor,
     resolution: float,
     axes: Axes | None = None,
     north_up: bool = False,
@@ -81,7 +82,8 @@ def rectify(
         camera: with its pose, of batch shape `*B`; the image is its full image. `camera.resized((w, h))` is the camera
             of a feature map of fewer pixels.
         plane: of batch shape `*B`.
-        extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes.
+        extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes; `(*B, 4)`, all equally large, where
+            each image has its own.
         resolution: world units per pixel of the top view. Where the extent is no whole multiple of it, the number of
             pixels is rounded, and they fill the extent.
         axes: `(origin, axis_s, axis_t)`, each `(*B, 3)`; those of `plane_axes` if left out.
@@ -108,6 +110,13 @@ def rectify(
         (torch.Size([3, 50, 100]), True)
     """
     image, camera, plane, (origin, along_s, along_t) = _checked("image", image, camera, plane, axes)
+    extent, moved = _of_each(extent, camera.K)
+    if moved is not None:  # to where the extent of each image begins
+        broadcast_batches(
+            image=image.shape[:-3], camera=camera.batch_shape, plane=plane.batch_shape, extent=moved.shape[:-1]
+        )
+        origin = origin + moved[..., :1] * along_s + moved[..., 1:] * along_t
+        along_s, along_t = along_s.expand_as(origin), along_t.expand_as(origin)
     rows, columns = _shape(extent, resolution)
     _check_size(image, camera)
     warn_if_rounded(camera, plane)
@@ -304,6 +313,28 @@ def _of(chosen: Chosen, camera: Camera, plane: Plane, axes: Axes, image: Tensor)
     )
     origin, along_s, along_t = (axis.expand(*batch, 3)[chosen] for axis in axes)
     return camera.expand(*batch)[chosen], plane.expand(*batch)[chosen], (origin, along_s, along_t)
+
+
+def _of_each(extent: Sequence[float] | Tensor, like: Tensor) -> tuple[Sequence[float], Tensor | None]:
+    """The first extent, and by how much each image's lies beside it `(*B, 2)`; `None` where there is one for all.
+
+    Raises:
+        TypeError: no numbers.
+        ValueError: extents of different sizes, or that are not finite.
+    """
+    if not isinstance(extent, Tensor | np.ndarray) or extent.ndim < 2:
+        return extent, None  # type: ignore[return-value]
+    each = check_tensor("extent", extent, 4, like=like).to(like)
+    if each.numel() == 0:
+        raise ValueError(f"extent: want one extent, or at least one for each image, got shape {tuple(each.shape)}")
+    first = each.reshape(-1, 4)[0]
+    moved = each[..., :2] - first[:2]
+    sides = each[..., 2:] - each[..., :2]
+    if not bool(each.isfinite().all()):
+        raise ValueError("extent: want finite (s_min, t_min, s_max, t_max), got NaN or infinity")
+    if not bool(((sides - sides.reshape(-1, 2)[0]).abs() <= 1e-5 * sides.abs()).all()):
+        raise ValueError(f"extent: want extents of one size, got {sides.reshape(-1, 2).tolist()}")
+    return first.tolist(), moved
 
 
 def _checked_extent(extent: Sequence[float]) -> tuple[float, float]:

@@ -7,7 +7,10 @@ The parameters are chosen so that steps of one size mean much the same for each 
 * the coefficients of the lens by addition, `k = k_0 + distortion`;
 * rotations by `R = Q(rotation) R_0`, where `Q(w)` turns about the axis w by `2 atan(|w| / 2)` (Cayley's map, which
   agrees with the rotation vector to second order; see `diffproj.geometry.cayley`);
-* translations in units of their length, `t = t_0 + |t_0| translation` (in world units where t_0 is 0).
+* translations in units of their length, `t = t_0 + |t_0| translation` (in world units where t_0 is 0);
+* in the place of both, the angles `pitch` (down), `yaw` (to the right) and `roll` (the horizon sinks to the right) about
+  the camera's own x, y and z, in radians, and the `height` along the world's z, in units of the same length. They turn
+  and lift the camera where it stands, as does a rotation that is learned without a translation.
 
 All parameters are zero at first, which gives the camera that the module was made from. Parts that are not learned are
 buffers, which are saved and moved along.
@@ -20,18 +23,30 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from diffproj._core.arguments import flag
-from diffproj._core.numerics import has_values
+from diffproj._core.numerics import dot, has_values
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.cayley import turned
 from diffproj.lens.models import coefficients_of, model_of
-from diffproj.nn.partial import PARTS, GeometryModule, Learn, add_kind, add_parameter, learned, learned_parts
+from diffproj.nn.partial import (
+    OF_POSE,
+    PARTS,
+    TURNS,
+    GeometryModule,
+    Learn,
+    add_kind,
+    add_parameter,
+    learned,
+    learned_parts,
+)
 
 _PARAMETERS = {
-    "focal": ("log_focal",),
+    "log_focal": ("focal",),
     "principal_point": ("principal_point",),
     "distortion": ("distortion",),
-    "pose": ("rotation", "translation"),
+    "rotation": ("pose", "rotation"),
+    "translation": ("pose", "translation"),
 }
+"""From each parameter to the parts that it belongs to."""
 
 
 class LearnableCamera(GeometryModule):
@@ -45,7 +60,8 @@ class LearnableCamera(GeometryModule):
         camera: the starting camera, of batch shape `*B`, or Kornia's `PinholeCamera`. Its tensors are copied; its dtype
             and device are the module's.
         learn: the parts to learn, of `"focal"`, `"principal_point"`, `"distortion"` and `"pose"`; all that the camera
-            has if left out. A mapping also says for which cameras of the batch: from the part to True, False, or
+            has if left out. In the place of the pose, parts of it: `"rotation"`, `"translation"`, `"pitch"`, `"yaw"`,
+            `"roll"` and `"height"`. A mapping also says for which cameras of the batch: from the part to True, False, or
             booleans that broadcast to the batch shape.
         tied_intrinsics: whether the cameras along a batch axis share one K and one lens. If left out, they do along
             every axis along which all start with the same values of both. True does the same and refuses cameras that
@@ -81,7 +97,7 @@ class LearnableCamera(GeometryModule):
         check_tied(tied_intrinsics)
         self._model = model_of(camera.distortion)
         available = [part for part in PARTS if self._model.count or part != "distortion"]
-        chosen = learned_parts(available if learn is None else learn, available)
+        chosen = learned_parts(available if learn is None else learn, (*available, *OF_POSE))
         self.learn, self.size, self.batch_shape = tuple(chosen), camera.size, camera.batch_shape
         axes = tied_axes(camera, tied_intrinsics)
         K, coefficients = (_first_along(axes, part) for part in _intrinsics(camera))
@@ -93,10 +109,16 @@ class LearnableCamera(GeometryModule):
         self.register_buffer("reach", torch.where(reach > 0, reach, 1.0))
         self.register_buffer("coefficients_0", coefficients.clone())
         add_kind(self, camera)
-        likes = {"focal": focal, "principal_point": focal, "distortion": coefficients, "pose": camera.t}
-        for part, names in _PARAMETERS.items():
-            for name in names:
-                add_parameter(self, name, likes[part], chosen.get(part, False), self.batch_shape)
+        likes = {"log_focal": focal, "principal_point": focal, "distortion": coefficients}
+        for name, parts in _PARAMETERS.items():
+            where = next((chosen[part] for part in parts if part in chosen), False)
+            add_parameter(self, name, likes.get(name, camera.t), where, self.batch_shape)
+        for name in (*TURNS, "height"):
+            if name in chosen:
+                add_parameter(self, name, camera.t[..., :1], chosen[name], self.batch_shape)
+        # By its parts the camera is turned where it stands; in a pose R and t are free of each other.
+        within = chosen.keys() & {*OF_POSE}
+        self._stays = bool(within) and within != {"rotation", "translation"}
         self.register_load_state_dict_pre_hook(_explain_other_tying)
 
     K_0: Tensor
@@ -117,7 +139,16 @@ class LearnableCamera(GeometryModule):
         K = self.K_0 * scale.unsqueeze(-2) + nn.functional.pad(shift, (2, 0))
         K = K.expand(*self.batch_shape, 3, 3)
         R = turned(self.R_0, learned(self, "rotation"))
+        if chosen := [name for name in TURNS if name in self.learn]:
+            none = torch.zeros_like(self.t_0[..., :1])
+            pitch, yaw, roll = (learned(self, name) if name in chosen else none for name in TURNS)
+            R = turned(R, torch.cat([pitch, -yaw, roll], dim=-1))
         t = self.t_0 + self.reach * learned(self, "translation")
+        if self._stays:
+            center = -dot(self.R_0.mT, self.t_0.unsqueeze(-2))
+            t = t + dot(self.R_0 - R, center.unsqueeze(-2))
+            if "height" in self.learn:
+                t = t - R[..., 2] * self.reach * learned(self, "height")
         lens = None
         if self._model.kind is not None:
             coefficients = self.coefficients_0 + learned(self, "distortion")

@@ -40,8 +40,8 @@ class FixedMap(GeometryModule):
         >>> points.tolist(), [name for name, _ in fixed.named_buffers()]
         ([[100.0, 0.0, 0.0]], ['K', 'R', 't', 'coefficients', 'normal', 'offset', 'matrix', 'kind'])
 
-    Behind a lens there are also those of its plan, `domain`, `reach`, `noise`, `rho_max` and `ratio`, so that a compiled
-    or exported map works out nothing about the lens.
+    Behind a lens there are also those of its plan, `domain`, `reach`, `noise`, `rho_max` and `ratio`, so that a
+    compiled or exported map works out nothing about the lens.
     """
 
     K: Tensor
@@ -77,6 +77,11 @@ class FixedMap(GeometryModule):
     def device(self) -> torch.device:
         """Where the tensors are."""
         return self.t.device
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """The batch shape of the camera."""
+        return self.t.shape[:-1]
 
     def forward(self) -> PlaneMap:
         """The map. It shares the buffers, as `camera` and `plane` do: what is written to them later changes it too."""

@@ -59,6 +59,11 @@ class LearnableMap(nn.Module):
         """Where the tensors are."""
         return self.camera.t_0.device
 
+    @property
+    def batch_shape(self) -> torch.Size:
+        """The batch shape of the camera."""
+        return self.camera.batch_shape
+
     def forward(self) -> PlaneMap:
         """The map with the current values of the parameters."""
         kept = self.frozen()

@@ -14,6 +14,10 @@ from diffproj.lens.models import MODELS, model_of
 
 PARTS = ("focal", "principal_point", "distortion", "pose")
 """The parts of a camera that can be learned."""
+TURNS = ("pitch", "yaw", "roll")
+"""Parts of a pose: angles about the camera's x, y and z."""
+OF_POSE = ("rotation", "translation", *TURNS, "height")
+"""Parts of a pose that can be learned in its place."""
 
 
 Learn = Sequence[str] | Mapping[str, Any]
@@ -99,7 +103,12 @@ def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
     if unknown:
         raise ValueError(f"learn: want parts of {', '.join(available)}, got {unknown[0]!r}")
     wanted = {part: learn[part] for part in names} if isinstance(learn, Mapping) else dict.fromkeys(names, True)
-    return {part: where for part, where in wanted.items() if bool(booleans("learn", where).any())}
+    chosen = {part: where for part, where in wanted.items() if bool(booleans("learn", where).any())}
+    for whole, within in (("pose", OF_POSE), ("rotation", TURNS), ("translation", ("height",))):
+        twice = [part for part in within if part in chosen and whole in chosen]
+        if twice:
+            raise ValueError(f"learn: want {whole!r} or parts of it, got both {whole!r} and {twice[0]!r}")
+    return chosen
 
 
 def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, batch: torch.Size) -> None:

@@ -1,20 +1,22 @@
 """`PlaneProjector`: pixels to points on a plane, as a layer."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from diffproj._core.arguments import Array
+from diffproj._core.arguments import Array, whole_number, whole_numbers
+from diffproj._core.numerics import has_values
 from diffproj.geometry.back_projection import PlaneMap
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
 from diffproj.nn.camera import check_tied, tied_axes
 from diffproj.nn.fixed_map import FixedMap
 from diffproj.nn.learnable_map import LearnableMap
-from diffproj.nn.partial import PARTS, Learn, learned_parts
+from diffproj.nn.partial import OF_POSE, PARTS, Learn, learned_parts
 
 
 class PlaneProjector(nn.Module):
@@ -26,8 +28,8 @@ class PlaneProjector(nn.Module):
     Args:
         camera: at its pose, of batch shape `*B`, or Kornia's `PinholeCamera`.
         plane: the plane, of batch shape `*B`.
-        learn: the parts to learn: any of `"focal"`, `"principal_point"`, `"distortion"`, `"pose"` and `"plane"`;
-            nothing if left out. A mapping also says for which cameras or planes of a batch, as for `LearnableCamera`:
+        learn: the parts to learn: any of `"focal"`, `"principal_point"`, `"distortion"`, `"pose"`, or parts of it as for
+            `LearnableCamera`, and `"plane"`; nothing if left out. A mapping also says for which cameras or planes of a batch, as for `LearnableCamera`:
             `{"focal": True, "pose": torch.tensor([True, False])}`.
         tied_intrinsics: whether the cameras of a batch share one K and one lens, as for `LearnableCamera`: if left out,
             they do where all start with the same values.
@@ -58,7 +60,7 @@ class PlaneProjector(nn.Module):
         super().__init__()
         camera = as_camera(camera).detach()
         check_tied(tied_intrinsics)
-        chosen = learned_parts(learn, (*PARTS, "plane"))
+        chosen = learned_parts(learn, (*PARTS, *OF_POSE, "plane"))
         self.learn = tuple(chosen)
         if chosen:
             self.geometry = LearnableMap(camera, plane, chosen, tied_intrinsics)
@@ -85,6 +87,7 @@ class PlaneProjector(nn.Module):
         pixels: Float[Tensor, "*#batch n 2"] | Array,
         warp: Float[Tensor, "*#batch 3 3"] | Array | None = None,
         plane: Plane | None = None,
+        camera: Int[Tensor, "*samples"] | Sequence[int] | int | None = None,
     ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
         """Points on the plane.
 
@@ -93,6 +96,8 @@ class PlaneProjector(nn.Module):
             warp: how the image that they belong to was warped, from the camera's own pixels: `(*B, 3, 3)`, what
                 Kornia's augmentations keep as `transform_matrix`; see `Camera.warped`.
             plane: of these samples, in place of the projector's own.
+            camera: which of the projector's cameras took each sample: whole numbers `(*S)` from 0, along the first
+                batch axis. Pixels, and a warp or plane, are then those of the samples, `(*S, N, 2)`.
 
         Returns:
             Points `(*B, N, 3)` in world units and `valid (*B, N)`; see `back_project`.
@@ -103,31 +108,59 @@ class PlaneProjector(nn.Module):
         """
         device = self.geometry.device.type
         with torch.autocast("cpu" if device == "meta" else device, enabled=False):
-            return self._map_of(warp, plane)(pixels)
+            return self._map_of(warp, plane, camera)(pixels)
 
-    def _map_of(self, warp: Tensor | Array | None, plane: Plane | None) -> PlaneMap:
-        """The map of samples whose images were warped, or that lie on a plane of their own."""
+    def _map_of(
+        self,
+        warp: Tensor | Array | None,
+        plane: Plane | None,
+        chosen: Tensor | Sequence[int] | int | None = None,
+    ) -> PlaneMap:
+        """The map of samples by some of the cameras, whose images were warped, or that lie on a plane of their own."""
+        if chosen is not None:
+            chosen = self._positions(chosen)
         if warp is None and plane is None:
-            return self.geometry()
+            return self.geometry() if chosen is None else self.geometry()[chosen]
         # Of a frozen camera the one that has been worked out, whose lens remembers its plan.
         frozen = self.geometry.frozen() if isinstance(self.geometry, LearnableMap) else None
         camera = self.camera if frozen is None else frozen.camera
+        own = self.plane if plane is None else plane
+        if chosen is not None:
+            camera = camera[chosen]
+            own = own[chosen] if plane is None and own.batch_shape else own
         camera = camera if warp is None else camera.warped_by("warp", warp)
-        return PlaneMap(camera, self.plane if plane is None else plane)
+        return PlaneMap(camera, own)
+
+    def _positions(self, chosen: Tensor | Sequence[int] | int) -> Tensor:
+        """Which cameras, as a tensor of whole numbers."""
+        device = self.geometry.device
+        if isinstance(chosen, int):
+            chosen = [whole_number("camera", chosen)]
+            return self._positions(chosen)[0]
+        found = whole_numbers("camera", chosen, "which camera took each sample").to(device)
+        shape = self.geometry.batch_shape
+        if not shape:
+            raise ValueError("camera: want none for a projector of one camera; build it of a batch, dp.stack(cameras)")
+        if found.device.type == "cpu" and has_values(found) and found.numel():
+            low, high = (int(end) for end in found.aminmax())
+            if low < 0 or high >= shape[0]:
+                raise ValueError(f"camera: want numbers from 0 to {shape[0] - 1}, got {low if low < 0 else high}")
+        return found
 
     def miss(
         self,
         pixels: Float[Tensor, "*#batch n 2"] | Array,
         warp: Float[Tensor, "*#batch 3 3"] | Array | None = None,
         plane: Plane | None = None,
+        camera: Int[Tensor, "*samples"] | Sequence[int] | int | None = None,
     ) -> Float[Tensor, "*#batch n"]:
-        """The angles in radians by which rays miss the plane `(*B, N)`, 0 where they meet it, for `PlaneLoss(pull=...)`.
+        """The angles in radians by which rays miss the plane `(*B, N)`, for `PlaneLoss(pull=...)`; 0 where they meet it.
 
         See `PlaneMap.miss`; arguments as for the call.
         """
         device = self.geometry.device.type
         with torch.autocast("cpu" if device == "meta" else device, enabled=False):
-            return self._map_of(warp, plane).miss(pixels)
+            return self._map_of(warp, plane, camera).miss(pixels)
 
     if TYPE_CHECKING:  # PyTorch types the call of a module as Any
         __call__ = forward
