@@ -3,9 +3,9 @@
 A subclass names its tensors, with how many axes each has behind those of the batch, the parts that are batched
 themselves, and its constants; it says how to build one without checks (`unchecked`). In return it can be converted,
 moved, detached, indexed, expanded and stacked, all in one way, and is a PyTree: `vmap`, `torch.func`, `torch.compile`
-and `torch.export` carry it. `torch.load(weights_only=True)`
-reads it once one public name of the package was used. Inside such a transformation the tensors are tracers, placeholders or plain `object()`s,
-whose values nobody can read: this is why a PyTree is rebuilt by `unchecked`.
+and `torch.export` carry it. Inside such a transformation the tensors are tracers, placeholders or plain `object()`s,
+whose values nobody can read: this is why a PyTree is rebuilt by `unchecked`. `torch.load(weights_only=True)` reads it
+once a public name of the package was used.
 """
 
 import sys

@@ -66,7 +66,7 @@ class MapViews:
         Example:
             >>> import diffproj as dp
             >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
-            >>> floor = dp.PlaneMap(dp.Camera(K), dp.Plane([0.0, 1.0, 0.0], 1.5))  # 1.5 below a camera that looks to the horizon
+            >>> floor = dp.PlaneMap(dp.Camera(K), dp.Plane([0.0, 1.0, 0.0], 1.5))  # the camera looks level
             >>> floor.miss(torch.tensor([[320.0, 300.0], [320.0, 240.0], [320.0, 190.0]])).rad2deg()
             tensor([0.0000, 0.0000, 5.7106])
         """
@@ -167,7 +167,7 @@ class MapViews:
         batch = broadcast_batches(map=self.matrix.shape[:-2], camera=self.camera.batch_shape)
         matrix, camera = self.matrix.expand(*batch, 4, 3), self.camera
         camera = camera if camera.batch_shape == batch else camera.expand(*batch)
-        return PlaneMap.unchecked(index_batch(matrix, index, 2), camera[index], False)
+        return type(self).unchecked(index_batch(matrix, index, 2), camera[index], False)
 
 
 def _angle(ray: Tensor, normal: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 The axes of a camera frame, and how a 4 x 4 matrix acts:
 
-    opencv       x right, y down, z forward      X_cam = M X_world, columns; ROS's optical frames, COLMAP, KITTI, nuScenes
+    opencv       x right, y down, z forward      X_cam = M X_world, columns: ROS's optical frames, COLMAP, KITTI
     opengl       x right, y up, z backward       the same; Blender, NeRF, ARKit
     pytorch3d    x left, y up, z forward         X_cam = X_world M, rows: M as `Transform3d.get_matrix()` gives it
 """

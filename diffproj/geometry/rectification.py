@@ -82,8 +82,8 @@ def rectify(
         camera: with its pose, of batch shape `*B`; the image is its full image. `camera.resized((w, h))` is the camera
             of a feature map of fewer pixels.
         plane: of batch shape `*B`.
-        extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes; `(*B, 4)`, all equally large, where
-            each image has its own.
+        extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes; `(*B, 4)`, all equally large,
+            where each image has its own.
         resolution: world units per pixel of the top view. Where the extent is no whole multiple of it, the number of
             pixels is rounded, and they fill the extent.
         axes: `(origin, axis_s, axis_t)`, each `(*B, 3)`; those of `plane_axes` if left out.

@@ -30,8 +30,8 @@ def _transforming() -> bool:
 def coordinates(points: Tensor) -> tuple[Tensor, Tensor]:
     """`x` and `y` of points `(*B, N, 2)`, outside of autograd.
 
-    In a compiled graph for the CPU, but not in an exported one, an opaque operation makes them contiguous first: a loop with stride 2 is not
-    vectorised and runs at a quarter of the speed.
+    In a compiled graph for the CPU, but not in an exported one, an opaque operation makes them contiguous first: a
+    loop with stride 2 is not vectorised and runs at a quarter of the speed.
     """
     compiling = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
     if compiling and points.device.type == "cpu" and not _transforming():

@@ -8,9 +8,9 @@ The parameters are chosen so that steps of one size mean much the same for each 
 * rotations by `R = Q(rotation) R_0`, where `Q(w)` turns about the axis w by `2 atan(|w| / 2)` (Cayley's map, which
   agrees with the rotation vector to second order; see `diffproj.geometry.cayley`);
 * translations in units of their length, `t = t_0 + |t_0| translation` (in world units where t_0 is 0);
-* in the place of both, the angles `pitch` (down), `yaw` (to the right) and `roll` (the horizon sinks to the right) about
-  the camera's own x, y and z, in radians, and the `height` along the world's z, in units of the same length. They turn
-  and lift the camera where it stands, as does a rotation that is learned without a translation.
+* in the place of both, the angles `pitch` (down), `yaw` (to the right) and `roll` (the horizon sinks to the right)
+  about the camera's own x, y and z, in radians, and the `height` along the world's z, in units of the same length. They
+  turn and lift the camera where it stands, as does a rotation that is learned without a translation.
 
 All parameters are zero at first, which gives the camera that the module was made from. Parts that are not learned are
 buffers, which are saved and moved along.
@@ -61,8 +61,8 @@ class LearnableCamera(GeometryModule):
             and device are the module's.
         learn: the parts to learn, of `"focal"`, `"principal_point"`, `"distortion"` and `"pose"`; all that the camera
             has if left out. In the place of the pose, parts of it: `"rotation"`, `"translation"`, `"pitch"`, `"yaw"`,
-            `"roll"` and `"height"`. A mapping also says for which cameras of the batch: from the part to True, False, or
-            booleans that broadcast to the batch shape.
+            `"roll"` and `"height"`. A mapping also says for which cameras of the batch: from the part to True, False,
+            or booleans that broadcast to the batch shape.
         tied_intrinsics: whether the cameras along a batch axis share one K and one lens. If left out, they do along
             every axis along which all start with the same values of both. True does the same and refuses cameras that
             differ along the last axis; False gives each camera its own K and lens, also where they start alike.

@@ -28,9 +28,9 @@ class PlaneProjector(nn.Module):
     Args:
         camera: at its pose, of batch shape `*B`, or Kornia's `PinholeCamera`.
         plane: the plane, of batch shape `*B`.
-        learn: the parts to learn: any of `"focal"`, `"principal_point"`, `"distortion"`, `"pose"`, or parts of it as for
-            `LearnableCamera`, and `"plane"`; nothing if left out. A mapping also says for which cameras or planes of a batch, as for `LearnableCamera`:
-            `{"focal": True, "pose": torch.tensor([True, False])}`.
+        learn: the parts to learn: any of `"focal"`, `"principal_point"`, `"distortion"`, `"pose"`, or parts of it as
+            for `LearnableCamera`, and `"plane"`; nothing if left out. A mapping also says for which cameras or planes
+            of a batch: `{"focal": True, "pose": torch.tensor([True, False])}`.
         tied_intrinsics: whether the cameras of a batch share one K and one lens, as for `LearnableCamera`: if left out,
             they do where all start with the same values.
 
@@ -154,7 +154,7 @@ class PlaneProjector(nn.Module):
         plane: Plane | None = None,
         camera: Int[Tensor, "*samples"] | Sequence[int] | int | None = None,
     ) -> Float[Tensor, "*#batch n"]:
-        """The angles in radians by which rays miss the plane `(*B, N)`, for `PlaneLoss(pull=...)`; 0 where they meet it.
+        """The angles in radians by which rays miss the plane `(*B, N)`, 0 where they meet it, for a `PlaneLoss` that pulls.
 
         See `PlaneMap.miss`; arguments as for the call.
         """
