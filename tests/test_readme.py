@@ -14,6 +14,7 @@ import cv2
 import pytest
 import torch
 from kornia.augmentation import RandomHorizontalFlip
+from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
 
 import diffproj as dp
 from diffproj import cli
@@ -109,6 +110,13 @@ def inputs(example: dict[str, Any]) -> dict[str, Any]:
         "target": torch.zeros(2, 3, dtype=D),
         "normals": torch.tensor([[0.0, 0, 1], [0.0, 0.1, 1]], dtype=D),
         "offsets": torch.tensor([0.0, 10.0], dtype=D),
+        "samples": example["pixels"].detach().expand(3, 2, 2).clone(),
+        "dataset": [{"camera": camera}, {"camera": camera}],
+        "P": undistorted.K @ undistorted.world_to_cam()[:3],
+        "pose": camera.cam_to_world("opengl"),
+        "quaternion": rotation_matrix_to_quaternion(camera.R),
+        "quaternion_to_rotation_matrix": quaternion_to_rotation_matrix,
+        "t": camera.t,
         "coefficients": camera.distortion.coefficients,
         "xy": torch.rand(5, 2, dtype=D) * 0.2,
         "left": 100,

@@ -67,8 +67,8 @@ class MapViews:
             >>> import diffproj as dp
             >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
             >>> floor = dp.PlaneMap(dp.Camera(K), dp.Plane([0.0, 1.0, 0.0], 1.5))  # the camera looks level
-            >>> floor.miss(torch.tensor([[320.0, 300.0], [320.0, 240.0], [320.0, 190.0]])).rad2deg()
-            tensor([0.0000, 0.0000, 5.7106])
+            >>> floor.miss(torch.tensor([[320.0, 300.0], [320.0, 190.0]])).rad2deg()
+            tensor([0.0000, 5.7106])
         """
 
         def miss(pixels: Tensor) -> tuple[Tensor]:

@@ -21,9 +21,9 @@ class FixedMap(GeometryModule):
     """The `PlaneMap` of a camera and a plane, built once; calling it gives the map.
 
     Everything that the map depends on is a buffer: its matrix, the tensors of camera and plane, and what was worked out
-    for the lens, all of which are in the `state_dict`. So whatever swaps or writes a module's state, such as `functional_call`,
-    `stack_module_state` or DistributedDataParallel, swaps or writes the whole map. Matrix and plan are built again, in full precision, where
-    the dtype or device changes (`.to`), and behind `load_state_dict`.
+    for the lens, all of which are in the `state_dict`. So whatever swaps or writes a module's state, such as
+    `functional_call`, `stack_module_state` or DistributedDataParallel, swaps or writes the whole map. Matrix and plan
+    are built again, in full precision, where the dtype or device changes (`.to`), and behind `load_state_dict`.
 
     Args:
         camera: of batch shape `*B`. Its tensors are copied, without gradients.

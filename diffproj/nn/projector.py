@@ -154,7 +154,7 @@ class PlaneProjector(nn.Module):
         plane: Plane | None = None,
         camera: Int[Tensor, "*samples"] | Sequence[int] | int | None = None,
     ) -> Float[Tensor, "*#batch n"]:
-        """The angles in radians by which rays miss the plane `(*B, N)`, 0 where they meet it, for a `PlaneLoss` that pulls.
+        """The angles in radians by which rays miss the plane `(*B, N)`, for a `PlaneLoss` that pulls.
 
         See `PlaneMap.miss`; arguments as for the call.
         """

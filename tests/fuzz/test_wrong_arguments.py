@@ -241,6 +241,40 @@ def _geometry(t: Things) -> dict[str, Call]:
         "Camera.mounted by degrees": Call(
             dp.Camera.mounted, {"height": 2.0, "tilt_deg": 20.0, "size": (128, 96), "fov_deg": 60.0}
         ),
+        "Camera.from_matrix": Call(
+            dp.Camera.from_matrix, {"projection": t.K @ t.camera.world_to_cam()[:3], "size": (128, 96)}
+        ),
+        "Camera.from_extrinsics": Call(
+            dp.Camera.from_extrinsics,
+            {
+                "extrinsics": t.cameras.cam_to_world("opengl"),
+                "K": t.K,
+                "convention": "opengl",
+                "to": "world",
+                "distortion": t.lens,
+                "size": (128, 96),
+            },
+        ),
+        "Camera.world_to_cam": Call(c.world_to_cam, {"convention": "pytorch3d"}),
+        "Camera.cam_to_world": Call(c.cam_to_world, {"convention": "opengl"}),
+        "Camera.looking_at": Call(
+            dp.Camera.looking_at,
+            {
+                "position": [0.0, -4, 3],
+                "target": [0.0, 0, 0],
+                "up": [0.0, 0, 1],
+                "size": (128, 96),
+                "focal": (100.0, 101.0),
+                "principal_point": [64.0, 48.0],
+                "distortion": t.lens,
+            },
+        ),
+        "stack": Call(dp.stack, {"items": [c, c], "dim": 0}),
+        "collate": Call(dp.collate, {"samples": [{"camera": c, "n": 1}, {"camera": c, "n": 2}]}),
+        "PlaneMap.miss": Call(dp.PlaneMap(c, t.plane).miss, {"pixels": p}),
+        "PlaneMap.homography": Call(
+            dp.PlaneMap(dp.Camera(t.K, c.R, c.t), dp.Plane.z(0.0)).homography, {"axes": dp.plane_axes(dp.Plane.z(0.0))}
+        ),
         "Camera.at": Call(c.at, {"R": t.cameras.R, "t": t.cameras.t}),
         "Camera.shifted": Call(c.shifted, {"offset": torch.ones(3, dtype=D)}),
         "Camera.resized": Call(c.resized, {"size": (64, 48), "stretched": False}),
@@ -543,6 +577,10 @@ def _uses(t: Things) -> dict[str, Call]:
             dp.PlaneProjector, {"camera": c, "plane": n, "learn": ("focal", "plane"), "tied_intrinsics": None}
         ),
         "PlaneProjector()": Call(projector, {"pixels": p, "warp": torch.eye(3, dtype=D), "plane": n}),
+        "PlaneProjector() of a bank": Call(
+            dp.PlaneProjector(t.cameras, n), {"pixels": p.expand(2, *p.shape), "camera": [0, 3]}
+        ),
+        "PlaneProjector.miss": Call(projector.miss, {"pixels": p, "warp": torch.eye(3, dtype=D), "plane": n}),
         "PlaneProjector() learned": Call(dp.PlaneProjector(c, n, learn="focal"), {"pixels": p}),
         "FixedMap": Call(FixedMap, {"camera": c, "plane": n}),
         "LearnableCamera": Call(
@@ -550,7 +588,7 @@ def _uses(t: Things) -> dict[str, Call]:
             {"camera": t.cameras, "learn": {"focal": True, "pose": [True, False, True, True]}, "tied_intrinsics": True},
         ),
         "LearnablePlane": Call(dp.LearnablePlane, {"plane": t.planes, "scale": 2.0, "learn": [True, False]}),
-        "PlaneLoss": Call(dp.PlaneLoss, {"loss": dp.Huber(1.0)}),
+        "PlaneLoss": Call(dp.PlaneLoss, {"loss": dp.Huber(1.0), "pull": 2.0}),
         "PlaneLoss()": Call(
             dp.PlaneLoss(dp.Huber(1.0)),
             {
@@ -561,6 +599,15 @@ def _uses(t: Things) -> dict[str, Call]:
                 "resolution": torch.ones(3, dtype=D),
             },
             20,
+        ),
+        "PlaneLoss.counted": Call(
+            dp.PlaneLoss(pull=1.0).counted,
+            {
+                "points": world,
+                "target": world + 1,
+                "valid": torch.tensor([True, False, True]),
+                "miss": torch.ones(3, dtype=D),
+            },
         ),
         "CalibrationPrior": Call(dp.CalibrationPrior, {"calibration": t.calibration, "view": 1}),
         "CalibrationPrior()": Call(prior, {"camera": t.calibration.cameras[0]}),

@@ -105,3 +105,77 @@ def test_factors_that_cannot_be(name: str, values: tuple[float, ...], want: str,
         torch.testing.assert_close(got, (points.square().sum(-1) * valid).mean())
         assert torch.autograd.grad(got, points)[0].isfinite().all()
     assert dp.PlaneLoss()(points, target, weights=torch.zeros(4, dtype=dtype)) == 0
+
+
+HORIZON = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=D)
+"""A camera that looks level along y, z up."""
+
+
+@pytest.mark.parametrize("lens", [None, "brown", "fisheye"])
+def test_what_misses_the_plane_is_pulled_back(lens: str | None, K: torch.Tensor) -> None:
+    kinds = {
+        "brown": dp.BrownConrady(torch.tensor([-0.28, 0.07, 0.0013, 0.0001, 0.0], dtype=D)),
+        "fisheye": dp.KannalaBrandt(torch.tensor([0.01, -0.002, 0, 0], dtype=D)),
+    }
+    camera = dp.Camera(K, HORIZON, torch.tensor([0.0, 1.5, 0], dtype=D), kinds.get(lens), (640, 480))
+    projector = dp.PlaneProjector(camera, dp.Plane.z(0.0), ("focal", "pose", "plane"))
+    sky = torch.rand(10, 2, dtype=D) * torch.tensor([640.0, 200], dtype=D)
+    outside = torch.tensor([[9000.0, 200.0], [342.0, -9000.0]], dtype=D)
+    pixels = torch.cat([sky, outside]).requires_grad_()
+    points, valid = projector(pixels)
+    assert not valid.any()
+    loss, invalid, total = dp.PlaneLoss(pull=2.0).counted(
+        points, torch.zeros_like(points), valid, miss=projector.miss(pixels)
+    )
+    assert (int(invalid), total) == (12, 12)
+    gradients = torch.autograd.grad(loss, [pixels, *projector.parameters()])
+    assert all(gradient.isfinite().all() for gradient in gradients)
+    assert (gradients[0].norm(dim=-1) > 0).all()
+    assert (gradients[0][:10, 1] < 0).all()  # a step against it leads down, to the ground
+    assert (
+        projector.miss(pixels - 1e-1 * gradients[0] / gradients[0].norm(dim=-1, keepdim=True)) < projector.miss(pixels)
+    ).all()
+    assert torch.autograd.gradcheck(projector.miss, pixels)
+    # Steps of an optimiser bring the sky to the ground.
+    moved = sky.clone().requires_grad_()
+    optimiser = torch.optim.Adam([moved], lr=20.0)
+    for _ in range(16):
+        optimiser.zero_grad()
+        points, valid = projector(moved)
+        dp.PlaneLoss(pull=1.0)(0 * points, torch.zeros_like(points), valid, miss=projector.miss(moved)).backward()
+        optimiser.step()
+    assert projector(moved)[1].all()
+
+
+def test_the_pull_is_continuous_at_the_horizon(K: torch.Tensor) -> None:
+    to_plane = dp.PlaneMap(dp.Camera(K, HORIZON, torch.tensor([0.0, 1.5, 0], dtype=D)), dp.Plane.z(0.0))
+    steps = torch.tensor([-1e-3, -1e-6, 0.0, 1e-6, 1e-3], dtype=D)
+    pixels = torch.stack([torch.full_like(steps, 342.0), 235.0 - steps], dim=-1)
+    want = (steps / 534).atan().clamp_min(0)
+    torch.testing.assert_close(to_plane.miss(pixels), want, rtol=1e-6, atol=1e-15)
+    strange = torch.tensor([[torch.nan, 0], [torch.inf, 1], [1e300, 0], [342.0, -1e20]], dtype=D).requires_grad_()
+    missed = to_plane.miss(strange)
+    assert missed.isfinite().all()
+    assert torch.autograd.grad(missed.sum(), strange)[0].isfinite().all()
+    on_plane = dp.PlaneMap(dp.Camera(K, HORIZON), dp.Plane.z(0.0))
+    assert (on_plane.miss(pixels) == 0).all()
+    zenith = dp.PlaneMap(dp.Camera(K, t=torch.tensor([0.0, 0, 5], dtype=D)), dp.Plane.z(9.0))
+    straight = torch.tensor([[342.0, 235.0]], dtype=D).requires_grad_()
+    up = dp.PlaneMap(
+        dp.Camera(K, torch.diag(torch.tensor([1.0, -1, -1], dtype=D)), torch.tensor([0.0, 0, -5], dtype=D)),
+        dp.Plane.z(-9.0),
+    )
+    for to_plane in (zenith, up):
+        missed = to_plane.miss(straight)
+        assert torch.autograd.grad(missed.sum(), straight)[0].isfinite().all()
+
+
+@pytest.mark.plain
+def test_a_loss_that_pulls_asks_for_angles() -> None:
+    points = torch.zeros(2, 3)
+    with pytest.raises(ValueError, match="miss: want angles"):
+        dp.PlaneLoss(pull=1.0)(points, points)
+    with pytest.raises(ValueError, match="pull: want"):
+        dp.PlaneLoss(pull=-1.0)
+    nothing = dp.PlaneLoss(pull=1.0).counted(points[:0], points[:0], miss=torch.zeros(0))
+    assert (nothing.loss.item(), nothing.invalid.item(), nothing.total) == (0, 0, 0)
