@@ -64,7 +64,7 @@ class Placed(CameraParts):
             >>> import diffproj as dp
             >>> P2 = [[721.5, 0.0, 609.6, 44.9], [0.0, 721.5, 172.9, 0.2], [0.0, 0.0, 1.0, 0.003]]
             >>> dp.Camera.from_matrix(P2, size=(1242, 375))
-            Camera(f 721.5, 721.5 px, c 609.6, 172.9 px, 1242 x 375 px, torch.float64)
+            Camera(f 721.5, 721.5 px, c 609.6, 172.9 px, pinhole, 1242 x 375 px, torch.float64)
         """
         P = check_tensor("projection", projection, "3 or 4", 4)
         P = _three_rows("projection", P)
@@ -162,8 +162,8 @@ class Placed(CameraParts):
         Example:
             >>> import diffproj as dp
             >>> camera = dp.Camera(torch.eye(3), t=torch.tensor([0.0, 0, 5]))
-            >>> camera.world_to_cam("opengl")[:3].tolist()
-            [[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, -5.0]]
+            >>> camera.world_to_cam()[:3, 3].tolist(), camera.world_to_cam("opengl")[2, 3].item()
+            ([0.0, 0.0, 5.0], -5.0)
         """
         convention = choice("convention", convention, get_args(Convention))  # type: ignore[assignment]
         signs = self.R.new_tensor(_SIGNS[convention])

@@ -1,0 +1,132 @@
+"""Every public map in every mode of PyTorch: what eager gives, with gradients where there are any."""
+
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffproj as dp
+
+K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+R = dp.rotation_from_euler(*torch.tensor([0.3, 0.2, 0.1]))
+LENS = dp.BrownConrady(torch.tensor([-0.28, 0.07, 0.0013, 0.0001, 0.002]))
+CAMERA = dp.Camera(K, R, torch.tensor([0.0, 0, 1000]), LENS, (640, 480))
+SMALL = CAMERA.resized((64, 48))
+PLANE = dp.Plane.z(0.0)
+TO_PLANE = dp.PlaneMap(CAMERA, PLANE)
+FROZEN = dp.PlaneProjector(CAMERA, PLANE)
+LEARNED = dp.PlaneProjector(CAMERA, PLANE, ("focal", "distortion", "pose", "plane"))
+BANK = dp.PlaneProjector(dp.stack([CAMERA, CAMERA.shifted([5.0, 0, 0])]), PLANE)
+EXTENT = (-100.0, -100.0, 100.0, 100.0)
+
+Map = Callable[[Tensor], tuple[Tensor, ...]]
+
+
+def lost(pixels: Tensor) -> tuple[Tensor, ...]:
+    points, valid = FROZEN(pixels)
+    return (dp.PlaneLoss(dp.Huber(5.0), pull=1.0)(points, 0 * points, valid, miss=FROZEN.miss(pixels)),)
+
+
+MAPS: dict[str, tuple[str, Map]] = {
+    "back_project": ("pixels", lambda x: dp.back_project(x, CAMERA, PLANE)),
+    "PlaneMap": ("pixels", lambda x: TO_PLANE(x)),
+    "miss": ("pixels", lambda x: (TO_PLANE.miss(x),)),
+    "explain": ("pixels", lambda x: (dp.explain(x, CAMERA, PLANE),)),
+    "ground_resolution": ("pixels", lambda x: dp.ground_resolution(x, CAMERA, PLANE)),
+    "project": ("points", lambda x: CAMERA.project(x)),
+    "directions": ("pixels", lambda x: CAMERA.directions(x)),
+    "rays": ("pixels", lambda x: CAMERA.rays(x)),
+    "distance": ("points", lambda x: (dp.Plane([0.0, 0.1, 1.0], 2.0).distance(x),)),
+    "frozen projector": ("pixels", lambda x: FROZEN(x)),
+    "learned projector": ("pixels", lambda x: LEARNED(x)),
+    "projector of a bank": ("pixels", lambda x: BANK(x, camera=torch.tensor([1, 0]))),
+    "loss": ("pixels", lost),
+    "rectify": ("image", lambda x: dp.rectify(x, SMALL, PLANE, EXTENT, 10.0, samples=1)),
+    "render": ("image", lambda x: dp.render(x, SMALL, PLANE, EXTENT, size=(16, 12), samples=2)),
+}
+INPUTS = {
+    "pixels": torch.rand(2, 6, 2, generator=torch.Generator().manual_seed(1)) * torch.tensor([640.0, 480]),
+    "points": torch.rand(2, 6, 3, generator=torch.Generator().manual_seed(1)) * 100,
+    "image": torch.rand(2, 1, 48, 64, generator=torch.Generator().manual_seed(1)),
+}
+OF_IMAGES = {"rectify", "render"}
+
+
+@pytest.fixture(autouse=True)
+def _fresh() -> Iterator[None]:
+    torch._dynamo.reset()
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+def under_autocast(function: Map, inputs: Tensor) -> tuple[Tensor, ...]:
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        return function(inputs)
+
+
+def compiled(function: Map, inputs: Tensor) -> tuple[Tensor, ...]:
+    return torch.compile(function, fullgraph=True, backend="aot_eager")(inputs)
+
+
+def exported(function: Map, inputs: Tensor) -> tuple[Tensor, ...]:
+    class Called(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.learned = LEARNED  # so that its parameters are the program's
+
+        def forward(self, x: Tensor) -> tuple[Tensor, ...]:
+            return function(x)
+
+    return torch.export.export(Called(), (inputs,), strict=False).module()(inputs)
+
+
+def mapped(function: Map, inputs: Tensor) -> tuple[Tensor, ...]:
+    return torch.vmap(function)(inputs.unsqueeze(0).expand(3, *inputs.shape))
+
+
+def in_inference_mode(function: Map, inputs: Tensor) -> tuple[Tensor, ...]:
+    with torch.inference_mode():
+        return function(inputs.clone())
+
+
+def deterministic(function: Map, inputs: Tensor) -> tuple[Tensor, ...]:
+    torch.use_deterministic_algorithms(True)
+    return function(inputs)
+
+
+MODES = {
+    "autocast": under_autocast,
+    "compile": compiled,
+    "export": exported,
+    "vmap": mapped,
+    "inference mode": in_inference_mode,
+    "deterministic": deterministic,
+}
+SLOW = {"compile", "export"}
+
+
+@pytest.mark.parametrize("what", MAPS)
+@pytest.mark.parametrize(
+    "mode", [pytest.param(mode, marks=pytest.mark.slow) if mode in SLOW else mode for mode in MODES]
+)
+def test_what_eager_gives(mode: str, what: str) -> None:
+    kind, function = MAPS[what]
+    inputs = INPUTS[kind].clone().requires_grad_(mode not in ("inference mode", "export"))
+    wants = function(inputs)
+    founds = MODES[mode](function, inputs)
+    assert len(wants) == len(founds)
+    for want, found in zip(wants, founds, strict=True):
+        found = found[1] if mode == "vmap" else found
+        assert found.dtype == want.dtype
+        if want.is_floating_point():
+            size = max(float(want.detach().abs().max()), 1.0)
+            tolerance = size * (2e-4 if what in OF_IMAGES else 2e-6)
+            torch.testing.assert_close(found, want, rtol=0, atol=tolerance)
+        else:
+            assert torch.equal(found, want)
+    if inputs.requires_grad and wants[0].requires_grad:
+        (want,) = torch.autograd.grad(wants[0].sum(), inputs)
+        (found,) = torch.autograd.grad(founds[0].sum(), inputs)
+        found = found / 3 if mode == "vmap" else found
+        torch.testing.assert_close(found, want, rtol=1e-3, atol=1e-5 * float(want.abs().max()))
