@@ -104,6 +104,7 @@ __all__ = [
     "PlaneMap",
     "PlaneProjector",
     "Positions",
+    "ProjectorBank",
     "Quantity",
     "Reason",
     "RigCalibration",

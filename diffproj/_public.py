@@ -74,6 +74,7 @@ from diffproj.measurement.fuse import fuse as fuse
 from diffproj.measurement.measure import measure as measure
 from diffproj.measurement.measurement import Measurement as Measurement
 from diffproj.measurement.quantity import Quantity as Quantity
+from diffproj.nn.bank import ProjectorBank as ProjectorBank
 from diffproj.nn.camera import LearnableCamera as LearnableCamera
 from diffproj.nn.loss import PlaneLoss as PlaneLoss
 from diffproj.nn.plane import LearnablePlane as LearnablePlane

@@ -51,8 +51,6 @@ class Batched(Copied, Shown):
             return
         cls._tensors, cls._parts, cls._constants = tensors, tuple(parts), tuple(constants)
         register_pytree(cls, children=(*tensors, *parts), constants=constants)
-        # Building one again from a file sets attributes and runs nothing else: `torch.load(weights_only=True)` may.
-        torch.serialization.add_safe_globals([cls])
 
     @classmethod
     def unchecked(cls: type[B], *args: Any, **fields: Any) -> B:
@@ -351,4 +349,6 @@ def register_pytree(
         serialized_type_name=f"{cls.__module__}.{cls.__qualname__}",
         flatten_with_keys_fn=flatten_with_keys,
     )
+    if build is None:  # built again from a file, attributes are set and nothing else is run
+        torch.serialization.add_safe_globals([cls])
     return cls

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import Kind, tensor_of
-from diffproj._core.torch_private import has_no_values, in_forward_mode, in_functional_transform
+from diffproj._core.torch_private import has_no_values, in_forward_mode, in_functional_transform, traced_beside
 
 BLOCK_POINTS = 2**16
 """Points handled at once on a CPU when no derivative is asked: large enough to hide the cost of dispatch, small enough
@@ -127,6 +127,12 @@ def has_values(*tensors: Tensor) -> bool:
     """Whether the values of these tensors can be read here: not while compiling, under `vmap`, or of a fake tensor."""
     tracing = torch.compiler.is_compiling() or in_functional_transform()
     return not (tracing or any(has_no_values(tensor) for tensor in tensors))
+
+
+def version_of(tensor: Tensor) -> int:
+    """How often a tensor was written to, as far as PyTorch counts; 0 where its values cannot be read."""
+    readable = has_values(tensor) or traced_beside(tensor)
+    return tensor._version if readable and not tensor.is_inference() else 0
 
 
 def spread_evenly(total: int, count: int, device: torch.device) -> Tensor:

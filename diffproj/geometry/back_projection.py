@@ -341,9 +341,8 @@ def warn_if_rounded(camera: Camera, plane: Plane) -> None:
     if looks_at_rounding(camera.t):
         with torch.no_grad():
             plane = plane.like(camera.K)
-            length = plane.length
             height = (dot(plane.normal, camera.center) - plane.offset).abs()
-            warn_of_rounding(plane.offset.abs() + length * vector_norm(camera.t, dim=-1), height)
+            warn_of_rounding(plane.offset.abs() + plane.length * vector_norm(camera.t, dim=-1), height)
 
 
 def _lacks_pose(to_plane: PlaneMap) -> bool:
@@ -391,8 +390,7 @@ def _plane_matrix(camera: Camera, plane: Plane, warn: bool) -> Tensor:
     with torch.no_grad():  # the factor changes no point, so no derivative has to pass through it
         reach, distance = offset.abs() + vector_norm(b, dim=-1) * vector_norm(t, dim=-1), height.abs()
         # A quarter, so that no pixel is large enough for a sum of three products to overflow.
-        factor = 0.25 / M.abs().amax(dim=(-2, -1))
-        factor = torch.where(height < 0, -factor, factor)  # not copysign, which ONNX does not have
+        factor = torch.where(height < 0, -0.25, 0.25) / M.abs().amax(dim=(-2, -1))  # not copysign, which ONNX lacks
         factor = torch.where(distance > rounding(camera.dtype) * reach, factor, 0.0)
         if warn and looks_at_rounding(camera.t):
             warn_of_rounding(reach, distance)
@@ -400,4 +398,3 @@ def _plane_matrix(camera: Camera, plane: Plane, warn: bool) -> Tensor:
 
 
 register_pytree(PlaneMap, children=("matrix", "camera"), constants=("is_per_point",))
-torch.serialization.add_safe_globals([PlaneMap])

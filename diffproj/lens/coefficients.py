@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffproj._core.arguments import Array
 from diffproj._core.batched import Batched, Rearrange
-from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, has_values
+from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, has_values, version_of
 from diffproj._core.torch_private import outside_of_tracing, traced_beside
 from diffproj.lens.plan import AXES, Plan, Recipe, domain_of, plan_of, register_recipe
 from diffproj.lens.protocol import distorted, undistorted
@@ -85,7 +85,7 @@ class CoefficientLens(Batched, ABC):
         if self._given is not None:
             lens._given = _rearranged_plan(self._given, (rearrange,))
         else:
-            root, version, steps = self._origin or (self, _version(self.coefficients), ())
+            root, version, steps = self._origin or (self, version_of(self.coefficients), ())
             if len(steps) < MOST_STEPS:  # further on it works its plan out anew
                 lens._origin = root, version, (*steps, rearrange)
         return lens
@@ -94,7 +94,7 @@ class CoefficientLens(Batched, ABC):
         """The same cut off from the graph, with all that is known of it."""
         lens = self.unchecked(self.coefficients.detach())
         lens._known, lens._given = self._known, self._given
-        lens._origin = self._origin or (self, _version(self.coefficients), ())
+        lens._origin = self._origin or (self, version_of(self.coefficients), ())
         return lens
 
     # ----------------------------------------------------------------------------------------------------- the plan
@@ -189,10 +189,10 @@ class CoefficientLens(Batched, ABC):
         if self._origin is None:
             return None
         root, version, steps = self._origin
-        return (root, steps) if _version(root.coefficients) == version else None
+        return (root, steps) if version_of(root.coefficients) == version else None
 
     def _remembered(self) -> tuple[int, Tensor, Plan | None]:
-        version = _version(self.coefficients)
+        version = version_of(self.coefficients)
         known = self._known
         if known is None or known[0] != version:
             with torch.inference_mode(False), torch.no_grad():
@@ -209,12 +209,6 @@ class CoefficientLens(Batched, ABC):
         check_same_kind(coefficients=self.coefficients, **{name: points})
         batch = broadcast_batches(lens=self.batch_shape, **{name: points.shape[:-2]})
         return points.expand(*batch, *points.shape[-2:])
-
-
-def _version(tensor: Tensor) -> int:
-    """How often a tensor was written to, as far as PyTorch counts; 0 where its values cannot be read."""
-    readable = has_values(tensor) or traced_beside(tensor)
-    return tensor._version if readable and not tensor.is_inference() else 0
 
 
 def _rearranged_part(part: Tensor, steps: tuple[Rearrange, ...], axes: int) -> Tensor:

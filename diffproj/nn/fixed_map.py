@@ -6,7 +6,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from diffproj._core.numerics import has_values
+from diffproj._core.numerics import version_of
 from diffproj.geometry.back_projection import PlaneMap
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
@@ -68,7 +68,7 @@ class FixedMap(GeometryModule):
         add_kind(self, camera)
         self._planned_for: tuple[_Mark, _Mark] | None = None
         if self._model.kind is not None:
-            for name in Plan._fields:
+            for name in PLAN:
                 self.register_buffer(name, None)
             self._plan_again()
         self.register_load_state_dict_post_hook(_rebuild)
@@ -107,7 +107,7 @@ class FixedMap(GeometryModule):
             now = _mark(self.coefficients), _mark(self.domain)
             if now[0] != before[0] and now[1] == before[1]:
                 return self._model.lens(self.coefficients)
-        return self._model.kind.planned(self.coefficients, Plan(*(getattr(self, name) for name in Plan._fields)))
+        return self._model.kind.planned(self.coefficients, Plan(*(getattr(self, name) for name in PLAN)))
 
     def _plan_again(self) -> None:
         """Work out the plan of the coefficients."""
@@ -136,12 +136,15 @@ class FixedMap(GeometryModule):
             self.matrix = PlaneMap(self.camera(), self.plane()).matrix
 
 
+PLAN = tuple(Plan.__annotations__)
+"""The names of the parts of a plan."""
+
 _Mark = tuple[int, int]
 
 
 def _mark(tensor: Tensor) -> _Mark:
     """Which tensor it is, and how often it was written to, as far as that is known."""
-    return id(tensor), tensor._version if has_values(tensor) and not tensor.is_inference() else 0
+    return id(tensor), version_of(tensor)
 
 
 def _rebuild(fixed: FixedMap, _: Any) -> None:

@@ -133,19 +133,10 @@ class PlaneProjector(nn.Module):
 
     def _positions(self, chosen: Tensor | Sequence[int] | int) -> Tensor:
         """Which cameras, as a tensor of whole numbers."""
-        device = self.geometry.device
-        if isinstance(chosen, int):
-            chosen = [whole_number("camera", chosen)]
-            return self._positions(chosen)[0]
-        found = whole_numbers("camera", chosen, "which camera took each sample").to(device)
         shape = self.geometry.batch_shape
         if not shape:
             raise ValueError("camera: want none for a projector of one camera; build it of a batch, dp.stack(cameras)")
-        if found.device.type == "cpu" and has_values(found) and found.numel():
-            low, high = (int(end) for end in found.aminmax())
-            if low < 0 or high >= shape[0]:
-                raise ValueError(f"camera: want numbers from 0 to {shape[0] - 1}, got {low if low < 0 else high}")
-        return found
+        return camera_numbers(chosen, shape[0], self.geometry.device)
 
     def miss(
         self,
@@ -168,3 +159,21 @@ class PlaneProjector(nn.Module):
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""
         return f"learn={self.learn}"
+
+
+def camera_numbers(chosen: Tensor | Sequence[int] | int, count: int, device: torch.device) -> Tensor:
+    """Which of so many cameras took each sample, as a tensor of whole numbers.
+
+    Raises:
+        TypeError: no whole numbers.
+        ValueError: one of no camera; looked at on a CPU, for a GPU would have to be waited for.
+    """
+    if isinstance(chosen, int):
+        found = torch.tensor(whole_number("camera", chosen), dtype=torch.long, device=device)
+    else:
+        found = whole_numbers("camera", chosen, "which camera took each sample").to(device)
+    if found.device.type == "cpu" and has_values(found) and found.numel():
+        low, high = (int(end) for end in found.aminmax())
+        if low < 0 or high >= count:
+            raise ValueError(f"camera: want numbers from 0 to {count - 1}, got {low if low < 0 else high}")
+    return found

@@ -580,6 +580,10 @@ def _uses(t: Things) -> dict[str, Call]:
         "PlaneProjector() of a bank": Call(
             dp.PlaneProjector(t.cameras, n), {"pixels": p.expand(2, *p.shape), "camera": [0, 3]}
         ),
+        "ProjectorBank": Call(
+            dp.ProjectorBank, {"cameras": [c, dp.Camera(t.K, c.R, c.t)], "plane": n, "learn": ("focal",)}
+        ),
+        "ProjectorBank()": Call(dp.ProjectorBank([c, c], n), {"pixels": p.expand(2, *p.shape), "camera": [0, 1]}),
         "PlaneProjector.miss": Call(projector.miss, {"pixels": p, "warp": torch.eye(3, dtype=D), "plane": n}),
         "PlaneProjector() learned": Call(dp.PlaneProjector(c, n, learn="focal"), {"pixels": p}),
         "FixedMap": Call(FixedMap, {"camera": c, "plane": n}),

@@ -98,6 +98,33 @@ def test_parts_of_a_pose_have_exact_gradients(pixels: torch.Tensor) -> None:
     assert torch.autograd.gradcheck(total, inputs, fast_mode=True)
 
 
+def test_a_bank_of_different_lenses(cameras: dp.Camera, pixels: torch.Tensor) -> None:
+    fisheye = dp.KannalaBrandt(torch.tensor([0.01, -0.002, 0, 0], dtype=D))
+    several = [
+        cameras[0],
+        dp.Camera(cameras.K[0], cameras.R[0], cameras.t[0], fisheye, (640, 480)),
+        dp.Camera(cameras.K[0], cameras.R[0], cameras.t[0] + 5),
+        cameras[1],
+    ]
+    bank = dp.ProjectorBank(several, dp.Plane.z(2.0), ("focal", "distortion"))
+    assert (len(bank), len(bank.projectors)) == (4, 3)
+    chosen, samples = [3, 0, 2, 1, 0], pixels[:50].reshape(5, 10, 2).clone().requires_grad_()
+    points, valid = bank(samples, camera=chosen)
+    for i, c in enumerate(chosen):
+        want, seen = dp.back_project(samples[i], several[c], dp.Plane.z(2.0))
+        torch.testing.assert_close(points[i], want, rtol=1e-10, atol=1e-8)
+        assert torch.equal(valid[i], seen)
+    points.sum().backward()
+    assert all(parameter.grad.isfinite().all() for parameter in bank.parameters())
+    again = dp.ProjectorBank(several, dp.Plane.z(0.0), ("focal", "distortion"))
+    again.load_state_dict(bank.state_dict())
+    torch.testing.assert_close(again(samples, camera=chosen)[0], points)
+    with pytest.raises(ValueError, match="cameras: want at least one, each a single camera"):
+        dp.ProjectorBank([cameras], dp.Plane.z(0.0))
+    with pytest.raises(ValueError, match="camera: want numbers from 0 to 3"):
+        bank(samples, camera=[0, 1, 2, 3, 4])
+
+
 class Samples(torch.utils.data.Dataset):
     def __init__(self, cameras: dp.Camera) -> None:
         self.cameras = cameras

@@ -1,0 +1,119 @@
+"""`ProjectorBank`: a `PlaneProjector` for cameras of any lenses and sizes."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from diffproj._core.arguments import Array, listing
+from diffproj._core.numerics import check_tensor
+from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.collating import stack
+from diffproj.geometry.plane import Plane
+from diffproj.lens.models import model_of
+from diffproj.nn.partial import Learn
+from diffproj.nn.projector import PlaneProjector, camera_numbers
+
+
+class ProjectorBank(nn.Module):
+    """Pixels to points on a plane, each sample by one of several cameras, which may have different lenses and sizes.
+
+    Cameras of one lens model and size are one `PlaneProjector`, so that a batch of samples takes as many calls as there
+    are kinds of cameras in it. Cameras that are all of one kind need no bank: `PlaneProjector(dp.stack(cameras), ...)`.
+
+    Args:
+        cameras: at least one, each a single camera at its pose, all of one dtype on one device.
+        plane: the plane that all look at.
+        learn: the parts to learn of each camera, as for `PlaneProjector`; those that a kind of camera does not have,
+            such as the distortion of a pinhole, are left out there.
+
+    Attributes:
+        projectors: one `PlaneProjector` for each kind.
+
+    Raises:
+        TypeError: no cameras, or different dtypes.
+        ValueError: none, cameras that are batches themselves, or what `PlaneProjector` refuses.
+
+    Example:
+        >>> import diffproj as dp
+        >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+        >>> pinhole = dp.Camera(K, t=torch.tensor([0.0, 0, 1000]))
+        >>> fisheye = dp.Camera(K, t=torch.tensor([0.0, 0, 1000]), distortion=dp.KannalaBrandt(torch.zeros(4)))
+        >>> bank = ProjectorBank([pinhole, fisheye], dp.Plane.z(0.0))
+        >>> points, valid = bank(torch.tensor([[[370.0, 240.0]], [[370.0, 240.0]]]), camera=[0, 1])
+        >>> points[:, 0, 0].round(decimals=2).tolist()
+        [100.0, 100.33]
+    """
+
+    kind_of: Tensor
+    place_of: Tensor
+
+    def __init__(self, cameras: Sequence[Camera], plane: Plane, learn: Learn = ()) -> None:
+        super().__init__()
+        given = [as_camera(camera, "cameras") for camera in listing("cameras", cameras, "several dp.Camera")]
+        if not given or any(camera.batch_shape for camera in given):
+            got = (
+                "none"
+                if not given
+                else f"one of batch shape {next(tuple(c.batch_shape) for c in given if c.batch_shape)}"
+            )
+            raise ValueError(f"cameras: want at least one, each a single camera, got {got}")
+        kinds: dict[object, list[int]] = {}
+        for number, camera in enumerate(given):
+            kinds.setdefault((model_of(camera.distortion).name, camera.size), []).append(number)
+        first = given[0].K
+        kind_of, place_of = (torch.zeros(len(given), dtype=torch.long, device=first.device) for _ in range(2))
+        projectors = []
+        for kind, numbers in enumerate(kinds.values()):
+            for place, number in enumerate(numbers):
+                kind_of[number], place_of[number] = kind, place
+            own = learn
+            if given[numbers[0]].distortion is None and not isinstance(learn, str):
+                parts = {part: learn[part] for part in learn} if isinstance(learn, dict) else dict.fromkeys(learn, True)
+                own = {part: where for part, where in parts.items() if part != "distortion"}
+            projectors.append(PlaneProjector(stack([given[number] for number in numbers]), plane, own, False))
+        self.projectors = nn.ModuleList(projectors)
+        self.register_buffer("kind_of", kind_of)
+        self.register_buffer("place_of", place_of)
+
+    def __len__(self) -> int:
+        """The number of cameras."""
+        return len(self.kind_of)
+
+    def forward(
+        self,
+        pixels: Float[Tensor, "samples n 2"] | Array,
+        camera: Int[Tensor, " samples"] | Sequence[int],
+    ) -> tuple[Float[Tensor, "samples n 3"], Bool[Tensor, "samples n"]]:
+        """Points on the plane.
+
+        Args:
+            pixels: `(S, N, 2)`, of S samples.
+            camera: which of the cameras took each sample `(S,)`, whole numbers from 0.
+
+        Returns:
+            Points `(S, N, 3)` in world units and `valid (S, N)`; see `back_project`.
+
+        Raises:
+            TypeError: no floating-point tensor, or no whole numbers.
+            ValueError: shapes or devices that do not fit, or a number of no camera.
+        """
+        pixels = check_tensor("pixels", pixels, "N", 2)
+        chosen = camera_numbers(camera, len(self), self.kind_of.device)
+        if pixels.ndim != 3 or chosen.shape != pixels.shape[:1]:
+            raise ValueError(
+                f"pixels, camera: want shapes (S, N, 2) and (S,), got {tuple(pixels.shape)} and {tuple(chosen.shape)}"
+            )
+        points = pixels.new_zeros(*pixels.shape[:2], 3)
+        valid = torch.zeros(pixels.shape[:2], dtype=torch.bool, device=pixels.device)
+        for kind, projector in enumerate(self.projectors):
+            (samples,) = (self.kind_of[chosen] == kind).nonzero(as_tuple=True)
+            if len(samples):
+                found, seen = projector(pixels[samples], camera=self.place_of[chosen[samples]])
+                points, valid = points.to(found).index_put((samples,), found), valid.index_put((samples,), seen)
+        return points, valid
+
+    if TYPE_CHECKING:  # PyTorch types the call of a module as Any
+        __call__ = forward
