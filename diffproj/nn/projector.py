@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
@@ -14,7 +13,7 @@ from diffproj.geometry.plane import Plane
 from diffproj.nn.camera import check_tied, tied_axes
 from diffproj.nn.fixed_map import FixedMap
 from diffproj.nn.learnable_map import LearnableMap
-from diffproj.nn.partial import PARTS, Learn, learned_parts
+from diffproj.nn.partial import PARTS, Learn, learned_parts, without_autocast
 
 
 class PlaneProjector(nn.Module):
@@ -101,8 +100,7 @@ class PlaneProjector(nn.Module):
             TypeError: no floating-point tensors, or others than the camera's dtype.
             ValueError: shapes or devices that do not fit, or a warp that `Camera.warped` refuses.
         """
-        device = self.geometry.device.type
-        with torch.autocast("cpu" if device == "meta" else device, enabled=False):
+        with without_autocast(self.geometry.device):
             if warp is None and plane is None:
                 return self.geometry()(pixels)
             camera = self.camera if warp is None else self.camera.warped_by("warp", warp)

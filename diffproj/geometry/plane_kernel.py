@@ -1,0 +1,152 @@
+"""What is done to every point: `X = A p / (b . p)` where `b . p` is positive beyond rounding, for `M = [A; b]`.
+
+It stands here twice, for two readers. `recorded` takes steps that every tool of PyTorch can follow: derivatives of any
+order and mode, `vmap`, compilers, export. `direct` takes as few as possible, for short calls cost their number; where a
+gradient is asked, the backward pass is written by hand. A derivative of that gradient is taken through `recorded`.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffproj._core.numerics import entries, interleaved, linear, rounding
+
+
+def components(p: Tensor) -> list[Tensor | None]:
+    """The three components of vectors `(*B, N, 3)`, or of `(*B, N, 2)` and a constant 1, for which `None` stands."""
+    return [*p.unbind(-1), *[None] * (3 - p.shape[-1])]
+
+
+# ---------------------------------------------------------------------------------------------------------- recorded
+
+
+def recorded(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Points `(*B, N, 3)`, zero where not valid, and `valid (*B, N)`.
+
+    Args:
+        p: centred pixels `(*B, N, 2)`, or directions `(*B, N, 3)`.
+        matrix: `M (*B, 4, 3)`.
+        seen: where the lens has an inverse `(*B, N)`; `None`: everywhere.
+    """
+    _, points, _, valid = intersection(p, matrix, seen)
+    return interleaved(points), valid
+
+
+def intersection(
+    p: Tensor, matrix: Tensor, seen: Tensor | None
+) -> tuple[list[Tensor | None], list[Tensor], Tensor, Tensor]:
+    """The components of `p`, those of the points, `1 / (b . p)`, and which are valid; 0 where they are not."""
+    rows, sight = entries(matrix), components(p)
+    denominator, threshold = denominator_and_threshold(matrix, sight)
+    valid = denominator > threshold  # false for NaN, too
+    if seen is not None:
+        valid = valid & seen
+    # Where there is no point, the denominator becomes infinite and p finite before anything is divided, so that
+    # neither values nor gradients of infinite or parallel rays ever arise.
+    sight = [component if component is None else torch.where(valid, component, 0.0) for component in sight]
+    *numerators, denominator = linear(rows, sight)
+    inverse = torch.where(valid, denominator, torch.inf).reciprocal()
+    return sight, [numerator * inverse for numerator in numerators], inverse, valid
+
+
+def denominator_and_threshold(matrix: Tensor, sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
+    """`b . p`, and the size below which rounding decides its sign: that of its terms, and of what b was built from."""
+    b = matrix[..., 3, :]
+    size = _size(b.detach()) * rounding(b.dtype)
+    terms = [component if component is None else component.detach().abs() for component in sight]
+    (denominator,), (threshold,) = linear(_as_row(b), sight), linear(_as_row(size), terms)
+    return denominator, threshold
+
+
+def _size(b: Tensor) -> Tensor:
+    size = b.abs()
+    return torch.add(size, size.amax(-1, keepdim=True), alpha=torch.finfo(b.dtype).eps)
+
+
+def _as_row(vector: Tensor) -> list[Sequence[Tensor]]:
+    return [vector.unsqueeze(-1).unbind(-2)]
+
+
+# ------------------------------------------------------------------------------------------------------------ direct
+
+
+def direct(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The same as `recorded` where values can be read and nothing but a gradient may be asked."""
+    if torch.is_grad_enabled() and (p.requires_grad or matrix.requires_grad):
+        return _WithGradient.apply(p, matrix, seen)  # type: ignore[no-any-return]
+    points, valid, _, _ = _divided(p, matrix, seen)
+    return points, valid
+
+
+def _divided(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """The points, which are valid, `b . p`, and which are not valid (`None`: all are)."""
+    numerators, denominator = _times(matrix, p.unsqueeze(-3)).split((3, 1), dim=-2)
+    threshold = _times(_size(matrix[..., 3, :]).unsqueeze(-2), p.abs().unsqueeze(-3))
+    valid = torch.add(denominator, threshold, alpha=-rounding(p.dtype)).squeeze(-2) > 0  # false for NaN, too
+    if seen is not None:
+        valid = valid & seen
+    points = p.new_empty((*p.shape[:-1], 3))
+    torch.div(numerators, denominator, out=points.mT)
+    denominator = denominator.squeeze(-2)
+    if p.device.type == "cpu" and bool(valid.all()):  # the usual case; elsewhere looking waits
+        return points, valid, denominator, None
+    hidden = ~valid
+    points.masked_fill_(hidden.unsqueeze(-1), 0.0)
+    return points, valid, denominator.masked_fill_(hidden, torch.inf), hidden
+
+
+def _times(matrix: Tensor, p: Tensor) -> Tensor:
+    """Products `(*B, m, N)` of matrices `(*B, m, 3)` and vectors `(*B, 1, N, 3)`, or of `(*B, 1, N, 2)` and a 1."""
+    (x, y, *z), (by_x, by_y, rest) = p.unbind(-1), matrix.unsqueeze(-1).unbind(-2)
+    return torch.addcmul(rest * z[0] if z else rest, x, by_x).addcmul_(y, by_y)
+
+
+class _WithGradient(torch.autograd.Function):
+    """`direct` with its gradient: by `dX = (A dp - X (b . dp)) / (b . p)`, and 0 where there is no point."""
+
+    @staticmethod
+    def forward(ctx: Any, p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor]:
+        points, valid, denominator, hidden = _divided(p, matrix, seen)
+        ctx.save_for_backward(p, matrix, seen, denominator, hidden)
+        ctx.mark_non_differentiable(valid)
+        return points, valid
+
+    @staticmethod
+    def backward(ctx: Any, by_points: Tensor, _: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        p, matrix, seen, denominator, hidden = ctx.saved_tensors
+        of_p, of_matrix, _ = ctx.needs_input_grad
+        if torch.is_grad_enabled():
+            return *_recorded_gradient(p, matrix, seen, by_points, (of_p, of_matrix)), None
+        if hidden is not None:
+            p, by_points = (tensor.masked_fill(hidden.unsqueeze(-1), 0.0) for tensor in (p, by_points))
+        inverse = denominator.reciprocal().unsqueeze(-2)
+        by_numerators = by_points.mT * inverse  # (*B, 3, N)
+        # By p through the numerators; along p this is what the denominator takes back.
+        through = _times(matrix[..., :3, :].mT, by_numerators.mT.unsqueeze(-3))
+        x, y, *z = p.unsqueeze(-3).unbind(-1)
+        along = torch.addcmul(through[..., 2:, :] * z[0] if z else through[..., 2:, :], through[..., :1, :], x)
+        by_denominator = torch.addcmul(along, through[..., 1:2, :], y).mul_(-inverse)
+        by_p = by_matrix = None
+        if of_matrix:
+            by_products = torch.cat([by_numerators, by_denominator], dim=-2)
+            by_columns = [(by_products * component).sum(-1) for component in (x, y, *z)]
+            by_columns = by_columns if z else [*by_columns, by_products.sum(-1)]
+            by_matrix = torch.stack(by_columns, dim=-1).sum_to_size(matrix.shape)
+        if of_p:
+            length = p.shape[-1]
+            b = matrix[..., 3, :length].unsqueeze(-1)
+            by_p = torch.addcmul(through[..., :length, :], by_denominator, b).mT
+        return by_p, by_matrix, None
+
+
+def _recorded_gradient(
+    p: Tensor, matrix: Tensor, seen: Tensor | None, by_points: Tensor, wanted: tuple[bool, bool]
+) -> list[Tensor | None]:
+    """The gradient by p and by the matrix, as a function that can be differentiated again."""
+    inputs = [tensor.view_as(tensor) for tensor in (p, matrix)]  # so that one does not count as a part of the other
+    points, _ = recorded(*inputs, seen)
+    chosen = [one for one, want in zip(inputs, wanted, strict=True) if want]
+    found = iter(torch.autograd.grad(points, chosen, by_points, create_graph=True))
+    return [next(found) if want else None for want in wanted]
