@@ -253,9 +253,11 @@ def in_blocks(
     Returns:
         What `function(points)` returns.
     """
+    if torch.compiler.is_compiling():  # a graph is not to depend on lengths, which are not even asked for here
+        return function(points)
     batch = max(1, points.shape[:-2].numel())
     length = max(1, block_points(points.device) // batch)
-    if wants_derivative(points, *parameters) or points.shape[-2] <= length:  # a graph is not to depend on the length
+    if points.shape[-2] <= length or wants_derivative(points, *parameters):
         return function(points)
     axis = points.ndim - 2
     results: list[Any] = []

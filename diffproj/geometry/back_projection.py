@@ -12,8 +12,9 @@ Both parts of the fraction are linear in `p`, so one matrix holds camera and pla
 
 `s` is the depth along the optical axis (behind a fisheye lens, the distance along the ray), so the point lies in front
 of the camera where `s > 0`. The sign of `M` is free and is chosen so that `d - n . C >= 0`: then one comparison,
-`b . p > rounding`, says that the ray neither runs parallel to the plane nor meets it behind the camera. Pixels are
-centred before they meet `M`, which keeps float32 accurate; `M` itself is built in float64.
+`b . p > s . |p|`, says that the ray neither runs parallel to the plane nor meets it behind the camera: s holds the
+size of b, times some units in the last place. Pixels are centred before they meet `M`, which keeps float32 accurate;
+`M` itself is built in float64.
 """
 
 import enum
@@ -75,7 +76,7 @@ class PlaneMap(Copied, Shown):
     `back_project` builds one for each call; keep one where camera and plane stay as they are. It is a PyTree.
 
     Attributes:
-        matrix: `M (*B, 4, 3)` up to a positive factor, in the camera's dtype.
+        matrix: `[A; b; s] (*B, 5, 3)` up to a positive factor, in the camera's dtype.
         camera: the camera, whose principal point and lens lead from pixels to `p`.
         is_per_point: whether the last batch axis runs over the points.
 
@@ -174,7 +175,7 @@ class PlaneMap(Copied, Shown):
 
     def _sight_slopes(self, sight: Sequence[Tensor | None], valid: Tensor) -> list[list[Tensor]]:
         """The derivatives of `M p` by u and by v: four components each, to within a multiple of `M p` itself."""
-        rows, (x, y, z) = entries(self.matrix), sight
+        (*rows, _), (x, y, z) = entries(self.matrix), sight
         if x is None or y is None or z is None:  # a pinhole, where p follows the pixel
             return [[row[axis] for row in rows] for axis in (0, 1)]
         direction = torch.stack([x, y, torch.where(valid, z, 1.0)], dim=-1)
@@ -199,7 +200,7 @@ class PlaneMap(Copied, Shown):
     def _sight(self, pixels: Tensor) -> tuple[Tensor, Tensor | None]:
         """Centred pixels or, behind a lens, directions, and where the lens has an inverse (`None`: everywhere)."""
         if self.camera.distortion is None:
-            return pixels - self.camera.K[..., :2, 2].unsqueeze(-2), None
+            return pixels - self.camera.K[..., None, :2, 2], None
         return self.camera.directions(pixels)
 
     def _checked(self, pixels: Tensor | Array) -> Tensor:
@@ -345,7 +346,7 @@ def _largest_singular_value(by_u: Tensor, by_v: Tensor) -> Tensor:
 
 
 def _plane_matrix(camera: Camera, plane: Plane, warn: bool) -> Tensor:
-    """`M (*B, 4, 3)` in float64, scaled to `max |M| = 1/4`; zero where the camera's centre lies in the plane."""
+    """`[A; b; s] (*B, 5, 3)` in float64, scaled to `max |A, b| = 1/4`; zero where the camera's centre is in the plane."""
     R, t = in_float64(camera.R), in_float64(camera.t)
     normal, offset = in_float64(plane.normal), in_float64(plane.offset)
     b = dot(R, normal.unsqueeze(-2))  # the normal in the camera frame: n . C = -b . t
@@ -363,7 +364,11 @@ def _plane_matrix(camera: Camera, plane: Plane, warn: bool) -> Tensor:
         factor = torch.where(distance > rounding(camera.dtype) * reach, factor, 0.0)
         if warn and looks_at_rounding(camera.t):
             warn_of_rounding(reach, distance)
-    return M * factor[..., None, None]
+        # Of the terms of b . p, and of what b was built from: where b is to be 0, it is what rounding left.
+        size = M[..., 3:, :].abs()
+        size = (size + size.amax(-1, keepdim=True) * torch.finfo(camera.dtype).eps) * rounding(camera.dtype)
+        factor = factor[..., None, None]
+    return torch.cat([M * factor, size * factor.abs()], dim=-2)
 
 
 register_pytree(PlaneMap, children=("matrix", "camera"), constants=("is_per_point",))

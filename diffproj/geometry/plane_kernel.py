@@ -1,4 +1,4 @@
-"""What is done to every point: `X = A p / (b . p)` where `b . p` is positive beyond rounding, for `M = [A; b]`.
+"""What is done to every point: `X = A p / (b . p)` where `b . p > s . |p|`, for a matrix `[A; b; s] (5, 3)`.
 
 It stands here twice, for two readers. `recorded` takes steps that every tool of PyTorch can follow: derivatives of any
 order and mode, `vmap`, compilers, export. `direct` takes as few as possible, for short calls cost their number; where a
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._core.numerics import entries, interleaved, linear, rounding
+from diffproj._core.numerics import entries, interleaved, linear
 
 
 def components(p: Tensor) -> list[Tensor | None]:
@@ -27,7 +27,7 @@ def recorded(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Te
 
     Args:
         p: centred pixels `(*B, N, 2)`, or directions `(*B, N, 3)`.
-        matrix: `M (*B, 4, 3)`.
+        matrix: `[A; b; s] (*B, 5, 3)`.
         seen: where the lens has an inverse `(*B, N)`; `None`: everywhere.
     """
     _, points, _, valid = intersection(p, matrix, seen)
@@ -38,7 +38,8 @@ def intersection(
     p: Tensor, matrix: Tensor, seen: Tensor | None
 ) -> tuple[list[Tensor | None], list[Tensor], Tensor, Tensor]:
     """The components of `p`, those of the points, `1 / (b . p)`, and which are valid; 0 where they are not."""
-    rows, sight = entries(matrix), components(p)
+    *rows, _ = entries(matrix)
+    sight = components(p)
     denominator, threshold = denominator_and_threshold(matrix, sight)
     valid = denominator > threshold  # false for NaN, too
     if seen is not None:
@@ -52,21 +53,10 @@ def intersection(
 
 
 def denominator_and_threshold(matrix: Tensor, sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
-    """`b . p`, and the size below which rounding decides its sign: that of its terms, and of what b was built from."""
-    b = matrix[..., 3, :]
-    size = _size(b.detach()) * rounding(b.dtype)
+    """`b . p`, and `s . |p|`, the size below which rounding decides its sign."""
+    *_, b, size = entries(matrix)
     terms = [component if component is None else component.detach().abs() for component in sight]
-    (denominator,), (threshold,) = linear(_as_row(b), sight), linear(_as_row(size), terms)
-    return denominator, threshold
-
-
-def _size(b: Tensor) -> Tensor:
-    size = b.abs()
-    return torch.add(size, size.amax(-1, keepdim=True), alpha=torch.finfo(b.dtype).eps)
-
-
-def _as_row(vector: Tensor) -> list[Sequence[Tensor]]:
-    return [vector.unsqueeze(-1).unbind(-2)]
+    return linear([b], sight)[0], linear([[part.detach() for part in size]], terms)[0]
 
 
 # ------------------------------------------------------------------------------------------------------------ direct
@@ -82,9 +72,11 @@ def direct(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Tens
 
 def _divided(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """The points, which are valid, `b . p`, and which are not valid (`None`: all are)."""
-    numerators, denominator = _times(matrix, p.unsqueeze(-3)).split((3, 1), dim=-2)
-    threshold = _times(_size(matrix[..., 3, :]).unsqueeze(-2), p.abs().unsqueeze(-3))
-    valid = torch.add(denominator, threshold, alpha=-rounding(p.dtype)).squeeze(-2) > 0  # false for NaN, too
+    x, y, *z = p.unsqueeze(-3).unbind(-1)
+    products = _times(matrix.narrow(-2, 0, 4), x, y, *z)
+    threshold = _times(matrix.narrow(-2, 4, 1), x.abs(), y.abs(), *(part.abs() for part in z))
+    numerators, denominator = products.narrow(-2, 0, 3), products.narrow(-2, 3, 1)
+    valid = (denominator > threshold).squeeze(-2)  # false for NaN, too
     if seen is not None:
         valid = valid & seen
     points = p.new_empty((*p.shape[:-1], 3))
@@ -97,9 +89,9 @@ def _divided(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Te
     return points, valid, denominator.masked_fill_(hidden, torch.inf), hidden
 
 
-def _times(matrix: Tensor, p: Tensor) -> Tensor:
-    """Products `(*B, m, N)` of matrices `(*B, m, 3)` and vectors `(*B, 1, N, 3)`, or of `(*B, 1, N, 2)` and a 1."""
-    (x, y, *z), (by_x, by_y, rest) = p.unbind(-1), matrix.unsqueeze(-1).unbind(-2)
+def _times(matrix: Tensor, x: Tensor, y: Tensor, *z: Tensor) -> Tensor:
+    """Products `(*B, m, N)` of matrices `(*B, m, 3)` and vectors of components `(*B, 1, N)`; z is 1 if left out."""
+    by_x, by_y, rest = matrix.unsqueeze(-1).unbind(-2)
     return torch.addcmul(rest * z[0] if z else rest, x, by_x).addcmul_(y, by_y)
 
 
@@ -124,13 +116,13 @@ class _WithGradient(torch.autograd.Function):
         inverse = denominator.reciprocal().unsqueeze(-2)
         by_numerators = by_points.mT * inverse  # (*B, 3, N)
         # By p through the numerators; along p this is what the denominator takes back.
-        through = _times(matrix[..., :3, :].mT, by_numerators.mT.unsqueeze(-3))
+        through = _times(matrix.narrow(-2, 0, 3).mT, *by_numerators.unsqueeze(-3).unbind(-2))
         x, y, *z = p.unsqueeze(-3).unbind(-1)
         along = torch.addcmul(through[..., 2:, :] * z[0] if z else through[..., 2:, :], through[..., :1, :], x)
         by_denominator = torch.addcmul(along, through[..., 1:2, :], y).mul_(-inverse)
         by_p = by_matrix = None
         if of_matrix:
-            by_products = torch.cat([by_numerators, by_denominator], dim=-2)
+            by_products = torch.cat([by_numerators, by_denominator, torch.zeros_like(by_denominator)], dim=-2)
             by_columns = [(by_products * component).sum(-1) for component in (x, y, *z)]
             by_columns = by_columns if z else [*by_columns, by_products.sum(-1)]
             by_matrix = torch.stack(by_columns, dim=-1).sum_to_size(matrix.shape)
