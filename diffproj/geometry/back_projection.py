@@ -21,6 +21,7 @@ import enum
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from kornia.geometry.camera import PinholeCamera
@@ -31,6 +32,7 @@ from diffproj._core.arguments import Array, tensor_of
 from diffproj._core.batched import register_pytree
 from diffproj._core.copying import Copied
 from diffproj._core.numerics import (
+    arrays_of,
     broadcast_batches,
     check_same_kind,
     dot,
@@ -40,6 +42,7 @@ from diffproj._core.numerics import (
     in_float64,
     linear,
     rounding,
+    wants_derivative,
 )
 from diffproj._core.shown import Shown
 from diffproj._core.torch_private import in_forward_mode
@@ -118,7 +121,7 @@ class PlaneMap(Copied, Shown):
         if plane.is_per_point:
             camera = camera[..., None]
         broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape)
-        self.matrix = _plane_matrix(camera, plane, warn).to(camera.dtype)
+        self.matrix = _plane_matrix(camera, plane, warn)
         # The principal point is read at each call: that of a K that was written to since would not go with the matrix.
         self.camera = Camera.unchecked(camera.K.clone(), camera.R, camera.t, camera.distortion, camera.size)
         self.is_per_point = plane.is_per_point
@@ -346,29 +349,60 @@ def _largest_singular_value(by_u: Tensor, by_v: Tensor) -> Tensor:
 
 
 def _plane_matrix(camera: Camera, plane: Plane, warn: bool) -> Tensor:
-    """`[A; b; s] (*B, 5, 3)` in float64, scaled to `max |A, b| = 1/4`; zero where the camera's centre is in the plane."""
-    R, t = in_float64(camera.R), in_float64(camera.t)
-    normal, offset = in_float64(plane.normal), in_float64(plane.offset)
-    b = dot(R, normal.unsqueeze(-2))  # the normal in the camera frame: n . C = -b . t
-    center = -dot(R.mT, t.unsqueeze(-2))
-    height = offset + dot(b, t)
-    A = center.unsqueeze(-1) * b.unsqueeze(-2) + height[..., None, None] * R.mT
-    M = torch.cat([A, b.unsqueeze(-2)], dim=-2)
-    if camera.distortion is None:  # so far G is R^T, as behind a lens: a pinhole's M is that times diag(F^-1, 1)
-        F_inverse = pixel_to_normalized(in_float64(camera.K))
-        M = torch.cat([(M[..., :2].unsqueeze(-1) * F_inverse.unsqueeze(-3)).sum(dim=-2), M[..., 2:]], dim=-1)
-    with torch.no_grad():  # the factor changes no point, so no derivative has to pass through it
-        reach, distance = offset.abs() + vector_norm(b, dim=-1) * vector_norm(t, dim=-1), height.abs()
-        # A quarter, so that no pixel is large enough for a sum of three products to overflow.
-        factor = (0.25 / M.abs().amax(dim=(-2, -1))).copysign(height)
-        factor = torch.where(distance > rounding(camera.dtype) * reach, factor, 0.0)
-        if warn and looks_at_rounding(camera.t):
-            warn_of_rounding(reach, distance)
-        # Of the terms of b . p, and of what b was built from: where b is to be 0, it is what rounding left.
-        size = M[..., 3:, :].abs()
-        size = (size + size.amax(-1, keepdim=True) * torch.finfo(camera.dtype).eps) * rounding(camera.dtype)
-        factor = factor[..., None, None]
-    return torch.cat([M * factor, size * factor.abs()], dim=-2)
+    """`[A; b; s] (*B, 5, 3)`, scaled to `max |A, b| = 1/4`; zero where the camera's centre lies in the plane."""
+    given = camera.K, camera.R, camera.t, plane.normal, plane.offset
+    behind_lens, dtype = camera.distortion is not None, camera.dtype
+    if wants_derivative(*given) or not has_values(*given):
+        parts = [in_float64(part) for part in given]
+        M, b, height = _unscaled(torch, *parts, behind_lens)
+        with torch.no_grad():  # the factor changes no point, so no derivative has to pass through it
+            factor, size, reach = _scale(torch, M, b, height, parts[2], parts[4], dtype)
+        matrix = torch.cat([M * factor, size], dim=-2)
+    else:
+        library, parts = arrays_of(*given, double=True)
+        with np.errstate(all="ignore"):
+            M, b, height = _unscaled(library, *parts, behind_lens)
+            factor, size, reach = _scale(library, M, b, height, parts[2], parts[4], dtype)
+            matrix = torch.as_tensor(library.concatenate((M * factor, size), -2))
+    if warn and looks_at_rounding(camera.t):
+        warn_of_rounding(reach, abs(height))
+    return matrix.to(dtype)
+
+
+def _unscaled(
+    library: Any, K: Any, R: Any, t: Any, normal: Any, offset: Any, behind_lens: bool
+) -> tuple[Any, Any, Any]:
+    """`M = [A; b] (*B, 4, 3)`, the normal in the camera frame `(*B, 3)` and `d - n . C`, as arrays or as tensors."""
+    b = (R * normal[..., None, :]).sum(-1)
+    height = offset + (b * t).sum(-1)  # n . C = -b . t
+    minus_center = (R * t[..., None]).sum(-2)
+    A = height[..., None, None] * R.swapaxes(-1, -2) - minus_center[..., None] * b[..., None, :]
+    M = library.concatenate((A, b[..., None, :]), -2)
+    if behind_lens:
+        return M, b, height
+    # So far G is R^T, as behind a lens: a pinhole's M is that times diag(F^-1, 1).
+    f_xx, f_xy, f_yx, f_yy = (K[..., row, column, None] for row in (0, 1) for column in (0, 1))
+    determinant = f_xx * f_yy - f_xy * f_yx
+    x, y, z = (M[..., column] for column in range(3))
+    columns = (x * f_yy - y * f_yx) / determinant, (y * f_xx - x * f_xy) / determinant, z
+    return library.stack(columns, -1), b, height
+
+
+def _scale(library: Any, M: Any, b: Any, height: Any, t: Any, offset: Any, dtype: torch.dtype) -> tuple[Any, Any, Any]:
+    """The factor of M `(*B, 1, 1)`, the row s `(*B, 1, 3)`, and how far all is from the world's origin `(*B,)`."""
+    reach = abs(offset) + _length(library, b) * _length(library, t)
+    # A quarter, so that no pixel is large enough for a sum of three products to overflow.
+    factor = library.copysign(0.25 / library.amax(abs(M), (-2, -1)), height)
+    factor = library.where(abs(height) > rounding(dtype) * reach, factor, 0.0)[..., None, None]
+    # Of the terms of b . p, and of what b was built from: where b is to be 0, it is what rounding left.
+    size = abs(M[..., 3:, :] * factor)
+    size = rounding(dtype) * (size + torch.finfo(dtype).eps * library.amax(size, -1)[..., None])
+    return factor, size, reach
+
+
+def _length(library: Any, vector: Any) -> Any:
+    x, y, z = (vector[..., axis] for axis in range(3))
+    return library.hypot(library.hypot(x, y), z)
 
 
 register_pytree(PlaneMap, children=("matrix", "camera"), constants=("is_per_point",))

@@ -13,6 +13,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
@@ -22,6 +23,7 @@ from torch.utils._pytree import tree_leaves
 from diffproj._core.arguments import Array, instance, meeting
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
+    arrays_of,
     broadcast_batches,
     check_same_kind,
     check_tensor,
@@ -384,16 +386,22 @@ def _pinhole(direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
 
 def is_rotation(R: Float[Tensor, "*shape 3 3"]) -> Bool[Tensor, "*shape"]:
     """Which matrices are rotations, to `ROTATION_TOLERANCE`."""
+    return _are_rotations(torch, R, torch.eye(3, dtype=R.dtype, device=R.device))
+
+
+def _are_rotations(library: Any, R: Any, identity: Any) -> Any:
     # No matrix product, which autocast and TF32 round.
-    products = (R.unsqueeze(-1) * R.unsqueeze(-2)).sum(-3)
-    error = (products - torch.eye(3, dtype=R.dtype, device=R.device)).abs()
-    return (error <= ROTATION_TOLERANCE).flatten(-2).all(-1) & (torch.linalg.det(R) > 0)
+    error = abs((R[..., None] * R[..., None, :]).sum(-3) - identity)
+    return (error <= ROTATION_TOLERANCE).all(-1).all(-1) & (library.linalg.det(R) > 0)
 
 
 def _check_pose(R: Tensor, t: Tensor) -> None:
-    if not bool(t.isfinite().all()):
+    library, (R, t, identity) = arrays_of(R, t, torch.eye(3, dtype=R.dtype, device=R.device))
+    if not bool(library.isfinite(t).all()):
         raise ValueError("t: want finite values, got NaN or infinity")
-    if not bool(is_rotation(R).all()):
+    with np.errstate(over="ignore", invalid="ignore"):
+        rotations = _are_rotations(library, R, identity)
+    if not bool(rotations.all()):
         raise ValueError(
             "R: want rotation matrices (orthonormal to 1e-5, determinant +1), got others; "
             "kornia's axis_angle_to_rotation_matrix makes them from rotation vectors"
