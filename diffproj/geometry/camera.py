@@ -31,9 +31,11 @@ from diffproj._core.numerics import (
     entries,
     has_values,
     in_blocks,
+    interleaved,
     least_depth,
     linear,
     transform,
+    wants_derivative,
 )
 from diffproj.geometry import description
 from diffproj.geometry.changed_images import ChangedImages
@@ -251,20 +253,23 @@ class Camera(
 
     def _project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """`project` of points that were checked, without a warning of rounding."""
+        derivative = wants_derivative(points, *self.tensors())
 
         def project(points: Tensor) -> tuple[Tensor, Tensor]:
-            finite = points.detach().sum(-1).isfinite()
-            points = points.nan_to_num(0.0, 0.0, 0.0)  # the slope by R is the point, and 0 times infinity is NaN
+            x, y, z = points.detach().unbind(-1)
+            finite = (x + y + z).isfinite()
+            if derivative:
+                points = points.nan_to_num(0.0, 0.0, 0.0)  # the slope by R is the point, and 0 times infinity is NaN
             rotated = linear(entries(self.R), points.unbind(-1))
             direction = [x + shift.unsqueeze(-1) for x, shift in zip(rotated, self.t.unbind(-1), strict=True)]
             if self.distortion is None:
-                xy, valid = _pinhole(direction)
+                xy, valid = _pinhole(direction, derivative)
             else:
                 xy_lens, valid = self.distortion.project_direction(torch.stack(direction, dim=-1))
                 xy = list(xy_lens.unbind(-1))
             valid = valid & finite
             uv = linear(entries(self.K[..., :2, :]), [*xy, None])
-            return torch.stack([torch.where(valid, x, 0.0) for x in uv], dim=-1), valid
+            return interleaved([torch.where(valid, x, 0.0) for x in uv]), valid
 
         pixels, valid = in_blocks(project, points, *self.tensors())
         return pixels, valid
@@ -374,14 +379,18 @@ def check_lens(distortion: object) -> None:
         instance("distortion", distortion, (), "a lens such as dp.BrownConrady(coefficients)")
 
 
-def _pinhole(direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
-    """Perspective division, valid where the point is finite and in front."""
+def _pinhole(direction: Sequence[Tensor], derivative: bool) -> tuple[list[Tensor], Tensor]:
+    """Perspective division, valid where the point is finite and in front.
+
+    Elsewhere it gives 0 where a derivative is asked, and anything where none is.
+    """
     x, y, z = direction
     reach, limits = x.abs() + y.abs(), torch.finfo(z.dtype)
     # Derivatives hold 1 / z, which must not overflow; and x / z, not x times 1 / z, whose derivative would sooner.
     valid = (z > limits.eps * reach + least_depth(z.dtype)) & (reach + z).isfinite()
-    depth = torch.where(valid, z, 1.0)
-    return [torch.where(valid, component, 0.0) / depth for component in (x, y)], valid
+    if derivative:
+        x, y, z = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0), torch.where(valid, z, 1.0)
+    return [x / z, y / z], valid
 
 
 def is_rotation(R: Float[Tensor, "*shape 3 3"]) -> Bool[Tensor, "*shape"]:
