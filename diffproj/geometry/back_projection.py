@@ -138,15 +138,29 @@ class PlaneMap(Copied, Shown):
     ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
         """Points `(*B, N, 3)` and `valid (*B, N)` of pixels `(*B, N, 2)`; see `back_project`."""
         pixels = self._checked(pixels)
-        parts = self.matrix, *self.camera.tensors()
         kernel = direct if has_values(pixels, self.matrix) and not in_forward_mode() else recorded
 
         def to_plane(pixels: Tensor) -> tuple[Tensor, Tensor]:
             p, seen = self._sight(pixels)
             return kernel(p, self.matrix, seen)
 
-        points, valid = in_blocks(to_plane, pixels, *parts)
+        points, valid = in_blocks(to_plane, pixels, self.matrix, *self.camera.tensors())
         return (points.squeeze(-2), valid.squeeze(-1)) if self.is_per_point else (points, valid)
+
+    def with_reach(
+        self, pixels: Float[Tensor, "*#batch n 2"] | Array
+    ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"], Bool[Tensor, "*#batch n"]]:
+        """Points and `valid` as calling the map gives them, and where the lens has an inverse `(*B, N)`."""
+
+        def to_plane(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            p, seen = self._sight(pixels)
+            points, valid = recorded(p, self.matrix, seen)
+            return points, valid, p.isfinite().all(-1) if seen is None else seen
+
+        points, valid, seen = in_blocks(to_plane, self._checked(pixels), self.matrix, *self.camera.tensors())
+        if self.is_per_point:
+            return points.squeeze(-2), valid.squeeze(-1), seen.squeeze(-1)
+        return points, valid, seen
 
     def resolution(
         self, pixels: Float[Tensor, "*#batch n 2"] | Array
