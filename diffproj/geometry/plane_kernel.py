@@ -92,7 +92,8 @@ def _divided(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Te
 def _times(matrix: Tensor, x: Tensor, y: Tensor, *z: Tensor) -> Tensor:
     """Products `(*B, m, N)` of matrices `(*B, m, 3)` and vectors of components `(*B, 1, N)`; z is 1 if left out."""
     by_x, by_y, rest = matrix.unsqueeze(-1).unbind(-2)
-    return torch.addcmul(rest * z[0] if z else rest, x, by_x).addcmul_(y, by_y)
+    products = (rest * z[0]).addcmul_(x, by_x) if z else torch.addcmul(rest, x, by_x)
+    return products.addcmul_(y, by_y)
 
 
 class _WithGradient(torch.autograd.Function):
@@ -113,24 +114,31 @@ class _WithGradient(torch.autograd.Function):
             return *_recorded_gradient(p, matrix, seen, by_points, (of_p, of_matrix)), None
         if hidden is not None:
             p, by_points = (tensor.masked_fill(hidden.unsqueeze(-1), 0.0) for tensor in (p, by_points))
+        x, y, *z = p.unsqueeze(-3).unbind(-1)
         inverse = denominator.reciprocal().unsqueeze(-2)
         by_numerators = by_points.mT * inverse  # (*B, 3, N)
+        rows = [_by_columns(by_numerators, x, y, *z)] if of_matrix else []
         # By p through the numerators; along p this is what the denominator takes back.
         through = _times(matrix.narrow(-2, 0, 3).mT, *by_numerators.unsqueeze(-3).unbind(-2))
-        x, y, *z = p.unsqueeze(-3).unbind(-1)
-        along = torch.addcmul(through[..., 2:, :] * z[0] if z else through[..., 2:, :], through[..., :1, :], x)
-        by_denominator = torch.addcmul(along, through[..., 1:2, :], y).mul_(-inverse)
+        del by_numerators  # for the memory at the peak
+        by_x, by_y, by_z = (through.narrow(-2, axis, 1) for axis in range(3))
+        along = (by_z * z[0]).addcmul_(by_x, x) if z else torch.addcmul(by_z, by_x, x)
+        by_denominator = along.addcmul_(by_y, y).mul_(inverse).neg_()
         by_p = by_matrix = None
         if of_matrix:
-            by_products = torch.cat([by_numerators, by_denominator, torch.zeros_like(by_denominator)], dim=-2)
-            by_columns = [(by_products * component).sum(-1) for component in (x, y, *z)]
-            by_columns = by_columns if z else [*by_columns, by_products.sum(-1)]
-            by_matrix = torch.stack(by_columns, dim=-1).sum_to_size(matrix.shape)
+            rows.append(_by_columns(by_denominator, x, y, *z))
+            by_matrix = torch.cat([*rows, torch.zeros_like(rows[1])], dim=-2).sum_to_size(matrix.shape)  # s is constant
         if of_p:
             length = p.shape[-1]
             b = matrix[..., 3, :length].unsqueeze(-1)
-            by_p = torch.addcmul(through[..., :length, :], by_denominator, b).mT
+            by_p = through.narrow(-2, 0, length).addcmul_(by_denominator, b).mT
         return by_p, by_matrix, None
+
+
+def _by_columns(by_products: Tensor, *components: Tensor) -> Tensor:
+    """The gradient `(*B, m, 3)` by a matrix from that by its products `(*B, m, N)`."""
+    columns = [(by_products * component).sum(-1) for component in components]
+    return torch.stack(columns if len(columns) == 3 else [*columns, by_products.sum(-1)], dim=-1)
 
 
 def _recorded_gradient(
