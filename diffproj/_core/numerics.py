@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -133,6 +134,22 @@ def version_of(tensor: Tensor) -> int:
     """How often a tensor was written to, as far as PyTorch counts; 0 where its values cannot be read."""
     readable = has_values(tensor) or traced_beside(tensor)
     return tensor._version if readable and not tensor.is_inference() else 0
+
+
+def arrays_of(*tensors: Tensor, double: bool = False) -> tuple[Any, list[Any]]:
+    """The library that works fastest with the values of small tensors, and them in its form.
+
+    On the CPU it is NumPy, whose steps on a few values take a third of the time of PyTorch's. What is done with them
+    has to be in words that both libraries know. NumPy warns of what PyTorch takes for granted: see `np.errstate`.
+
+    Args:
+        tensors: without a look at their graph.
+        double: whether in float64.
+    """
+    if all(tensor.device.type == "cpu" for tensor in tensors):
+        arrays = [tensor.numpy(force=True) for tensor in tensors]
+        return np, [array.astype(np.float64, copy=False) for array in arrays] if double else arrays
+    return torch, [in_float64(tensor.detach()) if double else tensor.detach() for tensor in tensors]
 
 
 def spread_evenly(total: int, count: int, device: torch.device) -> Tensor:
@@ -259,11 +276,11 @@ def in_blocks(
     Returns:
         What `function(points)` returns.
     """
-    if wants_derivative(points, *parameters):  # a graph is not to depend on lengths, which are not even asked for here
+    if torch.compiler.is_compiling():  # a graph is not to depend on lengths, which are not even asked for here
         return function(points)
     batch = max(1, points.shape[:-2].numel())
     length = max(1, block_points(points.device) // batch)
-    if points.shape[-2] <= length:
+    if points.shape[-2] <= length or wants_derivative(points, *parameters):
         return function(points)
     axis = points.ndim - 2
     results: list[Any] = []

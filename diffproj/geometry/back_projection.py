@@ -12,8 +12,9 @@ Both parts of the fraction are linear in `p`, so one matrix holds camera and pla
 
 `s` is the depth along the optical axis (behind a fisheye lens, the distance along the ray), so the point lies in front
 of the camera where `s > 0`. The sign of `M` is free and is chosen so that `d - n . C >= 0`: then one comparison,
-`b . p > rounding`, says that the ray neither runs parallel to the plane nor meets it behind the camera. Pixels are
-centred before they meet `M`, which keeps float32 accurate; `M` itself is built in float64.
+`b . p > s . |p|`, says that the ray neither runs parallel to the plane nor meets it behind the camera: s holds the
+size of b, times some units in the last place. Pixels are centred before they meet `M`, which keeps float32 accurate;
+`M` itself is built in float64.
 """
 
 import enum
@@ -36,12 +37,10 @@ from diffproj._core.numerics import (
     entries,
     has_values,
     in_blocks,
-    in_float64,
-    interleaved,
     linear,
-    rounding,
 )
 from diffproj._core.shown import Shown
+from diffproj._core.torch_private import in_forward_mode
 from diffproj._core.warn import warn_caller
 from diffproj.geometry import description
 from diffproj.geometry.camera import Camera, as_camera, meeting_camera
@@ -49,6 +48,8 @@ from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.geometry.intrinsics import pixel_to_normalized
 from diffproj.geometry.map_views import MapViews
 from diffproj.geometry.plane import Plane, as_plane
+from diffproj.geometry.plane_kernel import components, denominator_and_threshold, direct, intersection, recorded
+from diffproj.geometry.plane_matrix import plane_matrix
 from diffproj.lens.slopes import by_direction
 
 
@@ -75,7 +76,7 @@ class PlaneMap(MapViews, Copied, Shown):
     `back_project` builds one for each call; keep one where camera and plane stay as they are. It is a PyTree.
 
     Attributes:
-        matrix: `M (*B, 4, 3)` up to a positive factor, in the camera's dtype.
+        matrix: `[A; b; s] (*B, 5, 3)` up to a positive factor, in the camera's dtype.
         camera: the camera, whose principal point and lens lead from pixels to `p`.
         is_per_point: whether the last batch axis runs over the points.
 
@@ -117,7 +118,7 @@ class PlaneMap(MapViews, Copied, Shown):
         if plane.is_per_point:
             camera = camera[..., None]
         broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape)
-        self.matrix = _plane_matrix(camera, plane, warn).to(camera.dtype)
+        self.matrix = plane_matrix(camera, plane, warn)
         # The principal point is read at each call: that of a K that was written to since would not go with the matrix.
         self.camera = Camera.unchecked(camera.K.clone(), camera.R, camera.t, camera.distortion, camera.size)
         self.is_per_point = plane.is_per_point
@@ -133,24 +134,36 @@ class PlaneMap(MapViews, Copied, Shown):
         self, pixels: Float[Tensor, "*#batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
         """Points `(*B, N, 3)` and `valid (*B, N)` of pixels `(*B, N, 2)`; see `back_project`."""
-        rows = entries(self.matrix)
+        pixels = self._checked(pixels)
+        kernel = direct if has_values(pixels, self.matrix) and not in_forward_mode() else recorded
 
         def to_plane(pixels: Tensor) -> tuple[Tensor, Tensor]:
-            return self._to_plane(pixels, rows)
+            p, seen = self._sight(pixels)
+            return kernel(p, self.matrix, seen)
 
-        points, valid = in_blocks(to_plane, self._checked(pixels), self.matrix, *self.camera.tensors())
+        points, valid = in_blocks(to_plane, pixels, self.matrix, *self.camera.tensors())
         return (points.squeeze(-2), valid.squeeze(-1)) if self.is_per_point else (points, valid)
+
+    def with_reach(
+        self, pixels: Float[Tensor, "*#batch n 2"] | Array
+    ) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"], Bool[Tensor, "*#batch n"]]:
+        """Points and `valid` as calling the map gives them, and where the lens has an inverse `(*B, N)`."""
+
+        def to_plane(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            p, seen = self._sight(pixels)
+            points, valid = recorded(p, self.matrix, seen)
+            return points, valid, p.isfinite().all(-1) if seen is None else seen
+
+        points, valid, seen = in_blocks(to_plane, self._checked(pixels), self.matrix, *self.camera.tensors())
+        if self.is_per_point:
+            return points.squeeze(-2), valid.squeeze(-1), seen.squeeze(-1)
+        return points, valid, seen
 
     def resolution(
         self, pixels: Float[Tensor, "*#batch n 2"] | Array
     ) -> tuple[Float[Tensor, "*#batch n"], Bool[Tensor, "*#batch n"]]:
         """World units that a pixel covers `(*B, N)`, and `valid (*B, N)`; see the function `ground_resolution`."""
-        rows = entries(self.matrix)
-
-        def resolution(pixels: Tensor) -> tuple[Tensor, Tensor]:
-            return self._resolution(pixels, rows)
-
-        found, valid = in_blocks(resolution, self._checked(pixels), self.matrix, *self.camera.tensors())
+        found, valid = in_blocks(self._resolution, self._checked(pixels), self.matrix, *self.camera.tensors())
         return (found.squeeze(-1), valid.squeeze(-1)) if self.is_per_point else (found, valid)
 
     def explain(self, pixels: Float[Tensor, "*#batch n 2"] | Array) -> Int[Tensor, "*#batch n"]:
@@ -162,30 +175,11 @@ class PlaneMap(MapViews, Copied, Shown):
         planes = "a plane for each point" if self.is_per_point else ""
         return [repr(self.camera), planes]
 
-    def _to_plane(self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
-        _, points, _, valid = self._intersection(pixels, rows)
-        return interleaved(points), valid
-
-    def _intersection(
-        self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]
-    ) -> tuple[list[Tensor | None], list[Tensor], Tensor, Tensor]:
-        """The components of `p`, those of the points, `1 / (b . p)`, and which are valid; 0 where they are not."""
-        sight, seen = self._sight(pixels)
-        denominator, threshold = _denominator(self.matrix, rows[3], sight)
-        valid = denominator > threshold  # false for NaN, too
-        if seen is not None:
-            valid = valid & seen
-        # Where there is no point, the denominator becomes infinite and p finite before anything is divided, so that
-        # neither values nor gradients of infinite or parallel rays ever arise.
-        sight = [component if component is None else torch.where(valid, component, 0.0) for component in sight]
-        *numerators, denominator = linear(rows, sight)
-        inverse = torch.where(valid, denominator, torch.inf).reciprocal()
-        return sight, [numerator * inverse for numerator in numerators], inverse, valid
-
-    def _resolution(self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
+    def _resolution(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """See `ground_resolution`."""
-        sight, points, inverse, valid = self._intersection(pixels, rows)
-        steps = self._sight_slopes(sight, valid, rows)
+        p, seen = self._sight(pixels)
+        sight, points, inverse, valid = intersection(p, self.matrix, seen)
+        steps = self._sight_slopes(sight, valid)
         by_u, by_v = (
             torch.stack([(along - point * fall) * inverse for along, point in zip(step[:3], points, strict=True)], -1)
             for step in steps
@@ -193,11 +187,9 @@ class PlaneMap(MapViews, Copied, Shown):
         )
         return _largest_singular_value(by_u, by_v), valid
 
-    def _sight_slopes(
-        self, sight: Sequence[Tensor | None], valid: Tensor, rows: Sequence[Sequence[Tensor]]
-    ) -> list[list[Tensor]]:
+    def _sight_slopes(self, sight: Sequence[Tensor | None], valid: Tensor) -> list[list[Tensor]]:
         """The derivatives of `M p` by u and by v: four components each, to within a multiple of `M p` itself."""
-        x, y, z = sight
+        (*rows, _), (x, y, z) = entries(self.matrix), sight
         if x is None or y is None or z is None:  # a pinhole, where p follows the pixel
             return [[row[axis] for row in rows] for axis in (0, 1)]
         direction = torch.stack([x, y, torch.where(valid, z, 1.0)], dim=-1)
@@ -210,8 +202,8 @@ class PlaneMap(MapViews, Copied, Shown):
         return [linear(rows, step.unbind(-1)) for step in steps]
 
     def _explain(self, pixels: Tensor) -> tuple[Tensor]:
-        sight, seen = self._sight(pixels)
-        denominator, threshold = _denominator(self.matrix, entries(self.matrix)[3], sight)
+        p, seen = self._sight(pixels)
+        denominator, threshold = denominator_and_threshold(self.matrix, components(p))
         reasons = torch.where(denominator > threshold, Reason.VALID, Reason.PARALLEL)
         reasons = torch.where(denominator < -threshold, Reason.BEHIND, reasons)
         reasons = torch.where((self.matrix[..., 3, :] == 0).all(dim=-1, keepdim=True), Reason.CAMERA_ON_PLANE, reasons)
@@ -219,21 +211,21 @@ class PlaneMap(MapViews, Copied, Shown):
             reasons = torch.where(seen, reasons, Reason.OUTSIDE_LENS)
         return (torch.where(pixels.isfinite().all(dim=-1), reasons, Reason.NOT_FINITE),)
 
-    def _sight(self, pixels: Tensor) -> tuple[list[Tensor | None], Tensor | None]:
-        """The components of `p` (`None` for a constant 1), and where the lens has an inverse (`None`: everywhere)."""
+    def _sight(self, pixels: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Centred pixels or, behind a lens, directions, and where the lens has an inverse (`None`: everywhere)."""
         if self.camera.distortion is None:
-            center = self.camera.K[..., :2, 2, None].unbind(-2)
-            return [*(x - c for x, c in zip(pixels.unbind(-1), center, strict=True)), None], None
-        direction, seen = self.camera.directions(pixels)
-        return list(direction.unbind(-1)), seen
+            return pixels - self.camera.K[..., None, :2, 2], None
+        return self.camera.directions(pixels)
 
     def _checked(self, pixels: Tensor | Array) -> Tensor:
         if self.is_per_point:
             pixels = tensor_of("pixels", pixels, self.camera.K)
             pixels = pixels.unsqueeze(-2) if pixels.ndim >= 2 else pixels
         pixels = meeting_camera(self.camera, "pixels", pixels, 2)
-        batch = broadcast_batches(map=self.matrix.shape[:-2], pixels=pixels.shape[:-2])
-        return pixels.expand(*batch, *pixels.shape[-2:])
+        batch, given = self.matrix.shape[:-2], pixels.shape[:-2]
+        if batch == given:
+            return pixels
+        return pixels.expand(*broadcast_batches(map=batch, pixels=given), *pixels.shape[-2:])
 
 
 def back_project(
@@ -364,37 +356,6 @@ def _largest_singular_value(by_u: Tensor, by_v: Tensor) -> Tensor:
     squared = (a + c) / 2 + spread
     some = squared > 0
     return torch.where(some, torch.where(some, squared, 1.0).sqrt(), 0.0) * size
-
-
-def _denominator(matrix: Tensor, b: Sequence[Tensor], sight: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
-    """`b . p`, and the size below which rounding decides its sign: that of its terms, and of what b was built from."""
-    size = matrix[..., 3, :].detach().abs()
-    size = (size + size.amax(-1, keepdim=True) * torch.finfo(size.dtype).eps) * rounding(size.dtype)
-    bounds = size.unsqueeze(-1).unbind(-2)
-    threshold = linear([bounds], [component if component is None else component.detach().abs() for component in sight])
-    return linear([b], sight)[0], threshold[0]
-
-
-def _plane_matrix(camera: Camera, plane: Plane, warn: bool) -> Tensor:
-    """`M (*B, 4, 3)` in float64, scaled to `max |M| = 1/4`; zero where the camera's centre lies in the plane."""
-    R, t = in_float64(camera.R), in_float64(camera.t)
-    normal, offset = in_float64(plane.normal), in_float64(plane.offset)
-    b = dot(R, normal.unsqueeze(-2))  # the normal in the camera frame: n . C = -b . t
-    center = -dot(R.mT, t.unsqueeze(-2))
-    height = offset + dot(b, t)
-    A = center.unsqueeze(-1) * b.unsqueeze(-2) + height[..., None, None] * R.mT
-    M = torch.cat([A, b.unsqueeze(-2)], dim=-2)
-    if camera.distortion is None:  # so far G is R^T, as behind a lens: a pinhole's M is that times diag(F^-1, 1)
-        F_inverse = pixel_to_normalized(in_float64(camera.K))
-        M = torch.cat([(M[..., :2].unsqueeze(-1) * F_inverse.unsqueeze(-3)).sum(dim=-2), M[..., 2:]], dim=-1)
-    with torch.no_grad():  # the factor changes no point, so no derivative has to pass through it
-        reach, distance = offset.abs() + vector_norm(b, dim=-1) * vector_norm(t, dim=-1), height.abs()
-        # A quarter, so that no pixel is large enough for a sum of three products to overflow.
-        factor = torch.where(height < 0, -0.25, 0.25) / M.abs().amax(dim=(-2, -1))  # not copysign, which ONNX lacks
-        factor = torch.where(distance > rounding(camera.dtype) * reach, factor, 0.0)
-        if warn and looks_at_rounding(camera.t):
-            warn_of_rounding(reach, distance)
-    return M * factor[..., None, None]
 
 
 register_pytree(PlaneMap, children=("matrix", "camera"), constants=("is_per_point",))

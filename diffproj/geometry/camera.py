@@ -13,6 +13,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
@@ -22,6 +23,7 @@ from torch.utils._pytree import tree_leaves
 from diffproj._core.arguments import Array, instance, meeting
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
+    arrays_of,
     broadcast_batches,
     check_same_kind,
     check_tensor,
@@ -29,9 +31,11 @@ from diffproj._core.numerics import (
     entries,
     has_values,
     in_blocks,
+    interleaved,
     least_depth,
     linear,
     transform,
+    wants_derivative,
 )
 from diffproj.geometry import description
 from diffproj.geometry.changed_images import ChangedImages
@@ -251,20 +255,23 @@ class Camera(
 
     def _project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """`project` of points that were checked, without a warning of rounding."""
+        derivative = wants_derivative(points, *self.tensors())
 
         def project(points: Tensor) -> tuple[Tensor, Tensor]:
-            finite = points.detach().sum(-1).isfinite()
-            points = points.nan_to_num(0.0, 0.0, 0.0)  # the slope by R is the point, and 0 times infinity is NaN
+            x, y, z = points.detach().unbind(-1)
+            finite = (x + y + z).isfinite()
+            if derivative:
+                points = points.nan_to_num(0.0, 0.0, 0.0)  # the slope by R is the point, and 0 times infinity is NaN
             rotated = linear(entries(self.R), points.unbind(-1))
             direction = [x + shift.unsqueeze(-1) for x, shift in zip(rotated, self.t.unbind(-1), strict=True)]
             if self.distortion is None:
-                xy, valid = _pinhole(direction)
+                xy, valid = _pinhole(direction, derivative)
             else:
                 xy_lens, valid = self.distortion.project_direction(torch.stack(direction, dim=-1))
                 xy = list(xy_lens.unbind(-1))
             valid = valid & finite
             uv = linear(entries(self.K[..., :2, :]), [*xy, None])
-            return torch.stack([torch.where(valid, x, 0.0) for x in uv], dim=-1), valid
+            return interleaved([torch.where(valid, x, 0.0) for x in uv]), valid
 
         pixels, valid = in_blocks(project, points, *self.tensors())
         return pixels, valid
@@ -339,12 +346,28 @@ def as_camera(camera: Camera | PinholeCamera, name: str = "camera") -> Camera:
 
 def meeting_camera(camera: Camera, name: str, value: object, length: int) -> Tensor:
     """Check points or pixels against a camera, lift half precision, expand to the common batch shape."""
+    if isinstance(value, Tensor) and _fits(camera, value, length):  # the usual case, and five times as fast
+        return value
     tensor = check_tensor(name, value, "N", length, like=camera.K)
     if tensor is not value:  # lifted: any precision of the camera holds a half exactly
         tensor = tensor.to(camera.dtype)
     check_same_kind(**{"camera": camera.K, name: tensor})
     batch = broadcast_batches(**{"camera": camera.batch_shape, name: tensor.shape[:-2]})
     return tensor.expand(*batch, *tensor.shape[-2:])
+
+
+def _fits(camera: Camera, tensor: Tensor, length: int) -> bool:
+    """Whether a tensor of vectors is just as the camera needs it."""
+    K = camera.K
+    return (
+        tensor.dtype is K.dtype
+        and tensor.device == K.device
+        and tensor.layout is torch.strided
+        and not (tensor.is_nested or tensor.is_neg())
+        and tensor.ndim >= 2
+        and tensor.shape[-1] == length
+        and tensor.shape[:-2] == K.shape[:-2]
+    )
 
 
 def check_lens(distortion: object) -> None:
@@ -358,28 +381,38 @@ def check_lens(distortion: object) -> None:
         instance("distortion", distortion, (), "a lens such as dp.BrownConrady(coefficients)")
 
 
-def _pinhole(direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
-    """Perspective division, valid where the point is finite and in front."""
+def _pinhole(direction: Sequence[Tensor], derivative: bool) -> tuple[list[Tensor], Tensor]:
+    """Perspective division, valid where the point is finite and in front.
+
+    Elsewhere it gives 0 where a derivative is asked, and anything where none is.
+    """
     x, y, z = direction
     reach, limits = x.abs() + y.abs(), torch.finfo(z.dtype)
     # Derivatives hold 1 / z, which must not overflow; and x / z, not x times 1 / z, whose derivative would sooner.
     valid = (z > limits.eps * reach + least_depth(z.dtype)) & (reach + z).isfinite()
-    depth = torch.where(valid, z, 1.0)
-    return [torch.where(valid, component, 0.0) / depth for component in (x, y)], valid
+    if derivative:
+        x, y, z = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0), torch.where(valid, z, 1.0)
+    return [x / z, y / z], valid
 
 
 def is_rotation(R: Float[Tensor, "*shape 3 3"]) -> Bool[Tensor, "*shape"]:
     """Which matrices are rotations, to `ROTATION_TOLERANCE`."""
+    return _are_rotations(torch, R, torch.eye(3, dtype=R.dtype, device=R.device))
+
+
+def _are_rotations(library: Any, R: Any, identity: Any) -> Any:
     # No matrix product, which autocast and TF32 round.
-    products = (R.unsqueeze(-1) * R.unsqueeze(-2)).sum(-3)
-    error = (products - torch.eye(3, dtype=R.dtype, device=R.device)).abs()
-    return (error <= ROTATION_TOLERANCE).flatten(-2).all(-1) & (torch.linalg.det(R) > 0)
+    error = abs((R[..., None] * R[..., None, :]).sum(-3) - identity)
+    return (error <= ROTATION_TOLERANCE).all(-1).all(-1) & (library.linalg.det(R) > 0)
 
 
 def _check_pose(R: Tensor, t: Tensor) -> None:
-    if not bool(t.isfinite().all()):
+    library, (R, t, identity) = arrays_of(R, t, torch.eye(3, dtype=R.dtype, device=R.device))
+    if not bool(library.isfinite(t).all()):
         raise ValueError("t: want finite values, got NaN or infinity")
-    if not bool(is_rotation(R).all()):
+    with np.errstate(over="ignore", invalid="ignore"):
+        rotations = _are_rotations(library, R, identity)
+    if not bool(rotations.all()):
         raise ValueError(
             "R: want rotation matrices (orthonormal to 1e-5, determinant +1), got others; "
             "kornia's axis_angle_to_rotation_matrix makes them from rotation vectors"

@@ -1,6 +1,7 @@
 """Where float32 does not suffice: scenes far from the world's origin, whose coordinates it rounds to visible steps."""
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,8 +23,8 @@ def looks_at_rounding(t: Tensor) -> bool:
     return t.dtype == torch.float32 and t.device.type == "cpu" and has_values(t)
 
 
-def warn_of_rounding(reach: Tensor, height: Tensor) -> None:
-    """Warn where float32 rounds places visibly.
+def warn_of_rounding(reach: Any, height: Any) -> None:
+    """Warn where float32 rounds places visibly: tensors, or arrays.
 
     Args:
         reach: how far camera and plane are from the world's origin `(*B,)`.
@@ -35,7 +36,7 @@ def warn_of_rounding(reach: Tensor, height: Tensor) -> None:
         return
     doubtful = doubtful & (height > rounding(torch.float32) * reach)
     if bool(doubtful.any()):
-        share = 10.0 ** math.floor(math.log10(STEP * float((reach / height)[doubtful].amax())))
+        share = 10.0 ** math.floor(math.log10(STEP * float((reach / height)[doubtful].max())))
         warn_caller(
             "float32: the scene is so far from the world's origin that rounding moves places on the plane by "
             f"{share:g} of the camera's distance from it, or more; use float64 for camera and pixels, from the start, "

@@ -4,11 +4,12 @@
 invertible 2x2 matrix, and the camera model stays exact.
 """
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.numerics import in_float64, rounding
+from diffproj._core.numerics import arrays_of, in_float64, rounding
 
 
 def intrinsic_matrix(
@@ -97,14 +98,17 @@ def check_intrinsics(K: Tensor) -> None:
     Raises:
         ValueError: not finite, a last row other than (0, 0, 1), or singular.
     """
-    last_row = K.new_tensor([0.0, 0.0, 1.0])
-    if not bool(K.isfinite().all()):
+    eps = torch.finfo(K.dtype).eps
+    library, (K,) = arrays_of(K)
+    if not bool(library.isfinite(K).all()):
         raise ValueError("K: want finite values, got NaN or infinity")
-    if bool(((K[..., 2, :] - last_row).abs() > 1e-5).any()):
+    if bool((abs(K[..., 2, :2]) > 1e-5).any() or (abs(K[..., 2, 2] - 1) > 1e-5).any()):
         raise ValueError("K: want the last row (0, 0, 1), got another; divide by K[..., 2, 2]")
-    F = K[..., :2, :2]
-    determinant = F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0]
-    if bool((determinant.abs() <= 8 * torch.finfo(K.dtype).eps * F.square().sum(dim=(-2, -1))).any()):
+    with np.errstate(over="ignore", invalid="ignore"):
+        F = K[..., :2, :2]
+        determinant = F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0]
+        singular = abs(determinant) <= 8 * eps * (F * F).sum((-2, -1))
+    if bool(singular.any()):
         raise ValueError("K: want an invertible matrix, got a singular one; are both focal lengths set?")
 
 

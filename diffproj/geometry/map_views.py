@@ -1,7 +1,6 @@
 """What else a `PlaneMap` tells: by how much rays miss the plane, its homography, and some of a batch of maps."""
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,7 +12,6 @@ from diffproj._core.batched import check_index, index_batch
 from diffproj._core.numerics import (
     broadcast_batches,
     check_tensor,
-    entries,
     has_values,
     in_blocks,
     in_float64,
@@ -22,6 +20,7 @@ from diffproj._core.numerics import (
 )
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.intrinsics import pixel_to_normalized
+from diffproj.geometry.plane_kernel import intersection
 
 
 class MapViews:
@@ -42,11 +41,7 @@ class MapViews:
 
         def _checked(self, pixels: Tensor | Array) -> Tensor: ...
 
-        def _sight(self, pixels: Tensor) -> tuple[list[Tensor | None], Tensor | None]: ...
-
-        def _intersection(
-            self, pixels: Tensor, rows: Sequence[Sequence[Tensor]]
-        ) -> tuple[list[Tensor | None], list[Tensor], Tensor, Tensor]: ...
+        def _sight(self, pixels: Tensor) -> tuple[Tensor, Tensor | None]: ...
 
     def miss(self, pixels: Float[Tensor, "*#batch n 2"] | Array) -> Float[Tensor, "*#batch n"]:
         """The angle in radians by which each pixel's ray misses the plane `(*B, N)`; 0 where it meets it.
@@ -78,8 +73,8 @@ class MapViews:
         return found.squeeze(-1) if self.is_per_point else found
 
     def _miss(self, pixels: Tensor) -> Tensor:
-        sight, seen = self._sight(pixels)
-        meets = self._intersection(pixels.detach(), entries(self.matrix.detach()))[3]
+        p, seen = self._sight(pixels)
+        meets = intersection(p.detach(), self.matrix.detach(), seen)[3]
         finite = (pixels.abs() < torch.finfo(pixels.dtype).max ** 0.25).all(-1)
         off_plane = (self.matrix[..., 3, :] != 0).any(-1, keepdim=True)
         seen = finite if seen is None else finite & seen
@@ -93,8 +88,7 @@ class MapViews:
             F = self.camera.K[..., :2, :2]
             normal = torch.cat([(F * normal[..., :2, None]).sum(-2), normal[..., 2:]], dim=-1)
         else:
-            x, y, z = sight
-            ray = torch.stack([x, y, torch.ones_like(x) if z is None else z], dim=-1)  # type: ignore[list-item]
+            ray = p
         axis = torch.tensor([0.0, 0.0, 1.0], dtype=ray.dtype, device=ray.device)
         normal = torch.where(off_plane, normal, axis).unsqueeze(-2)
         away = -_angle(torch.where(seen.unsqueeze(-1), ray, axis), normal)
@@ -165,7 +159,7 @@ class MapViews:
             raise IndexError("map: want a batch of maps to index, got planes per point")
         check_index(index)
         batch = broadcast_batches(map=self.matrix.shape[:-2], camera=self.camera.batch_shape)
-        matrix, camera = self.matrix.expand(*batch, 4, 3), self.camera
+        matrix, camera = self.matrix.expand(*batch, *self.matrix.shape[-2:]), self.camera
         camera = camera if camera.batch_shape == batch else camera.expand(*batch)
         return type(self).unchecked(index_batch(matrix, index, 2), camera[index], False)
 

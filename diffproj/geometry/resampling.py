@@ -53,7 +53,7 @@ def resampled(
     corners = pixel_grid(*shape, like)
     if samples is not None:
         total, share = _mean(source, look_up_of(None), corners, samples)
-        return _finished(total, share)
+        return (total, share > 0) if samples == (1, 1) else _finished(total, share)
     with torch.no_grad():
         places, valid = look_up_of(None)((corners + 0.5).reshape(-1, 2))
         if 0 in (*source.shape[:-3], *valid.shape[:-1]):  # of no images
@@ -124,17 +124,17 @@ def _mean(source: Tensor, look_up: LookUp, corners: Tensor, samples: tuple[int, 
 
 def _sampled(source: Tensor, places: Tensor, valid: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Bilinear samples `(*B, C, rows, columns)` of the source at `places`, and which are inside it."""
-    size = _size(source)
-    seen = valid & inside(places, size)
-    last = places.new_tensor([max(size[0] - 1, 1), max(size[1] - 1, 1)])
-    grid = torch.where(seen.unsqueeze(-1), places, 0.0) * 2 / last - 1
-    batch = torch.broadcast_shapes(source.shape[:-3], grid.shape[:-2])
-    source, grid = source.expand(*batch, *source.shape[-3:]), grid.expand(*batch, *grid.shape[-2:])
+    width, height = _size(source)
+    seen = valid & inside(places, (width, height))
+    batch = torch.broadcast_shapes(source.shape[:-3], places.shape[:-2])
+    # An image of one row or column becomes one of two: positions are told by the distance between first and last.
+    source = source.expand(*batch, source.shape[-3], max(height, 2), max(width, 2))
+    last = places.new_tensor([max(width, 2) - 1, max(height, 2) - 1])
+    # Beyond the outermost centres an image goes on as it is there. What is not seen is far outside, where all is 0.
+    grid = torch.where(seen.unsqueeze(-1), (places * 2 / last - 1).clamp(-1, 1), -3.0).expand(*batch, -1, -1)
     flat = grid.reshape(-1, *shape, 2).to(source)
-    sampled = grid_sample(source.reshape(-1, *source.shape[-3:]), flat, padding_mode="border", align_corners=True)
-    sampled = sampled.reshape(*batch, *sampled.shape[1:])
-    seen = seen.expand(*batch, seen.shape[-1]).unflatten(-1, shape)
-    return torch.where(seen.unsqueeze(-3), sampled, 0.0), seen
+    sampled = grid_sample(source.reshape(-1, *source.shape[-3:]), flat, align_corners=True)
+    return sampled.reshape(*batch, *sampled.shape[1:]), seen.expand(*batch, -1).unflatten(-1, shape)
 
 
 def _size(source: Tensor) -> tuple[int, int]:

@@ -6,8 +6,7 @@ homography, is inverted in closed form first), in three stages:
 1. an initial estimate from a table of the inverse along the radius;
 2. a fixed number of Newton steps without autograd, then a globally convergent search, with a maximum number of steps,
    for the few points that have not converged;
-3. where a derivative is wanted, two more Newton steps recorded by autograd. At the solution, one step has the exact
-   first derivative of the inverse function, two have the second.
+3. where a derivative is wanted, what `brown_gradient` adds.
 """
 
 import torch
@@ -15,10 +14,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj._core.arguments import Array
-from diffproj._core.numerics import in_blocks, least_depth, rounding
+from diffproj._core.numerics import in_blocks, interleaved, least_depth, rounding
 from diffproj.lens import brown_domain
 from diffproj.lens.brown_equations import COUNTS, Terms, bend, by_coefficients, radial, tilted
-from diffproj.lens.brown_inverse import newton, search, squared_domain, untilted
+from diffproj.lens.brown_gradient import follows_gradient, recorded, with_gradient
+from diffproj.lens.brown_inverse import search, squared_domain
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.compiling import derivative_wanted
 from diffproj.lens.table import inverse_table
@@ -112,11 +112,11 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
             coefficients = self._usable(plan.domain)
             x, y, valid = search(coefficients.detach(), plan, points.detach())
             x, y = torch.where(valid, x, 0), torch.where(valid, y, 0)
-            if derivative_wanted(points, coefficients):
-                terms = Terms.of(coefficients)
-                target = untilted(terms, torch.where(valid.unsqueeze(-1), points, 0))
-                x, y = newton(terms, target, x, y, steps=2)
-            return torch.stack([x, y], dim=-1), valid
+            if not derivative_wanted(points, coefficients):
+                return interleaved([x, y]), valid
+            if follows_gradient(points, coefficients):
+                return with_gradient(coefficients, points, x, y, valid), valid
+            return recorded(coefficients, points, x, y, valid), valid
 
         return in_blocks(backward, xy_distorted, self.coefficients)  # type: ignore[return-value]
 

@@ -18,6 +18,8 @@ Sources: Brown 1966 (radial, tangential); Claus and Fitzgibbon 2005 (rational); 
 prism); Louhichi, Fournel, Lavest and Ben Aissia 2007 (tilt). The order of the coefficients is OpenCV's.
 """
 
+from collections.abc import Iterator
+from itertools import islice
 from typing import NamedTuple
 
 import torch
@@ -239,17 +241,31 @@ def tilted(terms: Terms, x: Tensor, y: Tensor) -> Tilted:
 
 def by_coefficients(terms: Terms, x: Tensor, y: Tensor, count: int) -> Tensor:
     """Derivatives of the distorted point by the first `count` coefficients `(*B, N, 2, count)`."""
-    s, zero = torch.addcmul(x * x, y, y), torch.zeros_like(x)
-    powers = [s, s * s, s * s * s]
-    below = denominator(terms, s)
-    numerator = [(x * power / below, y * power / below) for power in powers]
-    columns = [*numerator[:2], (2 * x * y, s + 2 * y * y), (s + 2 * x * x, 2 * x * y), *numerator[2:]]
-    factor = radial(terms, s)
-    columns += [(-factor * u, -factor * v) for u, v in numerator]
-    columns += [(s, zero), (powers[1], zero), (zero, s), (zero, powers[1])]
+    columns = list(islice(columns_by_coefficients(terms, x, y), count))
     if terms.tilt is not None:
         columns = _by_tilt(terms.tilt, *bend(terms, x, y), columns)
-    return torch.stack([torch.stack(row, dim=-1) for row in zip(*columns[:count], strict=True)], dim=-2)
+    return torch.stack([torch.stack(row, dim=-1) for row in zip(*columns, strict=True)], dim=-2)
+
+
+def columns_by_coefficients(terms: Terms, x: Tensor, y: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Derivatives of `(x', y')`, before the tilt, by one of its coefficients after the other."""
+    s = torch.addcmul(x * x, y, y)
+    below = denominator(terms, s)
+
+    def by_power(power: int) -> tuple[Tensor, Tensor]:
+        grows = s**power / below
+        return x * grows, y * grows
+
+    yield from (by_power(power) for power in (1, 2))
+    yield 2 * x * y, s + 2 * y * y
+    yield s + 2 * x * x, 2 * x * y
+    yield by_power(3)
+    factor = radial(terms, s)
+    for power in (1, 2, 3):
+        u, v = by_power(power)
+        yield -factor * u, -factor * v
+    zero = torch.zeros_like(x)
+    yield from ((s, zero), (s * s, zero), (zero, s), (zero, s * s))
 
 
 def _by_tilt(tilt: Tilt, x: Tensor, y: Tensor, columns: list[tuple[Tensor, Tensor]]) -> list[tuple[Tensor, Tensor]]:

@@ -11,13 +11,15 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.parametrisation import POSE, Parametrisation, moved
-from diffproj.geometry.back_projection import back_project
+from diffproj.geometry.back_projection import PlaneMap
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.propagation import root
 
 STEP = 3.0
 """By how many standard deviations the calibration is moved."""
+TOGETHER = 2**18
+"""About how many points are projected anew at a time."""
 
 
 @torch.no_grad()
@@ -58,19 +60,19 @@ def stretch(
     s, shared = parameters.size, parameters.pack(camera).expand(*batch, parameters.size)
     R = camera.R.expand(*batch, 3, 3)
     arm = torch.zeros_like(camera.t) if middle is None else middle
-    pose = R, camera.t.expand(*batch, 3) + (R @ arm.unsqueeze(-1)).squeeze(-1)
-    total = torch.zeros_like(points[..., 0])
+    t_0 = camera.t.expand(*batch, 3) + (R @ arm.unsqueeze(-1)).squeeze(-1)
     moves = along @ L.unsqueeze(-3)  # (*B, N, 3, q), by one standard deviation
-    for column, move in zip(L.unbind(-1), moves.unbind(-1), strict=True):
-        straight = STEP**2 * move.square().sum(-1)
-        for step in (STEP * column, -STEP * column):
-            turned, t = moved(pose, step[..., -POSE:])
-            t = t - (turned @ arm.unsqueeze(-1)).squeeze(-1)
-            there = parameters.unpack(shared + step[..., :s], (turned, t))
-            again, valid = back_project(pixels, there, plane)
-            seen = valid if bool(valid.all()) else there.directions(pixels)[1]
-            change = torch.where(valid, (again - points).square().sum(-1), straight)  # where the horizon is in the way
-            total = total + torch.where(seen, change, torch.inf)
+    straight = STEP**2 * moves.square().sum(-2).movedim(-1, 0).repeat(2, *[1] * (points.ndim - 1))  # (2 q, *B, N)
+    steps = STEP * torch.cat([L, -L], dim=-1).movedim(-1, 0)  # (2 q, *B, q)
+    total = torch.zeros_like(points[..., 0])
+    together = max(1, TOGETHER // max(1, total.numel()))
+    for step, linear in zip(steps.split(together), straight.split(together), strict=True):
+        turned, t = moved((R.expand(len(step), *R.shape), t_0), step[..., -POSE:])
+        t = t - (turned @ arm.unsqueeze(-1)).squeeze(-1)
+        there = parameters.unpack(shared + step[..., :s], (turned, t))
+        again, valid, seen = PlaneMap(there, plane).with_reach(pixels)
+        change = torch.where(valid, (again - points).square().sum(-1), linear)  # where the horizon is in the way
+        total = total + torch.where(seen, change, torch.inf).sum(0)
     first = moves.square().sum((-2, -1))
     squared = total / (2 * STEP**2) / torch.where(first > 0, first, torch.inf)
     found[..., some] = torch.where(which[..., some], squared.nan_to_num(1.0, torch.inf).clamp(min=1).sqrt(), 1.0)

@@ -1,6 +1,7 @@
 """What the learnable modules share: their precision, and parameters learned for all, some or none of a batch."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any, ClassVar
 
@@ -53,6 +54,12 @@ class GeometryModule(nn.Module):
 
         with torch.inference_mode(False):  # a module that is moved in inference mode can still be trained afterwards
             return super()._apply(convert, recurse)
+
+
+def without_autocast(device: torch.device) -> AbstractContextManager[Any]:
+    """A context in which autocast is off on a device."""
+    kind = "cpu" if device.type == "meta" else device.type
+    return torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext()
 
 
 def add_kind(module: GeometryModule, camera: Camera) -> None:

@@ -16,7 +16,7 @@ from diffproj.geometry.plane import Plane
 from diffproj.nn.camera import check_tied, tied_axes
 from diffproj.nn.fixed_map import FixedMap
 from diffproj.nn.learnable_map import LearnableMap
-from diffproj.nn.partial import OF_POSE, PARTS, Learn, learned_parts
+from diffproj.nn.partial import OF_POSE, PARTS, Learn, learned_parts, without_autocast
 
 
 class PlaneProjector(nn.Module):
@@ -106,8 +106,7 @@ class PlaneProjector(nn.Module):
             TypeError: no floating-point tensors, or others than the camera's dtype.
             ValueError: shapes or devices that do not fit, or a warp that `Camera.warped` refuses.
         """
-        device = self.geometry.device.type
-        with torch.autocast("cpu" if device == "meta" else device, enabled=False):
+        with without_autocast(self.geometry.device):
             return self._map_of(warp, plane, camera)(pixels)
 
     def _map_of(
@@ -149,8 +148,7 @@ class PlaneProjector(nn.Module):
 
         See `PlaneMap.miss`; arguments as for the call.
         """
-        device = self.geometry.device.type
-        with torch.autocast("cpu" if device == "meta" else device, enabled=False):
+        with without_autocast(self.geometry.device):
             return self._map_of(warp, plane, camera).miss(pixels)
 
     if TYPE_CHECKING:  # PyTorch types the call of a module as Any

@@ -1,78 +1,74 @@
-"""Undistorting a million float32 points: the exact lens against OpenCV and Kornia. Prints times and ratios.
+"""Undistorting float32 points, exactly, and the plane map behind a lens."""
 
-Run as `python tests/benchmarks/lens.py`; `--threads` sets how many threads PyTorch and OpenCV may use, `--compile`
-adds the compiled lens. Ratios are to be trusted, times are not: medians of interleaved runs in one process.
-"""
-
-import argparse
-import statistics
-import time
-from collections.abc import Callable
+import importlib
+from collections.abc import Callable, Iterator
 
 import cv2
 import kornia.geometry
 import numpy as np
 import torch
+from torch import Tensor
 
-from diffproj.lens.brown_conrady import BrownConrady
+import diffproj as dp
 
-CASES = {
-    "5 coefficients": [-0.2535, 0.0924, -0.0006, 0.0007, -0.0191],
-    "8 coefficients": [22.0, 8.0, 1e-4, 2e-4, 0.2, 22.3, 15.0, 1.6],
-}
-SIZE = (3840, 2160)
-FOCAL = 2500.0
+from .comparing import Comparison
+from .scenes import COEFFICIENTS, K, board, camera, some_pixels, through_opencv
 
-
-def main() -> None:
-    """Measure and print."""
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--points", type=int, default=10**6)
-    options.add_argument("--rounds", type=int, default=7)
-    options.add_argument("--threads", type=int, default=1)
-    options.add_argument("--compile", action="store_true")
-    chosen = options.parse_args()
-    torch.set_num_threads(chosen.threads)
-    cv2.setNumThreads(chosen.threads)
-    for name, coefficients in CASES.items():
-        compare(name, coefficients, chosen.points, chosen.rounds, compiled=chosen.compile)
+COUNT = 10**6
+LENSES = {"5": COEFFICIENTS.tolist(), "8": [22.0, 8.0, 1e-4, 2e-4, 0.2, 22.3, 15.0, 1.6]}
 
 
-def compare(name: str, coefficients: list[float], count: int, rounds: int, *, compiled: bool) -> None:
-    """Print medians for one lens, in milliseconds and relative to Kornia's five steps, and the largest errors."""
-    torch.manual_seed(0)
-    centre = torch.tensor(SIZE) / 2
-    pixels = torch.rand(count, 2) * torch.tensor(SIZE)
-    xy = (pixels - centre) / FOCAL
-    lens = BrownConrady(torch.tensor(coefficients))
-    exact, _ = BrownConrady(lens.coefficients.double()).undistort(xy.double())
-    distortion, intrinsics = lens.coefficients, torch.eye(3)
-    array, array_distortion = xy.numpy(), np.array(coefficients)
+def comparisons() -> Iterator[Comparison]:
+    pixels = some_pixels(COUNT)
+    to_board, opencv = dp.PlaneMap(camera(lens=True), board()), through_opencv(camera(lens=True), pixels)
+    compiled = torch.compile(dp.PlaneMap.__call__)
+    peer = "cv2.undistortPoints, 5 steps, and NumPy"
+    yield Comparison("PlaneMap behind a lens, 10^6 points", lambda: to_board(pixels), opencv, peer, 0.667)
+    yield Comparison(
+        "PlaneMap compiled behind a lens, 10^6 points", lambda: compiled(to_board, pixels), opencv, peer, 0.25
+    )
+    normalised = (pixels - K[:2, 2]) / K.diagonal()[:2]
+    for name, coefficients in LENSES.items():
+        yield from _alone(name, normalised, coefficients)
+
+
+def _alone(name: str, xy: Tensor, coefficients: list[float]) -> Iterator[Comparison]:
+    lens, array, distortion = dp.BrownConrady(coefficients).to(torch.float32), xy.numpy(), np.array(coefficients)
     to_rounding = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-7)
-    candidates: dict[str, Callable[[], torch.Tensor]] = {
-        "kornia, 5 steps": lambda: kornia.geometry.undistort_points(xy, intrinsics, distortion),
-        "cv2, equal tolerance": lambda: torch.from_numpy(
-            cv2.undistortPoints(array, np.eye(3), array_distortion, criteria=to_rounding)
-        ).reshape(-1, 2),
-        "diffproj": lambda: lens.undistort(xy)[0],
-    }
-    if compiled:
-        function = torch.compile(lambda points: lens.undistort(points)[0], fullgraph=True)
-        candidates["diffproj compiled"] = lambda: function(xy)
-    results = {label: run() for label, run in candidates.items()}
-    times: dict[str, list[float]] = {label: [] for label in candidates}
-    for _ in range(rounds):
-        for label, run in candidates.items():
-            started = time.perf_counter()
-            run()
-            times[label].append(time.perf_counter() - started)
-    reference = statistics.median(times["kornia, 5 steps"])
-    print(f"{name}, {count} float32 points, {torch.get_num_threads()} thread(s)")
-    for label in candidates:
-        median = statistics.median(times[label])
-        error = float((results[label] - exact).abs().max()) * FOCAL
-        print(f"  {label:22s} {median * 1e3:8.1f} ms   {median / reference:5.2f} x kornia   off by {error:.1e} px")
+    compiled = torch.compile(lambda points: lens.undistort(points)[0], fullgraph=True)
+    intrinsics, kornia_lens = torch.eye(3), torch.tensor(coefficients)
+
+    def opencv() -> object:
+        return cv2.undistortPoints(array, np.eye(3), distortion, criteria=to_rounding)
+
+    def five_steps() -> object:
+        return kornia.geometry.undistort_points(xy, intrinsics, kornia_lens)
+
+    which = f"undistort, {name} coefficients, 10^6 points"
+    yield Comparison(f"{which}: Kornia", lambda: lens.undistort(xy), five_steps, "Kornia, 5 steps")
+    yield Comparison(f"{which}: OpenCV", lambda: lens.undistort(xy), opencv, "OpenCV to 1e-7", seconds=2.0)
+    yield Comparison(f"{which}, compiled", lambda: compiled(xy), opencv, "OpenCV to 1e-7", seconds=2.0)
+    for package, work in (("pycolmap", _pycolmap(xy, coefficients)), ("mrcal", _mrcal(xy, coefficients))):
+        if work is not None:
+            yield Comparison(f"{which}: {package}", lambda: lens.undistort(xy), work, package, seconds=2.0)
 
 
-if __name__ == "__main__":
-    main()
+def _pycolmap(xy: Tensor, coefficients: list[float]) -> Callable[[], object] | None:
+    """The inverse of COLMAP's lens of 4 or 8 coefficients, whose order is OpenCV's."""
+    try:
+        pycolmap = importlib.import_module("pycolmap")
+    except ImportError:
+        return None
+    model, count = ("FULL_OPENCV", 8) if len(coefficients) == 8 else ("OPENCV", 4)
+    camera = pycolmap.Camera(model=model, width=2, height=2, params=[1.0, 1.0, 0.0, 0.0, *coefficients[:count]])
+    array = xy.double().numpy()
+    return lambda: camera.cam_from_img(array)
+
+
+def _mrcal(xy: Tensor, coefficients: list[float]) -> Callable[[], object] | None:
+    try:
+        mrcal = importlib.import_module("mrcal")
+    except ImportError:
+        return None
+    array, intrinsics = xy.double().numpy(), np.array([1.0, 1.0, 0.0, 0.0, *coefficients])
+    return lambda: mrcal.unproject(array, f"LENSMODEL_OPENCV{len(coefficients)}", intrinsics)

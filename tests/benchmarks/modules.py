@@ -1,78 +1,58 @@
-"""What the training parts cost over the bare map, in time and memory.
+"""What the training parts cost: a frozen and a learning projector behind a lens, and their memory."""
 
-Run alone on the machine: `python tests/benchmarks/modules.py [--threads N]`. Memory is the highest sum of what
-PyTorch's allocator held beyond what was there before (pixels and gradients of an earlier step were: another 1.3 times the
-output), as its profiler saw it.
-"""
-
-import argparse
-import statistics
-import time
-from collections.abc import Callable
+from collections.abc import Iterator
 
 import torch
-from torch.profiler import ProfilerActivity, profile
+from torch import Tensor
 
 import diffproj as dp
 
-LENS = dp.BrownConrady(torch.tensor([-0.28, 0.07, 0.0013, 0.0001, 0.002]))
+from .comparing import Comparison
+from .scenes import board, both_ways, camera, some_pixels
 
 
-def compared(functions: dict[str, Callable[[], object]], rounds: int = 200) -> dict[str, float]:
-    """Median seconds of each function, called in turn so that a busy moment of the machine meets them all."""
-    times: dict[str, list[float]] = {name: [] for name in functions}
-    for _ in range(rounds):
-        for name, function in functions.items():
-            start = time.perf_counter()
-            function()
-            times[name].append(time.perf_counter() - start)
-    return {name: statistics.median(values[3:]) for name, values in times.items()}
+def comparisons() -> Iterator[Comparison]:
+    pixels, behind = some_pixels(1000), camera(lens=True)
+    bare = dp.PlaneMap(behind, board())
+    frozen = dp.PlaneProjector(behind, board())
+    turn, above = torch.tensor([[0.0, -1, 479], [1, 0, 0], [0, 0, 1]]), dp.Plane.z(torch.tensor(5.0))
 
+    def peer() -> object:
+        return frozen(pixels)
 
-def peak_bytes(function: Callable[[], object]) -> int:
-    """Highest sum of allocated less freed bytes while the function runs."""
-    function()
-    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as seen:
-        function()
-    held, peak = 0, 0
-    changes = (event for event in seen.profiler.kineto_results.events() if event.name() == "[memory]")
-    for event in sorted(changes, key=lambda event: event.start_ns()):
-        held += event.nbytes()
-        peak = max(peak, held)
-    return peak
+    which = "behind a lens, 1000 points"
+    yield Comparison(f"frozen projector {which}", peer, lambda: bare(pixels), "bare map", 1.1)
+    yield Comparison(f"the same with warp=, {which}", lambda: frozen(pixels, warp=turn), peer, "without", 1.3)
+    yield Comparison(f"the same with plane=, {which}", lambda: frozen(pixels, plane=above), peer, "without", 1.3)
+    pose, pinhole = dp.PlaneProjector(behind, board(), "pose"), dp.PlaneProjector(camera(), board(), "pose")
+    yield Comparison(
+        "map of a learned pose, fixed lens", lambda: pose.map(), lambda: pinhole.map(), "of a pinhole's pose", 1.3
+    )
+    yield Comparison(
+        "learned pose, fixed lens, 1000 points, both ways",
+        both_ways(lambda: pose(pixels)[0]),
+        both_ways(lambda: bare(_tracked(pixels))[0]),
+        "bare map",
+    )
+    lens = dp.PlaneProjector(behind, board(), "distortion")
+    yield Comparison("learned lens, 100 points", lambda: lens(pixels[:100]), lambda: bare(pixels[:100]), "bare map")
+    for name, seen_from in (("pinhole", camera()), ("lens", behind)):
+        learn = ("focal", "principal_point", "pose", "plane") + (("distortion",) if name == "lens" else ())
+        projector, many = dp.PlaneProjector(seen_from, board(), learn), some_pixels(10**5)
 
-
-def camera(lens: dp.Lens | None) -> dp.Camera:
-    """A web camera that looks down at a slant from half a metre, in millimetres."""
-    K = torch.tensor([[533.0, 0, 342], [0, 534, 235], [0, 0, 1]])
-    R = dp.rotation_from_euler(*torch.tensor([2.7, 0.25, 0.4]))
-    return dp.Camera(K, R, torch.tensor([10.0, -20, 500]), lens, size=(640, 480))
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    torch.set_num_threads(parser.parse_args().threads)
-    board = dp.Plane.z(0.0)
-    print(f"{torch.get_num_threads()} thread(s), float32")
-    for name, lens in (("pinhole", None), ("5-coefficient lens", LENS)):
-        learn = ("focal", "principal_point", "pose", "plane") + (("distortion",) if lens else ())
-        frozen, learned = dp.PlaneProjector(camera(lens), board), dp.PlaneProjector(camera(lens), board, learn)
-        pixels = torch.rand(10**5, 2) * torch.tensor([640.0, 480])
-        bare = dp.PlaneMap(camera(lens), board)
-        took = compared({"bare": lambda: bare(pixels), "frozen": lambda: frozen(pixels)})  # noqa: B023
-        rebuilt = compared({"map": learned.map})["map"]
-
-        def step() -> None:
-            inputs = pixels.requires_grad_()  # noqa: B023
-            points, _ = learned(inputs)  # noqa: B023
+        def step(projector: dp.PlaneProjector = projector, many: Tensor = many) -> None:
+            points, _ = projector(_tracked(many))
             points.backward(torch.ones_like(points))
 
-        peak = peak_bytes(step) / (12 * len(pixels))
-        print(f"{name}, 10^5 points: frozen projector {took['frozen'] / took['bare']:.2f} x the bare map")
-        print(f"{name}: a learnable projector rebuilds its map in {1e3 * rebuilt:.2f} ms")
-        print(f"{name}, 10^5 points: forward and backward peak at {peak:.1f} x the output")
+        yield Comparison(
+            f"peak memory, both ways, {name}, 10^5 points",
+            step,
+            lambda: 12 * 10**5,
+            "output",
+            6.5 if name == "pinhole" else 12.0,
+            memory=True,
+        )
 
 
-if __name__ == "__main__":
-    main()
+def _tracked(pixels: Tensor) -> Tensor:
+    return pixels.detach().requires_grad_()
