@@ -346,7 +346,7 @@ def as_camera(camera: Camera | PinholeCamera, name: str = "camera") -> Camera:
 
 def meeting_camera(camera: Camera, name: str, value: object, length: int) -> Tensor:
     """Check points or pixels against a camera, lift half precision, expand to the common batch shape."""
-    if not torch.compiler.is_compiling() and isinstance(value, Tensor) and _fits(camera, value, length):  # the usual case, and five times as fast
+    if isinstance(value, Tensor) and _fits(camera, value, length):  # the usual case, and five times as fast
         return value
     tensor = check_tensor(name, value, "N", length, like=camera.K)
     if tensor is not value:  # lifted: any precision of the camera holds a half exactly
@@ -360,7 +360,8 @@ def _fits(camera: Camera, tensor: Tensor, length: int) -> bool:
     """Whether a tensor of vectors is just as the camera needs it."""
     K = camera.K
     return (
-        tensor.dtype is K.dtype
+        not torch.compiler.is_compiling()
+        and tensor.dtype is K.dtype
         and tensor.device == K.device
         and tensor.layout is torch.strided
         and not (tensor.is_nested or tensor.is_neg())
