@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import torch
+from torch.utils._python_dispatch import _disable_current_modes
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
@@ -53,5 +54,5 @@ def traced_beside(tensor: torch.Tensor) -> bool:
 
 def outside_of_tracing(function: Callable[[], T]) -> T:
     """What a function gives where nothing is traced: its results are constants of the graph."""
-    with torch.utils._python_dispatch._disable_current_modes():
+    with _disable_current_modes():
         return function()

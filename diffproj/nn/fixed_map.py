@@ -51,6 +51,7 @@ class FixedMap(GeometryModule):
     normal: Tensor
     offset: Tensor
     matrix: Tensor
+    domain: Tensor
 
     def __init__(self, camera: Camera | PinholeCamera, plane: Plane) -> None:
         super().__init__()
