@@ -91,7 +91,7 @@ def best(task: Task, steps: int) -> Found:
     own, R = task.own(), task.camera.R.reshape(-1, 3, 3)
     prior = task.known.prior(own, task.batch)
     begin = task.known.begin(own, prior)
-    found = _descended(task, R, begin, prior, (), steps)
+    found = descended(task, R, begin, prior, (), steps)
     if not task.pieces or steps == 0:
         return found
     left = spare(task, found)
@@ -108,11 +108,11 @@ def best(task: Task, steps: int) -> Found:
     rows = (cost + _away(rotations, first)).topk(min(TRIED, K), dim=0, largest=False).indices
     k, each = len(rows), torch.arange(P, device=rows.device)
     many = Prior(*(part.expand(k, *part.shape).flatten(0, 1) for part in prior[:2]))
-    near = _descended(task, rotations[rows, each].flatten(0, 1), values[rows, each].flatten(0, 1), many, (k,), FEW)
+    near = descended(task, rotations[rows, each].flatten(0, 1), values[rows, each].flatten(0, 1), many, (k,), FEW)
     away = _away(near.parameters.rotation(near.values), first.repeat(k, 1, 1))
     chosen = (near.cost + away).nan_to_num(torch.inf).reshape(k, P).argmin(0) * P + each
     R = R if near.parameters.start is None else near.parameters.start[chosen]
-    other = _descended(task, R, near.values[chosen], prior, (), steps)
+    other = descended(task, R, near.values[chosen], prior, (), steps)
     ends = [torch.where(one.status == Status.CONVERGED, one.cost, torch.inf) for one in (other, found)]
     better = poor & (ends[0] < ends[1])
     start = None
@@ -130,7 +130,11 @@ def _away(R: Tensor, first: Tensor) -> Tensor:
     return HAIR * (3 - (R * first).sum((-2, -1)))
 
 
-def _descended(task: Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[int, ...], steps: int) -> Found:
+def descended(task: Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[int, ...], steps: int) -> Found:
+    """The minimum that the solver reaches from values `(P, q)`, whose turns are about rotations `(P, 3, 3)`.
+
+    `more` is the shape of the starts that stand in front of the batch of cameras.
+    """
     parameters = task.known.parameters(R)
     evidence = task.evidence(parameters, more)
     basis = task.known.basis(begin)
