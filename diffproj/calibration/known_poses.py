@@ -69,18 +69,21 @@ def known_poses(
     camera = camera.to(torch.float64)[..., None].expand(*batch).detach()
     known = _checked(data, camera, options, fixed, priors)
     single = _single(data, known)
-    used = single.used
-    for done in range(1 + MAX_REJECTION_ROUNDS):
+
+    def seen_by(used: Tensor) -> tuple[Seen, tuple[Found, ...], Fit]:
         piece = _seen(data, used.reshape(*batch, -1))
         ends = _ends(camera, alone, known, piece, options.max_iterations)
-        fit = _fit(data, single, used, ends[0])
-        if options.outlier_limit is None or done == MAX_REJECTION_ROUNDS:
-            break
+        return piece, ends, _fit(data, single, used, ends[0])
+
+    used = single.used
+    piece, ends, fit = seen_by(used)
+    for _ in range(MAX_REJECTION_ROUNDS if options.outlier_limit else 0):
         near = inliers(single, used, fit.solution, options.outlier_limit)
         kept = near & (near.sum(-1, keepdim=True) >= 4)
         if bool((kept == used).all()):
             break
         used = kept
+        piece, ends, fit = seen_by(used)
     found = ends[0]
     whole = _joined(data, fit)
     plain = outcome("locate", data, whole, camera.size or data.views.size, throw=False, known=calibration)
