@@ -128,7 +128,8 @@ class Data:
         if int(self.used.any(-1).sum(-1).amax()) > 1:
             raise ValueError(
                 "target: want landmarks without sigma, or one view: several views see a landmark off in the same way, "
-                "which calibrate and refine do not carry; dp.locate does, for each view"
+                "which calibrate and refine do not carry; dp.locate does, for each view; on z = 0, shape='free' with "
+                "priors={'points': sigma} finds where they are, of landmarks without sigma"
             )
 
     def task(self, model: LensModel, **options: Any) -> Task:

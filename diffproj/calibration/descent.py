@@ -22,6 +22,8 @@ TOLERANCE, ROUNDING = 1e-13, 1e-12
 """Part of the cost that another step may still bring, and that rounding may."""
 ROBUST_STEPS, NEWTON = 40, 20
 """Steps of reweighting, which shrink slowly under a robust loss, before at most so many of Newton's."""
+UNDETERMINED_STEPS = 30
+"""Steps where there are fewer residuals than unknowns: many places explain them, and the solver would go on for long."""
 POOR = 9.0
 """Cost per spare residual from which on other starts are tried."""
 RESTRAINT = 1e-8
@@ -91,11 +93,15 @@ def best(task: Task, steps: int) -> Found:
     own, R = task.own(), task.camera.R.reshape(-1, 3, 3)
     prior = task.known.prior(own, task.batch)
     begin = task.known.begin(own, prior)
+    basis, none = task.known.basis(begin), torch.zeros(len(begin), dtype=torch.long, device=begin.device)
+    few = spare(task, Found(task.known.parameters(R), basis, prior, begin, none, none, begin[:, 0])) < 0
+    steps = min(steps, UNDETERMINED_STEPS) if bool(few.all()) else steps
     found = descended(task, R, begin, prior, (), steps)
     if not task.pieces or steps == 0:
         return found
     left = spare(task, found)
-    poor = (found.status == Status.DIVERGED) | ~(2 * found.cost <= POOR * left.clamp(min=1))
+    # Where there are fewer residuals than unknowns, another start tells no more.
+    poor = (found.status == Status.DIVERGED) | (~(2 * found.cost <= POOR * left.clamp(min=1)) & (left >= 0))
     if not bool(poor.any()):
         return found
     camera = task.known.parameters(R).unpack(begin, (len(begin),), task.camera.size)
