@@ -23,7 +23,7 @@ TOLERANCE, ROUNDING = 1e-13, 1e-12
 ROBUST_STEPS, NEWTON = 40, 20
 """Steps of reweighting, which shrink slowly under a robust loss, before at most so many of Newton's."""
 UNDETERMINED_STEPS = 30
-"""Steps where there are fewer residuals than unknowns: many places explain them, and the solver would go on for long."""
+"""Steps where there are fewer residuals than unknowns: many places explain them, and the solver would go on long."""
 POOR = 9.0
 """Cost per spare residual from which on other starts are tried."""
 RESTRAINT = 1e-8
