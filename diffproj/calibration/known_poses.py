@@ -77,7 +77,9 @@ def known_poses(
 
     used = single.used
     piece, ends, fit = seen_by(used)
-    for _ in range(MAX_REJECTION_ROUNDS if options.outlier_limit else 0):
+    for _ in range(MAX_REJECTION_ROUNDS):
+        if options.outlier_limit is None:
+            break
         near = inliers(single, used, fit.solution, options.outlier_limit)
         kept = near & (near.sum(-1, keepdim=True) >= 4)
         if bool((kept == used).all()):
