@@ -50,6 +50,7 @@ from diffproj.geometry.map_views import MapViews
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.geometry.plane_kernel import components, denominator_and_threshold, direct, intersection, recorded
 from diffproj.geometry.plane_matrix import plane_matrix
+from diffproj.lens.brown_conrady import BrownConrady
 from diffproj.lens.slopes import by_direction
 
 
@@ -189,9 +190,11 @@ class PlaneMap(MapViews, Copied, Shown):
 
     def _sight_slopes(self, sight: Sequence[Tensor | None], valid: Tensor) -> list[list[Tensor]]:
         """The derivatives of `M p` by u and by v: four components each, to within a multiple of `M p` itself."""
-        (*rows, _), (x, y, z) = entries(self.matrix), sight
-        if x is None or y is None or z is None:  # a pinhole, where p follows the pixel
+        *rows, _ = entries(self.matrix)
+        if self.camera.distortion is None:  # p follows the pixel
             return [[row[axis] for row in rows] for axis in (0, 1)]
+        one = torch.ones_like(valid, dtype=self.matrix.dtype)
+        x, y, z = (one if component is None else component for component in sight)
         direction = torch.stack([x, y, torch.where(valid, z, 1.0)], dim=-1)
         # The distorted point does not change along p: any step does that moves it by what the pixel's step asks.
         g, h = by_direction(self.camera.distortion, direction).unbind(-2)
@@ -212,10 +215,15 @@ class PlaneMap(MapViews, Copied, Shown):
         return (torch.where(pixels.isfinite().all(dim=-1), reasons, Reason.NOT_FINITE),)
 
     def _sight(self, pixels: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Centred pixels or, behind a lens, directions, and where the lens has an inverse (`None`: everywhere)."""
-        if self.camera.distortion is None:
+        """The p of a pinhole or behind a lens, and where the lens has an inverse (`None`: everywhere)."""
+        lens = self.camera.distortion
+        if lens is None:
             return pixels - self.camera.K[..., None, :2, 2], None
-        return self.camera.directions(pixels)
+        if not isinstance(lens, BrownConrady):
+            return self.camera.directions(pixels)
+        xy, finite = self.camera.normalised(pixels)
+        xy, seen = lens.undistort(xy)
+        return xy, seen & finite
 
     def _checked(self, pixels: Tensor | Array) -> Tensor:
         if self.is_per_point:

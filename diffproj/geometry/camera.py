@@ -293,13 +293,23 @@ class Camera(
             ValueError: wrong shape or device, or batch shapes that do not broadcast.
         """
         pixels = meeting_camera(self, "pixels", pixels, 2)
-        finite = (pixels.abs() < torch.finfo(pixels.dtype).max ** SQUARED).all(dim=-1)
-        offset = torch.where(finite.unsqueeze(-1), pixels - self.K[..., None, :2, 2], 0.0)
-        xy = transform(pixel_to_normalized(self.K), offset)
+        xy, finite = self.normalised(pixels)
         if self.distortion is None:
             return torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1), finite
         direction, valid = self.distortion.unproject(xy)
         return direction, valid & finite
+
+    def normalised(
+        self, pixels: Float[Tensor, "*batch n 2"]
+    ) -> tuple[Float[Tensor, "*batch n 2"], Bool[Tensor, "*batch n"]]:
+        """Pixels that were checked, on the normalised plane, still distorted `(*B, N, 2)`, and which are finite."""
+        center = self.K[..., :2, 2].unsqueeze(-1).unbind(-2)
+        u, v = pixels.unbind(-1)
+        finite = torch.maximum(u.abs(), v.abs()) < torch.finfo(pixels.dtype).max ** SQUARED
+        offset = [u - center[0], v - center[1]]
+        if not (has_values(finite) and finite.device.type == "cpu" and bool(finite.all())):
+            offset = [torch.where(finite, part, 0.0) for part in offset]
+        return interleaved(linear(entries(pixel_to_normalized(self.K)), offset)), finite
 
     def rays(
         self, pixels: Float[Tensor, "*#batch n 2"] | Array

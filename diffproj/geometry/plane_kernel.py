@@ -107,11 +107,13 @@ class _WithGradient(torch.autograd.Function):
         return points, valid
 
     @staticmethod
-    def backward(ctx: Any, by_points: Tensor, _: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        by_points = grad_outputs[0]
         p, matrix, seen, denominator, hidden = ctx.saved_tensors
         of_p, of_matrix, _ = ctx.needs_input_grad
         if torch.is_grad_enabled():
-            return *_recorded_gradient(p, matrix, seen, by_points, (of_p, of_matrix)), None
+            by_p, by_matrix = _recorded_gradient(p, matrix, seen, by_points, (of_p, of_matrix))
+            return by_p, by_matrix, None
         if hidden is not None:
             p, by_points = (tensor.masked_fill(hidden.unsqueeze(-1), 0.0) for tensor in (p, by_points))
         x, y, *z = p.unsqueeze(-3).unbind(-1)
@@ -143,10 +145,10 @@ def _by_columns(by_products: Tensor, *components: Tensor) -> Tensor:
 
 def _recorded_gradient(
     p: Tensor, matrix: Tensor, seen: Tensor | None, by_points: Tensor, wanted: tuple[bool, bool]
-) -> list[Tensor | None]:
+) -> tuple[Tensor | None, Tensor | None]:
     """The gradient by p and by the matrix, as a function that can be differentiated again."""
-    inputs = [tensor.view_as(tensor) for tensor in (p, matrix)]  # so that one does not count as a part of the other
-    points, _ = recorded(*inputs, seen)
-    chosen = [one for one, want in zip(inputs, wanted, strict=True) if want]
+    p, matrix = p.view_as(p), matrix.view_as(matrix)  # so that one does not count as a part of the other
+    points, _ = recorded(p, matrix, seen)
+    chosen = [one for one, want in zip((p, matrix), wanted, strict=True) if want]
     found = iter(torch.autograd.grad(points, chosen, by_points, create_graph=True))
-    return [next(found) if want else None for want in wanted]
+    return next(found) if wanted[0] else None, next(found) if wanted[1] else None

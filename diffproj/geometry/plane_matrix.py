@@ -18,14 +18,14 @@ def plane_matrix(camera: Camera, plane: Plane, warn: bool) -> Tensor:
     behind_lens, dtype = camera.distortion is not None, camera.dtype
     if wants_derivative(*given) or not has_values(*given):
         parts = [in_float64(part) for part in given]
-        M, b, height = _unscaled(torch, *parts, behind_lens)
+        M, b, height = _unscaled(torch, behind_lens, *parts)
         with torch.no_grad():  # the factor changes no point, so no derivative has to pass through it
             factor, size, reach = _scale(torch, M, b, height, parts[2], parts[4], dtype)
         matrix = torch.cat([M * factor, size], dim=-2)
     else:
         library, parts = arrays_of(*given, double=True)
         with np.errstate(all="ignore"):
-            M, b, height = _unscaled(library, *parts, behind_lens)
+            M, b, height = _unscaled(library, behind_lens, *parts)
             factor, size, reach = _scale(library, M, b, height, parts[2], parts[4], dtype)
             matrix = torch.as_tensor(library.concatenate((M * factor, size), -2))
     if warn and looks_at_rounding(camera.t):
@@ -34,7 +34,7 @@ def plane_matrix(camera: Camera, plane: Plane, warn: bool) -> Tensor:
 
 
 def _unscaled(
-    library: Any, K: Any, R: Any, t: Any, normal: Any, offset: Any, behind_lens: bool
+    library: Any, behind_lens: bool, K: Any, R: Any, t: Any, normal: Any, offset: Any
 ) -> tuple[Any, Any, Any]:
     """`M = [A; b] (*B, 4, 3)`, the normal in the camera frame `(*B, 3)` and `d - n . C`, as arrays or as tensors."""
     b = (R * normal[..., None, :]).sum(-1)

@@ -51,11 +51,12 @@ class _Inverse(torch.autograd.Function):
         return torch.stack((x, y), dim=-1)
 
     @staticmethod
-    def backward(ctx: Any, by_xy: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:
+        by_xy = grad_outputs[0]
         coefficients, points, x, y, valid = ctx.saved_tensors
         wanted = ctx.needs_input_grad[:2]
         if torch.is_grad_enabled():
-            return *_recorded_gradient(coefficients, points, x, y, valid, by_xy, wanted), None, None, None
+            return *_recorded_gradient(coefficients, points, (x, y, valid), by_xy, wanted), None, None, None
         terms, zero = Terms.of(coefficients), torch.zeros_like(x)
         jacobian = bend_off(terms, (zero, zero), x, y)[2]
         by_x, by_y = torch.where(valid.unsqueeze(-1), by_xy, 0).unbind(-1)
@@ -73,15 +74,13 @@ class _Inverse(torch.autograd.Function):
 def _recorded_gradient(
     coefficients: Tensor,
     points: Tensor,
-    x: Tensor,
-    y: Tensor,
-    valid: Tensor,
+    found: tuple[Tensor, Tensor, Tensor],
     by_xy: Tensor,
     wanted: tuple[bool, bool],
-) -> list[Tensor | None]:
+) -> tuple[Tensor | None, Tensor | None]:
     """The gradient by coefficients and points, as a function that can be differentiated again."""
-    inputs = [tensor.view_as(tensor) for tensor in (coefficients, points)]  # neither counts as a part of the other
-    xy = recorded(*inputs, x, y, valid)
-    chosen = [one for one, want in zip(inputs, wanted, strict=True) if want]
-    found = iter(torch.autograd.grad(xy, chosen, by_xy, create_graph=True))
-    return [next(found) if want else None for want in wanted]
+    coefficients, points = coefficients.view_as(coefficients), points.view_as(points)  # neither a part of the other
+    xy = recorded(coefficients, points, *found)
+    chosen = [one for one, want in zip((coefficients, points), wanted, strict=True) if want]
+    slopes = iter(torch.autograd.grad(xy, chosen, by_xy, create_graph=True))
+    return next(slopes) if wanted[0] else None, next(slopes) if wanted[1] else None

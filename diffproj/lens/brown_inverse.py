@@ -14,7 +14,7 @@ from diffproj.lens.table import InverseTable
 
 Pair = tuple[Tensor, Tensor]
 
-NEWTON_STEPS = {torch.float32: 3, torch.float64: 4}
+NEWTON_STEPS = {torch.float32: 2, torch.float64: 3}
 """Newton steps from the table's estimate to full precision, except for points next to a fold."""
 MAX_STEPS = 200
 """Maximum number of steps of the global search: near a fold each step only halves the distance to the solution."""

@@ -7,7 +7,7 @@ the calling thread's work, which waiting for the machine does not lengthen, and 
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch.profiler import ProfilerActivity, profile
@@ -97,8 +97,8 @@ def peak_bytes(work: Work) -> int:
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as seen:
         work()
     held, peak = 0, 0
-    changes = (event for event in seen.profiler.kineto_results.events() if event.name() == "[memory]")
-    for event in sorted(changes, key=lambda event: event.start_ns()):
+    events: list[Any] = seen.profiler.kineto_results.events()  # type: ignore[union-attr]
+    for event in sorted((one for one in events if one.name() == "[memory]"), key=lambda one: one.start_ns()):
         held += event.nbytes()
         peak = max(peak, held)
     return peak
