@@ -88,7 +88,7 @@ class MapViews:
             F = self.camera.K[..., :2, :2]
             normal = torch.cat([(F * normal[..., :2, None]).sum(-2), normal[..., 2:]], dim=-1)
         else:
-            ray = p
+            ray = p if p.shape[-1] == 3 else torch.nn.functional.pad(p, (0, 1), value=1.0)
         axis = torch.tensor([0.0, 0.0, 1.0], dtype=ray.dtype, device=ray.device)
         normal = torch.where(off_plane, normal, axis).unsqueeze(-2)
         away = -_angle(torch.where(seen.unsqueeze(-1), ray, axis), normal)
