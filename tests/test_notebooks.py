@@ -123,3 +123,21 @@ def test_from_landmarks_to_the_ground(monkeypatch: pytest.MonkeyPatch, tmp_path:
     assert "horizon" not in found["told"]
     assert len(found["told"]) == 5
     assert found["missing"].startswith("height: no evidence")
+
+
+@pytest.mark.slow
+def test_a_birds_eye_view_learns_its_tilts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    found = outcome(
+        "05_birds_eye_view_from_six_cameras",
+        monkeypatch,
+        tmp_path,
+        tilt="tilt_error",
+        overlaps="overlaps",
+        difference="difference",
+        ratio="ratio",
+    )
+    assert found["tilt"] < 0.4  # degrees, of 4; .14 was measured
+    assert found["overlaps"]["wrong tilt, learned"] > found["overlaps"]["wrong tilt, frozen"] + 0.4  # .68 and .00
+    assert found["overlaps"]["true tilt"] > 0.7  # .80
+    assert found["difference"] < 1e-4
+    assert found["ratio"] < 3  # 1.1 to 1.2, of times on a busy machine
