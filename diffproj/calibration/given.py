@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from diffproj._core.warn import warn_caller
-from diffproj.geometry.camera import is_rotation
+from diffproj.geometry.rotations import is_rotation
 
 Size = tuple[int, int] | None
 

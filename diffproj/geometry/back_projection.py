@@ -221,7 +221,7 @@ class PlaneMap(MapViews, Copied, Shown):
             return pixels - self.camera.K[..., None, :2, 2], None
         if not isinstance(lens, BrownConrady):
             return self.camera.directions(pixels)
-        xy, finite = self.camera.normalised(pixels)
+        xy, finite = self.camera._normalised(pixels)
         xy, seen = lens.undistort(xy)
         return xy, seen & finite
 

@@ -13,7 +13,6 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
@@ -23,7 +22,6 @@ from torch.utils._pytree import tree_leaves
 from diffproj._core.arguments import Array, instance, meeting
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
-    arrays_of,
     broadcast_batches,
     check_same_kind,
     check_tensor,
@@ -45,10 +43,8 @@ from diffproj.geometry.grid import checked_size, inside
 from diffproj.geometry.intrinsics import check_intrinsics, pixel_to_normalized
 from diffproj.geometry.mounting import Mounted
 from diffproj.geometry.placement import Placed
+from diffproj.geometry.rotations import check_pose
 from diffproj.lens.protocol import Lens
-
-ROTATION_TOLERANCE = 1e-5
-"""How far `R^T R` may be from the identity, entry by entry, where a user hands a camera in."""
 
 SQUARED = 0.45
 """The power of the largest number up to which a pixel counts as finite: its square, and what is left of it, are."""
@@ -121,7 +117,7 @@ class Camera(
             check_lens(distortion)
         if has_values(K, R, t):
             check_intrinsics(K)
-            _check_pose(R, t)
+            check_pose(R, t)
         self._assign(K, R, t, distortion, checked_size(size))
 
     def _assign(self, K: Tensor, R: Tensor, t: Tensor, distortion: Lens | None, size: tuple[int, int] | None) -> None:
@@ -177,7 +173,7 @@ class Camera(
         """
         R, t = check_tensor("R", R, 3, 3, like=self.K), check_tensor("t", t, 3, like=self.K)
         if has_values(R, t):
-            _check_pose(R, t)
+            check_pose(R, t)
         return self._with(R=R, t=t)
 
     def without_pose(self) -> "Camera":
@@ -293,13 +289,13 @@ class Camera(
             ValueError: wrong shape or device, or batch shapes that do not broadcast.
         """
         pixels = meeting_camera(self, "pixels", pixels, 2)
-        xy, finite = self.normalised(pixels)
+        xy, finite = self._normalised(pixels)
         if self.distortion is None:
             return torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1), finite
         direction, valid = self.distortion.unproject(xy)
         return direction, valid & finite
 
-    def normalised(
+    def _normalised(
         self, pixels: Float[Tensor, "*batch n 2"]
     ) -> tuple[Float[Tensor, "*batch n 2"], Bool[Tensor, "*batch n"]]:
         """Pixels that were checked, on the normalised plane, still distorted `(*B, N, 2)`, and which are finite."""
@@ -404,27 +400,3 @@ def _pinhole(direction: Sequence[Tensor], derivative: bool) -> tuple[list[Tensor
     if derivative:
         x, y, z = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0), torch.where(valid, z, 1.0)
     return [x / z, y / z], valid
-
-
-def is_rotation(R: Float[Tensor, "*shape 3 3"]) -> Bool[Tensor, "*shape"]:
-    """Which matrices are rotations, to `ROTATION_TOLERANCE`."""
-    return _are_rotations(torch, R, torch.eye(3, dtype=R.dtype, device=R.device))
-
-
-def _are_rotations(library: Any, R: Any, identity: Any) -> Any:
-    # No matrix product, which autocast and TF32 round.
-    error = abs((R[..., None] * R[..., None, :]).sum(-3) - identity)
-    return (error <= ROTATION_TOLERANCE).all(-1).all(-1) & (library.linalg.det(R) > 0)
-
-
-def _check_pose(R: Tensor, t: Tensor) -> None:
-    library, (R, t, identity) = arrays_of(R, t, torch.eye(3, dtype=R.dtype, device=R.device))
-    if not bool(library.isfinite(t).all()):
-        raise ValueError("t: want finite values, got NaN or infinity")
-    with np.errstate(over="ignore", invalid="ignore"):
-        rotations = _are_rotations(library, R, identity)
-    if not bool(rotations.all()):
-        raise ValueError(
-            "R: want rotation matrices (orthonormal to 1e-5, determinant +1), got others; "
-            "kornia's axis_angle_to_rotation_matrix makes them from rotation vectors"
-        )

@@ -1,4 +1,7 @@
-"""The matrix of a camera and a plane: how `back_projection` builds it, in float64, with its threshold."""
+"""The matrix of the map from a camera's pixels to a plane, as `back_projection.py` derives it.
+
+It is worked out in float64, and in NumPy where nothing but values is asked for, which takes half the time.
+"""
 
 from typing import Any
 

@@ -192,6 +192,7 @@ def _geometry(t: Things) -> dict[str, Call]:
         "PlaneMap": Call(dp.PlaneMap, onto),
         "PlaneMap()": Call(dp.PlaneMap(c, n), {"pixels": p}),
         "PlaneMap.resolution": Call(dp.PlaneMap(c, n).resolution, {"pixels": p}),
+        "PlaneMap.with_reach": Call(dp.PlaneMap(c, n).with_reach, {"pixels": p}),
         "PlaneMap.explain": Call(dp.PlaneMap(c, n).explain, {"pixels": p}),
         "paper_route": Call(
             dp.paper_route, {"pixels": p, "camera": dp.Camera(t.K), "plane": dp.Plane.z(9.0), "focal_length": 1.0}
