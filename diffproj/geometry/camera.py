@@ -41,7 +41,6 @@ from diffproj.geometry.exchange import Exchange
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounded_pixels
 from diffproj.geometry.grid import checked_size, inside
 from diffproj.geometry.intrinsics import check_intrinsics, pixel_to_normalized
-from diffproj.geometry.mounting import Mounted
 from diffproj.geometry.placement import Placed
 from diffproj.geometry.rotations import check_pose
 from diffproj.lens.protocol import Lens
@@ -54,7 +53,6 @@ class Camera(
     ChangedImages,
     Exchange,
     Placed,
-    Mounted,
     Batched,
     tensors={"K": 2, "R": 2, "t": 1},
     parts=("distortion",),

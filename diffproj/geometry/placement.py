@@ -15,10 +15,9 @@ from torch import Tensor
 
 from diffproj._core.arguments import Array, choice, meeting
 from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, dot, has_values, rounding
-from diffproj.geometry.camera_parts import CameraParts
 from diffproj.geometry.grid import checked_size
 from diffproj.geometry.intrinsics import intrinsic_matrix
-from diffproj.geometry.mounting import Number, focal_lengths
+from diffproj.geometry.mounting import Mounted, Number, focal_lengths
 from diffproj.lens.protocol import Lens
 
 C = TypeVar("C", bound="Placed")
@@ -36,7 +35,7 @@ SKEW = 0.1
 """A skew of fewer than so many roots of the rounding error, relative to f_x, is rounding."""
 
 
-class Placed(CameraParts):
+class Placed(Mounted):
     """Cameras from and to matrices that say where they stand."""
 
     __slots__ = ()
