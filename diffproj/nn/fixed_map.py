@@ -134,7 +134,7 @@ class FixedMap(GeometryModule):
         """Build the matrix again from the tensors of camera and plane, in the precision that they have now."""
         with torch.inference_mode(False), torch.no_grad():
             self._plan_again()
-            self.matrix = PlaneMap(self.camera(), self.plane()).matrix
+            self.matrix = PlaneMap.quietly(self.camera(), self.plane()).matrix
 
 
 PLAN = tuple(Plan.__annotations__)
