@@ -30,7 +30,8 @@ def plane_matrix(camera: Camera, plane: Plane, warn: bool) -> Tensor:
         with np.errstate(all="ignore"):
             M, b, height = _unscaled(library, behind_lens, *parts)
             factor, size, reach = _scale(library, M, b, height, parts[2], parts[4], dtype)
-            matrix = torch.as_tensor(library.concatenate((M * factor, size), -2))
+            matrix = library.concatenate((M * factor, size), -2)
+        matrix = torch.from_numpy(matrix) if library is np else matrix
     if warn and looks_at_rounding(camera.t):
         warn_of_rounding(reach, abs(height))
     return matrix.to(dtype)
