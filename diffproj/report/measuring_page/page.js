@@ -143,11 +143,22 @@ const actions = {
   },
 };
 
-function put(pixel) {
+// On the first corner of an open area a click ends it. On another point a click chooses it; but where a measure still
+// wants a point, or the point is chosen already, it puts one just there.
+function clickPoint(handle) {
   const open = openMeasure(sheet);
-  const again = open?.kind === "area" && open.points.length > 2 && nearest(onCanvas(view, pixel), 10);
-  if (again && again.measure === sheet.measures.indexOf(open) && again.point === 0) finish(sheet);
-  else putPoint(sheet, pixel);
+  const own = open && sheet.measures[handle.measure] === open;
+  const again = sheet.chosen?.measure === handle.measure && sheet.chosen?.point === handle.point;
+  if (own && open.kind === "area" && handle.point === 0 && open.points.length > 2) finish(sheet);
+  else if (own || !(open || again)) sheet.chosen = handle;
+  else putPoint(sheet, [...chosenPixel(handle)]);
+  changed();
+}
+
+function put(pixel) {
+  const handle = nearest(onCanvas(view, pixel), 3);
+  if (handle) return clickPoint(handle);
+  putPoint(sheet, pixel);
   changed();
 }
 
@@ -181,7 +192,6 @@ function toggle(option) {
 
 function choose(tool) {
   chooseTool(sheet, tool);
-  sheet.chosen = null;
   changed();
 }
 
@@ -259,12 +269,8 @@ function released(event) {
   press = null;
   canvas.style.cursor = "crosshair";
   if (!done || event.type === "pointercancel" || done.moved) return;
-  const open = openMeasure(sheet);
-  const closes = open?.kind === "area" && open.points.length > 2 && done.handle?.point === 0 && sheet.measures[done.handle.measure] === open;
-  if (done.handle && !closes) {
-    sheet.chosen = done.handle;
-    changed();
-  } else put(toPixel(view, done.start));
+  if (done.handle) clickPoint(done.handle);
+  else put(toPixel(view, done.start));
   if (done.touch) cursor = null;
 }
 canvas.addEventListener("pointerup", released);

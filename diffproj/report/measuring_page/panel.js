@@ -106,7 +106,7 @@ function fillAnswer(sheet, results, unit) {
       if (byId(`m-${id}`).textContent !== text) byId(`m-${id}`).textContent = text;
     }
   };
-  if (!measure || (measure.open && measure.kind !== sheet.tool)) return show(TITLES[sheet.tool], "–", WANTED[sheet.tool][0], "");
+  if (!measure || (sheet.prompted && !sheet.chosen)) return show(TITLES[sheet.tool], "–", WANTED[sheet.tool][0], "");
   const { quantities, measured } = results[index];
   if (measure.kind === "point") {
     const { point } = measured[0];

@@ -7,7 +7,7 @@ const NEEDED = { point: 1, length: 2, angle: 3, area: 3 };
 const TITLES = { point: "Point", length: "Length", angle: "Angle", area: "Area" };
 
 function makeSheet() {
-  return { measures: [], tool: "length", chosen: null, past: [], future: [], counts: { point: 0, length: 0, angle: 0, area: 0 } };
+  return { measures: [], tool: "length", prompted: false, chosen: null, past: [], future: [], counts: { point: 0, length: 0, angle: 0, area: 0 } };
 }
 
 function remember(sheet) {
@@ -31,6 +31,7 @@ const openMeasure = (sheet) => sheet.measures.find(({ open }) => open);
 // Put a point: into the measure that still wants one, or as the first of a new one.
 function putPoint(sheet, pixel) {
   remember(sheet);
+  sheet.prompted = false;
   let measure = openMeasure(sheet);
   if (!measure) {
     const number = ++sheet.counts[sheet.tool];
@@ -62,9 +63,10 @@ function finish(sheet) {
   sheet.chosen = null;
 }
 
+// From now on points make measures of this kind; the answer says what it wants.
 function chooseTool(sheet, tool) {
   if (openMeasure(sheet)) finish(sheet);
-  sheet.tool = tool;
+  Object.assign(sheet, { tool, chosen: null, prompted: true });
 }
 
 // A corner of an area goes alone as long as three are left; every other point takes its measure along.
