@@ -16,7 +16,7 @@ from diffproj.calibration.parametrisation import POSE, Parametrisation, moved
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane, as_plane
-from diffproj.lens.models import MODELS, coefficients_of, model_of
+from diffproj.lens.models import coefficients_of, model_of
 from diffproj.measurement.choices import chosen_view, detector_noise, doubts
 from diffproj.measurement.doubt import NEGLIGIBLE
 from diffproj.measurement.lens_reach import STEP

@@ -144,13 +144,13 @@ const actions = {
 };
 
 // On the first corner of an open area a click ends it. On another point a click chooses it; but where a measure still
-// wants a point, or the point is chosen already, it puts one just there.
+// wants a point, or a tool was just taken, or the point is chosen already, it puts one just there.
 function clickPoint(handle) {
   const open = openMeasure(sheet);
   const own = open && sheet.measures[handle.measure] === open;
   const again = sheet.chosen?.measure === handle.measure && sheet.chosen?.point === handle.point;
   if (own && open.kind === "area" && handle.point === 0 && open.points.length > 2) finish(sheet);
-  else if (own || !(open || again)) sheet.chosen = handle;
+  else if (own || !(open || again || sheet.prompted)) sheet.chosen = handle;
   else putPoint(sheet, [...chosenPixel(handle)]);
   changed();
 }

@@ -265,7 +265,7 @@ function drawCross(context, [x, y], arm) {
 
 // The photograph around the cursor, larger, in the corner that the cursor is not in.
 function drawLoupe(context, view, pixel, width, height) {
-  const radius = Math.min(74, width / 5, height / 5);
+  const radius = Math.min(74, width / 7, height / 5);
   const [x, y] = onCanvas(view, pixel);
   const margin = radius + 12;
   const near = x > width - 2.6 * margin && y < 2.6 * margin;
