@@ -67,8 +67,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "%(prog)s PHOTO --camera FILE --board CxR --square SIDE\n"
         "                        --points u,v ... [options]\n"
         "       %(prog)s --camera FILE --view NAME --points u,v ... [options]\n"
-        "       %(prog)s PHOTO --camera FILE (--board CxR --square SIDE | --view NAME)\n"
-        "                        --page FILE [options]"
+        "       %(prog)s PHOTO --camera FILE (--view NAME | --board ...) --page F"
     )
     photograph = command.add_argument(
         "photograph", type=some_path, metavar="PHOTO", help="the photograph, with --board; --view needs none"

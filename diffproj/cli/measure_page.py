@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from diffproj._core.atomic import write_whole
 from diffproj.cli.inputs import check_writable, some_path, writing
 
 if TYPE_CHECKING:  # they are slow to load
@@ -39,17 +40,17 @@ def write_page(options: argparse.Namespace, scene: "Scene", plane: "Plane", sigm
         ValueError: the photograph has another size than the camera's images.
         OSError: it cannot be read, or the page not be written.
     """
-    from diffproj.report.measuring_file import write_measuring_page
+    from diffproj.report.document import document
+    from diffproj.report.measuring import measuring_part
 
-    unit = scene.square.unit or scene.calibration.unit
+    part = measuring_part(
+        options.photograph,
+        scene.calibration,
+        plane,
+        scene.view,
+        sigma,
+        unit=scene.square.unit or scene.calibration.unit,
+        orientation=options.orientation,
+    )
     with writing("--page", options.page):
-        write_measuring_page(
-            options.page,
-            options.photograph,
-            scene.calibration,
-            plane,
-            scene.view,
-            sigma,
-            unit=unit,
-            orientation=options.orientation,
-        )
+        write_whole(options.page, document(part.title, [part]))

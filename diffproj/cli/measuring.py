@@ -67,7 +67,9 @@ def _given_pixels(options: argparse.Namespace) -> list[Pixel]:
     """The pixels to measure, named by their numbers where they have no names."""
     if options.points_file is not None:
         return read_points(options.points_file)
-    return [Pixel(str(number), u, v) for number, (u, v) in enumerate(options.points or (), start=1)]
+    if options.points is None:
+        return []
+    return [Pixel(str(number), u, v) for number, (u, v) in enumerate(options.points, start=1)]
 
 
 def _noise(options: argparse.Namespace, scene: Scene) -> PixelNoise:

@@ -1,15 +1,15 @@
-"""The measuring page as a part of a document: its fixed HTML, style and script, the photograph, and the camera's numbers."""
+"""The measuring page as a part of a document: fixed HTML, style and script, the photograph, the camera's numbers."""
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 import cv2
 import numpy as np
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from diffproj._core.arguments import called
+from diffproj._core.arguments import called, choice
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
@@ -51,10 +51,8 @@ def measuring_part(
     one, number = as_one(calibration, view)
     if unit is not None and not isinstance(unit, str):
         raise TypeError(f"unit: want a name such as 'mm', got {called(unit)}")
-    found = listed(photograph)
-    if len(found) > 1:
-        raise ValueError(f"photograph: want one, got {len(found)}")
-    image = colour(found[0], orientation)
+    found = _one(photograph)
+    image = colour(found, cast(Orientation, choice("orientation", orientation, get_args(Orientation))))
     size = image.shape[1], image.shape[0]
     camera = one.camera if isinstance(one, Calibration) else one
     if camera.size is not None and camera.size != size:
@@ -64,7 +62,7 @@ def measuring_part(
     if name is None:
         is_file = isinstance(photograph, str | os.PathLike)
         of_view = one.views.names[number] if isinstance(one, Calibration) else "a photograph"
-        name = found[0].name if is_file else of_view
+        name = found.name if is_file else of_view
     known_unit = one.unit if isinstance(one, Calibration) and unit is None else unit
     data = {
         "name": shortened(name),
@@ -74,6 +72,21 @@ def measuring_part(
         "model": measuring_model(one, number, plane, pixel_sigma),
     }
     return Part(f"Measure in {name}", "measuring-page", _html(data, jpeg), asset("measuring_page/page.css"), script())
+
+
+def _one(photograph: Any) -> Photograph:
+    """The photograph, checked to be one."""
+    if isinstance(photograph, str | os.PathLike):
+        if not Path(photograph).is_file():
+            raise FileNotFoundError(f"photograph: no such file: {os.fspath(photograph)}")
+    elif not isinstance(photograph, np.ndarray | Tensor):
+        raise TypeError(f"photograph: want a file name, an array or a tensor, got {called(photograph)}")
+    elif photograph.ndim > 3:
+        raise ValueError(f"photograph: want one, got shape {tuple(photograph.shape)}")
+    found = listed(photograph)
+    if len(found) > 1:
+        raise ValueError(f"photograph: want one, got {len(found)}")
+    return found[0] if isinstance(found[0].source, Path) else found[0]._replace(label="photograph")
 
 
 def _html(data: dict[str, Any], jpeg: bytes) -> str:

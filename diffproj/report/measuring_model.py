@@ -9,6 +9,7 @@ import math
 from typing import Any
 
 import torch
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.arguments import number
@@ -28,7 +29,9 @@ PICKED = 0.5
 """Standard deviation in px, along u and along v, of points that a person picks in a photograph."""
 
 
-def as_one(calibration: Calibration | Camera, view: int | str | None) -> tuple[Calibration | Camera, int]:
+def as_one(
+    calibration: Calibration | Camera | PinholeCamera, view: int | str | None
+) -> tuple[Calibration | Camera, int]:
     """A calibration and the number of the view, or one camera and 0.
 
     Raises:

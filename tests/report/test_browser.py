@@ -302,7 +302,7 @@ def test_beyond_the_horizon_and_the_lens_it_says_so(
         assert text in page.locator("#m-cursor").inner_text()
     click(page, (320, 330), (320, 100))
     assert "beyond the horizon" in page.locator("#m-note").inner_text()
-    assert page.locator("#m-value").inner_text() == "–"
+    assert page.locator("#m-value").inner_text() == "\u2013"
     assert "the camera came without its uncertainty" in page.locator("#m-facts").inner_text()
     option = page.locator("#m-plane option").all_inner_texts()
     assert option == ["the given plane, y = 1.5", "the plane, z = 0"]
@@ -321,7 +321,7 @@ def test_large_photographs_are_reduced_but_not_their_coordinates(
     path = tmp_path / "large.html"
     dp.write_measuring_page(path, large, scaled, unit="mm")
     page = opened(path)
-    assert "It is shown from 2400 × 1800 px" in page.locator("#m-facts").inner_text()
+    assert "It is shown from 2400 \u00d7 1800 px" in page.locator("#m-facts").inner_text()
     click(page, (244, 94), (512, 110))
     expected = torch.tensor([[244.0, 94], [512, 110]], dtype=D) * 5 + 2
     torch.testing.assert_close(points(page), expected, atol=2.0, rtol=0)
