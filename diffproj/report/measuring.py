@@ -17,7 +17,7 @@ from diffproj.report.document import Part, asset, data_uri, json_block, shortene
 from diffproj.report.measuring_model import PICKED, as_one, measuring_model
 from diffproj.targets.images import Orientation, Photograph, as_8_bit, grey, listed
 
-SCRIPTS = ("lens", "camera", "statistics", "errors", "tools", "view", "plan", "panel", "page")
+SCRIPTS = ("lens", "camera", "statistics", "errors", "tools", "view", "plan", "panel", "page", "hands", "start")
 """The files of the page's script, in their order; the first four are its mathematics."""
 SIDE = 2400
 """Pixels of the longer side of the embedded photograph; a larger one is reduced, its coordinates stay."""
@@ -63,9 +63,10 @@ def measuring_part(
         is_file = isinstance(photograph, str | os.PathLike)
         of_view = one.views.names[number] if isinstance(one, Calibration) else "a photograph"
         name = found.name if is_file else of_view
+    name = shortened(name.encode(errors="replace").decode())  # file names need not be UTF-8
     known_unit = one.unit if isinstance(one, Calibration) and unit is None else unit
     data = {
-        "name": shortened(name),
+        "name": name,
         "unit": known_unit,
         "size": size,
         "shown": shown,

@@ -42,8 +42,12 @@ def as_one(
         if calibration.views.batch_shape:
             shape = tuple(calibration.views.batch_shape)
             raise ValueError(f"calibration: want one camera, got batch shape {shape}")
+        if not bool(calibration.converged):
+            raise ValueError(f"calibration: want one that converged, got one that did not: {calibration.message}")
         return calibration, view_number(chosen_view(calibration, view), calibration.views.names)
     camera = as_camera(calibration, "calibration").upright()
+    if camera.batch_shape == (1,):  # as Kornia's always are
+        camera = camera[0]
     if camera.batch_shape:
         raise ValueError(f"calibration: want one camera, got batch shape {tuple(camera.batch_shape)}; index it")
     if camera.K.is_meta:

@@ -27,8 +27,20 @@ const sum = (numbers) => numbers.reduce((total, number) => total + number, 0);
 function makeCamera({ K, R, t, lens }) {
   const [[a, b], [c, d]] = [K[0], K[1]];
   const determinant = a * d - b * c;
-  const camera = { F: [[a, b], [c, d]], center: [K[0][2], K[1][2]], R, t, lens: makeLens(lens) };
-  camera.inverseF = [[d / determinant, -b / determinant], [-c / determinant, a / determinant]];
+  const camera = {
+    F: [
+      [a, b],
+      [c, d],
+    ],
+    center: [K[0][2], K[1][2]],
+    R,
+    t,
+    lens: makeLens(lens),
+  };
+  camera.inverseF = [
+    [d / determinant, -b / determinant],
+    [-c / determinant, a / determinant],
+  ];
   camera.back = transposed(R);
   camera.place = times(apply(camera.back, t), -1);
   return camera;
@@ -77,7 +89,14 @@ function makeMap(camera, plane) {
   rows = rows.map((row) => times(row, factor));
   const sizes = rows[3].map(Math.abs);
   const most = Math.max(...sizes);
-  return { camera, plane, rows, bare, thresholds: sizes.map((size) => (size + most * EPSILON) * ROUNDING), flat: !factor };
+  return {
+    camera,
+    plane,
+    rows,
+    bare,
+    thresholds: sizes.map((size) => (size + most * EPSILON) * ROUNDING),
+    flat: !factor,
+  };
 }
 
 function pointAt(map, pixel) {
@@ -102,7 +121,15 @@ function stretchAt(map, point) {
   const byPoint = byCamera.map((row) => apply(camera.back, row));
   const [[a, b], [c, d]] = byPoint.map((row) => plane.axes.map((axis) => dot(row, axis)));
   const determinant = a * d - b * c;
-  const inverse = determinant ? [[d, -b], [-c, a]].map((row) => row.map((x) => x / determinant)) : [[0, 0], [0, 0]];
+  const inverse = determinant
+    ? [
+        [d, -b],
+        [-c, a],
+      ].map((row) => row.map((x) => x / determinant))
+    : [
+        [0, 0],
+        [0, 0],
+      ];
   const [x, y] = plane.axes;
   const byPixel = [0, 1, 2].map((i) => [0, 1].map((j) => x[i] * inverse[0][j] + y[i] * inverse[1][j]));
   return { direction, byCamera, byPixel };

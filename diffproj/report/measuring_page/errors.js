@@ -10,7 +10,16 @@
 function makeKnowledge(description, map) {
   const { root, undetermined, middle, skew, moved, region, other } = description;
   const q = root.length;
-  const knowledge = { q, root, columns: q ? transposed(root) : [], middle, skew, knows: q > 0, region, freedom: description.freedom ?? Infinity };
+  const knowledge = {
+    q,
+    root,
+    columns: q ? transposed(root) : [],
+    middle,
+    skew,
+    knows: q > 0,
+    region,
+    freedom: description.freedom ?? Infinity,
+  };
   knowledge.undetermined = undetermined;
   knowledge.moved = moved.map((camera) => makeMap(makeCamera(camera), map.plane));
   knowledge.other = other && { ...other, map: makeMap(makeCamera({ ...description.camera, ...other }), map.plane) };
@@ -51,7 +60,9 @@ function measurePoint(scene, pixel) {
   const wider = factor === Infinity ? 1 : factor;
   const shared = moves.map((move) => times(move, wider));
   const away = [];
-  const lost = knowledge.undetermined.map((index) => byPixel.map((row) => row[0] * byTheta[0][index] + row[1] * byTheta[1][index]));
+  const lost = knowledge.undetermined.map((index) =>
+    byPixel.map((row) => row[0] * byTheta[0][index] + row[1] * byTheta[1][index]),
+  );
   let nowhere = factor === Infinity;
   if (knowledge.other) {
     const there = pointAt(knowledge.other.map, pixel).point;
@@ -67,13 +78,19 @@ function measurePoint(scene, pixel) {
 function shaken(scene, measured, errors, own) {
   const { map, knowledge, sigma } = scene;
   const { q } = knowledge;
-  const pixel = measured.pixel.map((x, axis) => x + sigma * own[axis] - measured.sway.reduce((t, step, e) => t + step[axis] * errors[e], 0));
+  const pixel = measured.pixel.map(
+    (x, axis) => x + sigma * own[axis] - measured.sway.reduce((t, step, e) => t + step[axis] * errors[e], 0),
+  );
   const { point } = pointAt(map, pixel);
   if (point === null) return null;
   const { byPixel } = stretchAt(map, point);
   const place = measured.away.reduce((place, away, n) => plus(place, away, errors[q + n]), point);
   const shared = measured.sway.map((step) => byPixel.map((row) => -(row[0] * step[0] + row[1] * step[1])));
-  return { point: place, shared: [...shared, ...measured.away], own: [0, 1].map((axis) => byPixel.map((row) => row[axis] * sigma)) };
+  return {
+    point: place,
+    shared: [...shared, ...measured.away],
+    own: [0, 1].map((axis) => byPixel.map((row) => row[axis] * sigma)),
+  };
 }
 
 // ---------------------------------------------------------------------------------------------- vectors of the points
@@ -102,7 +119,11 @@ function turn([first, corner, last]) {
   const q = cosine > 0 ? sine / cosine : Infinity;
   const g = sine > 0 ? Math.atan2(sine, cosine) / sine : cosine > 0 ? 1 / cosine : 0;
   // (dg / dsine) / sine; by its series where the two terms cancel.
-  const bend = !(size > 0) ? 0 : q < 0.01 ? (-2 / 3 + q * q * (4 / 5 - (6 / 7) * q * q)) / cosine ** 3 : (cosine / size - g) / (sine * sine);
+  const bend = !(size > 0)
+    ? 0
+    : q < 0.01
+      ? (-2 / 3 + q * q * (4 / 5 - (6 / 7) * q * q)) / cosine ** 3
+      : (cosine / size - g) / (sine * sine);
   const byArms = (da, db) => {
     const turned = plus(cross(da, b), cross(a, db));
     const opened = sign * (dot(da, b) + dot(a, db));
@@ -158,9 +179,17 @@ function measureNorm(scene, points, vector, limit = Infinity) {
   const longest = longestAxis(C);
   const towards = r > 0 ? u : longest.axis;
   const lost = isLost(points, (j, step) => dot(towards, found.along[j](step)));
-  const reach = studentReach(freedomOf(scene, columns.map((column) => dot(column, towards)), points.length));
+  const reach = studentReach(
+    freedomOf(
+      scene,
+      columns.map((column) => dot(column, towards)),
+      points.length,
+    ),
+  );
   const deviation = lost ? Infinity : variance > 0 ? Math.sqrt(variance) : 0;
-  const bounds = lost ? { low: 0, high: limit } : normBounds(scene, points, vector, { found, C, r, longest, reach, limit });
+  const bounds = lost
+    ? { low: 0, high: limit }
+    : normBounds(scene, points, vector, { found, C, r, longest, reach, limit });
   return described({ value, deviation, ...bounds, reach });
 }
 
@@ -193,7 +222,11 @@ function normBounds(scene, points, vector, { found, C, r, longest, reach, limit 
   const down = extreme(scene, points, signed, r, slopes, -1, reach);
   const up = extreme(scene, points, signed, r, slopes, 1, reach);
   const after = (steps) => {
-    const at = allShaken(scene, points, down.where.map((part) => (part * steps * reach) / z));
+    const at = allShaken(
+      scene,
+      points,
+      down.where.map((part) => (part * steps * reach) / z),
+    );
     return at ? signed(at.map(({ point }) => point)).value : -Infinity;
   };
   const toZero = stepsToZero(after, r);
@@ -207,7 +240,14 @@ function normBounds(scene, points, vector, { found, C, r, longest, reach, limit 
   const step = s > 0 ? Math.max((up.best - r) / (z * unit), 0) : Math.max(reach / z, 0);
   const wide = Number.isFinite(step) ? step ** 2 : 1;
   const wider = { largest: longest.largest * wide, axis: longest.axis };
-  let high = up.best === Infinity ? Infinity : upperBound(found.w, C.map((row) => times(row, wide)), wider);
+  let high =
+    up.best === Infinity
+      ? Infinity
+      : upperBound(
+          found.w,
+          C.map((row) => times(row, wide)),
+          wider,
+        );
   if (found.supplement) [low, high] = [limit - high, limit - low];
   return { low: Math.max(low, 0), high: Math.min(high, limit) };
 }
@@ -227,7 +267,11 @@ function extreme(scene, points, valueOf, value, slopes, side, reach) {
   let [best, direction] = [value, towards(slopes)];
   let where = direction;
   for (let round = 0; round < 8; round++) {
-    const at = allShaken(scene, points, direction.map((part) => part * reach));
+    const at = allShaken(
+      scene,
+      points,
+      direction.map((part) => part * reach),
+    );
     if (at === null) return { best: side * Infinity, where };
     const there = valueOf(at.map(({ point }) => point));
     if (side * there.value > side * best) [best, where] = [there.value, direction];
@@ -263,11 +307,16 @@ function measureNumber(scene, points, valueOf) {
   if (points.some(({ point }) => point === null)) return UNKNOWN;
   const places = points.map(({ point }) => point);
   const { value, gradient } = valueOf(places);
-  const slopes = columnsOf(points, points.map((_, j) => (step) => [gradient(j, step)]), 1).map(([x]) => x);
+  const slopes = columnsOf(
+    points,
+    points.map((_, j) => (step) => [gradient(j, step)]),
+    1,
+  ).map(([x]) => x);
   const first = sum(slopes.map((x) => x * x));
   const kink = kinkVariance(points, places, (at) => valueOf(at).value, first);
   const deviation = Math.sqrt(first + kink);
-  if (isLost(points, gradient)) return described({ value, deviation: Infinity, low: -Infinity, high: Infinity, reach: 0 });
+  if (isLost(points, gradient))
+    return described({ value, deviation: Infinity, low: -Infinity, high: Infinity, reach: 0 });
   const reach = studentReach(freedomOf(scene, slopes, points.length));
   const [low, high] = [-1, 1].map((side) => extreme(scene, points, valueOf, value, slopes, side, reach).best);
   const lacking = deviation - Math.sqrt(first);
@@ -280,7 +329,8 @@ function kinkVariance(points, places, valueOf, first) {
   for (const [j, point] of points.entries()) {
     for (const own of point.own) steps.push(points.map((_, i) => (i === j ? own : [0, 0, 0])));
   }
-  const change = (side) => sum(steps.map((step) => (valueOf(places.map((place, j) => plus(place, step[j], side))) - here) ** 2));
+  const change = (side) =>
+    sum(steps.map((step) => (valueOf(places.map((place, j) => plus(place, step[j], side))) - here) ** 2));
   const excess = Math.max((change(-1) + change(1)) / 2 - first, 0);
   return first + excess > 0 ? excess ** 2 / (first + excess) : 0;
 }
@@ -297,7 +347,8 @@ const way = (closed) => (places) => {
   const count = places.length;
   const legs = Array.from({ length: closed ? count : count - 1 }, (_, n) => [n, (n + 1) % count]);
   const units = legs.map(([a, b]) => minus(places[b], places[a])).map((leg) => times(leg, 1 / (norm(leg) || 1)));
-  const gradient = (j, step) => sum(legs.map(([a, b], n) => (j === b ? dot(units[n], step) : 0) - (j === a ? dot(units[n], step) : 0)));
+  const gradient = (j, step) =>
+    sum(legs.map(([a, b], n) => (j === b ? dot(units[n], step) : 0) - (j === a ? dot(units[n], step) : 0)));
   return { value: sum(legs.map(([a, b]) => norm(minus(places[b], places[a])))), gradient };
 };
 

@@ -34,7 +34,9 @@ function numberCell(text, data) {
 }
 
 function deleteCell(key, label, onClick) {
-  return element("td", {}, [element("button", { type: "button", text: "✕", "aria-label": label, data: { key }, on: { click: onClick } })]);
+  return element("td", {}, [
+    element("button", { type: "button", text: "✕", "aria-label": label, data: { key }, on: { click: onClick } }),
+  ]);
 }
 
 function exactly({ value, deviation, low, high }) {
@@ -49,10 +51,16 @@ function fillMeasures(sheet, results, unit, actions) {
       const its = unitOf(quantity.what, unit);
       const name = n
         ? element("td", { text: quantity.what, class: "faint" })
-        : field(`measure-${m}`, `Name of ${measure.name}`, measure.name, (text) => actions.renameMeasure(m, text), { maxlength: 300 });
+        : field(`measure-${m}`, `Name of ${measure.name}`, measure.name, (text) => actions.renameMeasure(m, text), {
+            maxlength: 300,
+          });
       return element("tr", { class: sheet.chosen?.measure === m ? "m-chosen" : "" }, [
         name,
-        element("td", { class: "number m-quantity", text: withDeviation(quantity.value, quantity.deviation, its), data: { what: quantity.what, ...exactly(quantity) } }),
+        element("td", {
+          class: "number m-quantity",
+          text: withDeviation(quantity.value, quantity.deviation, its),
+          data: { what: quantity.what, ...exactly(quantity) },
+        }),
         numberCell(intervalText(quantity, its), {}),
         element("td", { class: "m-remark", text: remarksOf(measured, [quantity]) }),
         n ? element("td") : deleteCell(`drop-${m}`, `Delete ${measure.name}`, () => actions.deleteMeasure(m)),
@@ -72,12 +80,17 @@ function fillPoints(sheet, results, unit, actions) {
       const set = (axis) => (text) => actions.movePoint(m, n, axis, Number(text));
       const numbers = { type: "number", step: "any" };
       return element("tr", { class: sheet.chosen?.measure === m && sheet.chosen?.point === n ? "m-chosen" : "" }, [
-        field(`name-${key}`, `Name of point ${name}`, name, (text) => actions.renamePoint(m, n, text), { maxlength: 300 }),
+        field(`name-${key}`, `Name of point ${name}`, name, (text) => actions.renamePoint(m, n, text), {
+          maxlength: 300,
+        }),
         field(`u-${key}`, `u of ${name}`, Number(pixel[0].toFixed(3)), set(0), numbers),
         field(`v-${key}`, `v of ${name}`, Number(pixel[1].toFixed(3)), set(1), numbers),
         ...[0, 1, 2].map((i) =>
           spread
-            ? numberCell(withDeviation(measured.point[i], spread[i], ""), { value: measured.point[i], deviation: spread[i] })
+            ? numberCell(withDeviation(measured.point[i], spread[i], ""), {
+                value: measured.point[i],
+                deviation: spread[i],
+              })
             : numberCell("–", {}),
         ),
         element("td", { class: "m-remark", text: remarksOf([measured]) }),
@@ -111,10 +124,13 @@ function fillAnswer(sheet, results, unit) {
   if (measure.kind === "point") {
     const { point } = measured[0];
     const spread = point && deviationsOf(measured[0]);
-    const lines = point ? "xyz".split("").map((axis, i) => `${axis} ${withDeviation(point[i], spread[i], unit ?? "")}`) : ["–"];
+    const lines = point
+      ? "xyz".split("").map((axis, i) => `${axis} ${withDeviation(point[i], spread[i], unit ?? "")}`)
+      : ["–"];
     return show(measure.name, lines[0], lines.slice(1).join(", "), remarksOf(measured));
   }
-  if (!quantities.length) return show(measure.name, "–", WANTED[measure.kind][measure.points.length] ?? "", remarksOf(measured));
+  if (!quantities.length)
+    return show(measure.name, "–", WANTED[measure.kind][measure.points.length] ?? "", remarksOf(measured));
   const [main, second] = quantities;
   const its = unitOf(main.what, unit);
   const more = second ? ` Perimeter ${withDeviation(second.value, second.deviation, unitOf("perimeter", unit))}.` : "";
@@ -132,14 +148,18 @@ function equationOf({ normal, offset }) {
 }
 
 const INCLUDED = {
-  camera: "The deviations hold the noise of your clicks, and what the calibration leaves open: focal lengths, principal point, lens and the pose, together.",
+  camera:
+    "The deviations hold the noise of your clicks, and what the calibration leaves open: focal lengths, principal point, lens and the pose, together.",
   pose: "The deviations hold the noise of your clicks and of the pose. The camera itself counts as exact, for it came without its uncertainty.",
   pixels: "The deviations hold the noise of your clicks alone: the camera came without its uncertainty.",
 };
 
 function fillFacts(data, scene) {
   const [width, height] = data.size;
-  const reduced = data.shown[0] < width ? ` It is shown from ${data.shown[0]} × ${data.shown[1]} px; coordinates are those of the original.` : "";
+  const reduced =
+    data.shown[0] < width
+      ? ` It is shown from ${data.shown[0]} × ${data.shown[1]} px; coordinates are those of the original.`
+      : "";
   const facts = [
     data.model.doubts ? `Doubtful: ${data.model.doubts}` : "",
     INCLUDED[data.model.includes],

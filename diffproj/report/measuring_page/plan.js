@@ -31,7 +31,7 @@ function extentOf(plan, [width, height], others) {
       const { point } = pointAt(map, pixel);
       if (point === null) continue;
       const { byPixel } = stretchAt(map, point);
-      seen.push({ place: inPlan(plan, point), coarse: hypot(...byPixel.flat()) });
+      seen.push({ place: inPlan(plan, point), coarse: Math.hypot(...byPixel.flat()) });
     }
   }
   if (!seen.length) return null;
@@ -81,7 +81,10 @@ function blend({ data, width, height }, u, v, target, at) {
   const from = 4 * (j * width + i);
   for (let channel = 0; channel < 3; channel++) {
     const k = from + channel;
-    const [top, bottom] = [data[k] * (1 - a) + data[k + 4] * a, data[k + 4 * width] * (1 - a) + data[k + 4 * width + 4] * a];
+    const [top, bottom] = [
+      data[k] * (1 - a) + data[k + 4] * a,
+      data[k + 4 * width] * (1 - a) + data[k + 4 * width + 4] * a,
+    ];
     target[at + channel] = top * (1 - b) + bottom * b;
   }
   target[at + 3] = 255;
@@ -111,7 +114,10 @@ function drawPlan(canvas, plan, picture, sheet, cursorPoint, unit, showGrid) {
   if (showGrid) drawPlanGrid(context, plan, layout);
   const { map } = plan.scene;
   for (const measure of sheet.measures) {
-    const places = measure.points.map(({ pixel }) => pointAt(map, pixel).point).filter(Boolean).map(layout.place);
+    const places = measure.points
+      .map(({ pixel }) => pointAt(map, pixel).point)
+      .filter(Boolean)
+      .map(layout.place);
     const outline = () => {
       places.forEach(([x, y], n) => context[n ? "lineTo" : "moveTo"](x, y));
       if (measure.kind === "area" && places.length > 2) context.closePath();
@@ -146,11 +152,16 @@ function drawScaleBar(context, layout, unit) {
   const length = niceStep(layout.width / 7 / layout.scale);
   const long = length * layout.scale;
   const [x, y] = [12, layout.height - 14];
-  stroke(context, () => {
-    context.moveTo(x, y - 4);
-    context.lineTo(x, y);
-    context.lineTo(x + long, y);
-    context.lineTo(x + long, y - 4);
-  }, "#ffffff", 1.6);
+  stroke(
+    context,
+    () => {
+      context.moveTo(x, y - 4);
+      context.lineTo(x, y);
+      context.lineTo(x + long, y);
+      context.lineTo(x + long, y - 4);
+    },
+    "#ffffff",
+    1.6,
+  );
   label(context, `${plainNumber(length)}${unit ? ` ${unit}` : ""}`, x + long + 9, y - 4, "left", 12);
 }

@@ -74,9 +74,17 @@ function normalBelow(x) {
 // Eigenvalues and vectors of a symmetric 3 x 3 matrix by Jacobi's rotations: the largest and its vector.
 function longestAxis(C) {
   const A = C.map((row) => [...row]);
-  const V = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+  const V = [
+    [1, 0, 0],
+    [0, 1, 0],
+    [0, 0, 1],
+  ];
   for (let sweep = 0; sweep < 30; sweep++) {
-    for (const [p, q] of [[0, 1], [0, 2], [1, 2]]) {
+    for (const [p, q] of [
+      [0, 1],
+      [0, 2],
+      [1, 2],
+    ]) {
       if (A[p][q] === 0) continue;
       const theta = (A[q][q] - A[p][p]) / (2 * A[p][q]);
       const t = (theta < 0 ? -1 : 1) / (Math.abs(theta) + hypot(theta, 1));
@@ -91,7 +99,8 @@ function longestAxis(C) {
   return { largest: Math.max(A[best][best], 0), axis: V.map((row) => row[best]) };
 }
 
-const nearness = (r, largest) => Math.min(Math.max((FAR - r / Math.max(Math.sqrt(largest), 1e-300)) / (FAR - NEAR), 0), 1);
+const nearness = (r, largest) =>
+  Math.min(Math.max((FAR - r / Math.max(Math.sqrt(largest), 1e-300)) / (FAR - NEAR), 0), 1);
 
 // The smallest length, in deviations along it, that a measured one of r is compatible with.
 function lowerBound(r, across, correlated, largest) {
@@ -123,7 +132,7 @@ function probabilityBelow(x, length, across, correlated) {
     const [e, half] = [x * Math.sin(end * node), x * Math.cos(end * node)];
     const middle = length + slope * e;
     const inside = normalBelow((half - middle) / left) - normalBelow((-half - middle) / left);
-    total += ((Math.exp(-((e / tau) ** 2) / 2) / (tau * Math.sqrt(2 * Math.PI))) * half * inside) * weight;
+    total += (Math.exp(-((e / tau) ** 2) / 2) / (tau * Math.sqrt(2 * Math.PI))) * half * inside * weight;
   }
   return total * end;
 }

@@ -7,7 +7,15 @@ const NEEDED = { point: 1, length: 2, angle: 3, area: 3 };
 const TITLES = { point: "Point", length: "Length", angle: "Angle", area: "Area" };
 
 function makeSheet() {
-  return { measures: [], tool: "length", prompted: false, chosen: null, past: [], future: [], counts: { point: 0, length: 0, angle: 0, area: 0 } };
+  return {
+    measures: [],
+    tool: "length",
+    prompted: false,
+    chosen: null,
+    past: [],
+    future: [],
+    counts: { point: 0, length: 0, angle: 0, area: 0 },
+  };
 }
 
 function remember(sheet) {
@@ -100,9 +108,13 @@ function chooseNext(sheet, side) {
 function quantitiesOf(scene, measure) {
   const points = measure.points.map(({ pixel }) => measurePoint(scene, pixel));
   if (measure.kind === "length" && points.length === 2) return [{ what: "length", ...measureLength(scene, points) }];
-  if (measure.kind === "angle" && points.length === 3) return [{ what: "angle", ...inDegrees(measureAngle(scene, points)) }];
+  if (measure.kind === "angle" && points.length === 3)
+    return [{ what: "angle", ...inDegrees(measureAngle(scene, points)) }];
   if (measure.kind === "area" && points.length > 2) {
-    return [{ what: "area", ...measureArea(scene, points) }, { what: "perimeter", ...measurePerimeter(scene, points) }];
+    return [
+      { what: "area", ...measureArea(scene, points) },
+      { what: "perimeter", ...measurePerimeter(scene, points) },
+    ];
   }
   return [];
 }
@@ -124,7 +136,10 @@ function rounded(value, deviation) {
   if (!Number.isFinite(value)) return value > 0 ? "∞" : "−∞";
   if (!(Number.isFinite(deviation) && deviation > 0)) return plainNumber(value);
   if (deviation >= 1e5) return value.toExponential(2).replaceAll("-", "−");
-  return value.toFixed(decimalsOf(deviation)).replace(/^-(?=[0.]*$)/, "").replace("-", "−");
+  return value
+    .toFixed(decimalsOf(deviation))
+    .replace(/^-(?=[0.]*$)/, "")
+    .replace("-", "−");
 }
 
 function withDeviation(value, deviation, unit) {
@@ -153,7 +168,8 @@ function remarksOf(measured, quantities = []) {
   const remarks = [];
   const lost = measured.find(({ point }) => point === null);
   if (lost) remarks.push(REASONS[lost.reason]);
-  if (measured.some(({ point, extrapolated }) => point !== null && extrapolated)) remarks.push("extrapolated: the calibration saw no corner there");
+  if (measured.some(({ point, extrapolated }) => point !== null && extrapolated))
+    remarks.push("extrapolated: the calibration saw no corner there");
   if (quantities.some(({ nonlinear }) => nonlinear)) remarks.push("lopsided: take the interval");
   return remarks.join("; ");
 }
@@ -193,10 +209,46 @@ function cell(value) {
 }
 
 function asTable({ measures, unit }) {
-  const title = ["measure", "row", "value", "deviation", "low_95", "high_95", "unit", "u", "v", "x", "y", "z", "x_deviation", "y_deviation", "z_deviation", "extrapolated", "remark"];
+  const title = [
+    "measure",
+    "row",
+    "value",
+    "deviation",
+    "low_95",
+    "high_95",
+    "unit",
+    "u",
+    "v",
+    "x",
+    "y",
+    "z",
+    "x_deviation",
+    "y_deviation",
+    "z_deviation",
+    "extrapolated",
+    "remark",
+  ];
   const rows = measures.flatMap(({ name, quantities, points }) => [
     ...quantities.map((q) => [name, q.what, q.value, q.deviation, q.low_95, q.high_95, q.unit]),
-    ...points.map((p) => [name, p.name, "", "", "", "", unit ?? "", p.u, p.v, p.x, p.y, p.z, p.x_deviation, p.y_deviation, p.z_deviation, p.extrapolated, p.remark]),
+    ...points.map((p) => [
+      name,
+      p.name,
+      "",
+      "",
+      "",
+      "",
+      unit ?? "",
+      p.u,
+      p.v,
+      p.x,
+      p.y,
+      p.z,
+      p.x_deviation,
+      p.y_deviation,
+      p.z_deviation,
+      p.extrapolated,
+      p.remark,
+    ]),
   ]);
   const full = rows.map((row) => [...row, ...new Array(title.length - row.length).fill("")]);
   return `${[title, ...full].map((row) => row.map(cell).join(",")).join("\r\n")}\r\n`;

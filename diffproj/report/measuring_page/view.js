@@ -75,7 +75,12 @@ function shadeOf(scene, [width, height]) {
 // The photograph without the region that the calibration's corners covered.
 function outsideOf(region, [width, height]) {
   if (!region) return null;
-  let corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([a, b]) => [a * 1e6, b * 1e6]);
+  let corners = [
+    [-1, -1],
+    [1, -1],
+    [1, 1],
+    [-1, 1],
+  ].map(([a, b]) => [a * 1e6, b * 1e6]);
   region.forEach((reach, k) => {
     const angle = (k * 2 * Math.PI) / region.length;
     const over = ([x, y]) => Math.cos(angle) * x + Math.sin(angle) * y - reach;
@@ -88,7 +93,9 @@ function outsideOf(region, [width, height]) {
   });
   const outside = new Path2D();
   outside.rect(0, 0, width, height);
-  corners.forEach(([u, v], n) => outside[n ? "lineTo" : "moveTo"](Math.min(Math.max(u + 0.5, 0), width), Math.min(Math.max(v + 0.5, 0), height)));
+  corners.forEach(([u, v], n) =>
+    outside[n ? "lineTo" : "moveTo"](Math.min(Math.max(u + 0.5, 0), width), Math.min(Math.max(v + 0.5, 0), height)),
+  );
   outside.closePath();
   return outside;
 }
@@ -101,7 +108,8 @@ const niceStep = (about) => {
 // Lines of the plane at whole steps, projected piece by piece.
 function gridOf(scene, extent, step) {
   const { plane, camera } = scene.map;
-  const place = (a, b) => project(camera, plus(plus(times(plane.unit, plane.distance), plane.axes[0], a), plane.axes[1], b));
+  const place = (a, b) =>
+    project(camera, plus(plus(times(plane.unit, plane.distance), plane.axes[0], a), plane.axes[1], b));
   const path = new Path2D();
   const [[lowA, highA], [lowB, highB]] = extent;
   const draw = (from, to, at) => {
@@ -113,8 +121,10 @@ function gridOf(scene, extent, step) {
       drawn = Boolean(seen);
     }
   };
-  for (let a = Math.ceil(lowA / step) * step; a <= highA + 1e-9 * step; a += step) draw(lowB, highB, (b) => place(a, b));
-  for (let b = Math.ceil(lowB / step) * step; b <= highB + 1e-9 * step; b += step) draw(lowA, highA, (a) => place(a, b));
+  for (let a = Math.ceil(lowA / step) * step; a <= highA + 1e-9 * step; a += step)
+    draw(lowB, highB, (b) => place(a, b));
+  for (let b = Math.ceil(lowB / step) * step; b <= highB + 1e-9 * step; b += step)
+    draw(lowA, highA, (a) => place(a, b));
   return path;
 }
 
@@ -123,7 +133,10 @@ function hatching(context, ratio) {
   tile.width = tile.height = Math.round(12 * ratio);
   const pen = tile.getContext("2d");
   const side = tile.width;
-  for (const [color, shift] of [["rgba(0, 0, 0, 0.32)", 1.2 * ratio], ["rgba(255, 255, 255, 0.42)", 0]]) {
+  for (const [color, shift] of [
+    ["rgba(0, 0, 0, 0.32)", 1.2 * ratio],
+    ["rgba(255, 255, 255, 0.42)", 0],
+  ]) {
     pen.strokeStyle = color;
     pen.lineWidth = ratio;
     for (const offset of [-side, 0, side]) {
@@ -167,7 +180,10 @@ function drawView(view, sheet, overlay, cursor, options) {
   context.rect(0, 0, ...view.size);
   context.clip();
   if (options.grid && overlay.grid) {
-    for (const [color, width] of [["rgba(0, 0, 0, 0.35)", 2.2], ["rgba(255, 255, 255, 0.75)", 0.9]]) {
+    for (const [color, width] of [
+      ["rgba(0, 0, 0, 0.35)", 2.2],
+      ["rgba(255, 255, 255, 0.75)", 0.9],
+    ]) {
       context.strokeStyle = color;
       context.lineWidth = width / view.scale;
       context.stroke(overlay.grid);
@@ -184,7 +200,8 @@ function drawView(view, sheet, overlay, cursor, options) {
     context.fill(path, "evenodd");
     context.restore();
   }
-  for (const [m, measure] of sheet.measures.entries()) drawMeasure(context, view, sheet, measure, m, overlay.texts[m] ?? "");
+  for (const [m, measure] of sheet.measures.entries())
+    drawMeasure(context, view, sheet, measure, m, overlay.texts[m] ?? "");
   if (cursor) {
     drawCross(context, onCanvas(view, cursor.pixel), options.keyboard ? 14 : 9);
     if (options.loupe && !cursor.touch) drawLoupe(context, view, cursor.pixel, width, height);
@@ -192,7 +209,10 @@ function drawView(view, sheet, overlay, cursor, options) {
 }
 
 function stroke(context, draw, color = LINE, width = 2) {
-  for (const [ink, thick] of [[CASING, width + 2.4], [color, width]]) {
+  for (const [ink, thick] of [
+    [CASING, width + 2.4],
+    [color, width],
+  ]) {
     context.strokeStyle = ink;
     context.lineWidth = thick;
     context.lineJoin = context.lineCap = "round";
@@ -219,14 +239,25 @@ function drawMeasure(context, view, sheet, measure, number, text) {
   }
   places.forEach(([x, y], n) => {
     const chosen = sheet.chosen?.measure === number && sheet.chosen?.point === n;
-    stroke(context, () => context.arc(x, y, chosen ? 8 : 5.5, 0, 2 * Math.PI), chosen ? CHOSEN : LINE, chosen ? 2.4 : 1.8);
+    stroke(
+      context,
+      () => context.arc(x, y, chosen ? 8 : 5.5, 0, 2 * Math.PI),
+      chosen ? CHOSEN : LINE,
+      chosen ? 2.4 : 1.8,
+    );
     context.fillStyle = chosen ? CHOSEN : LINE;
     context.fillRect(x - 0.75, y - 0.75, 1.5, 1.5);
     label(context, measure.points[n].name, x + 11, y - 11, "left", 12);
   });
   if (text && places.length) {
-    const [x, y] = [0, 1].map((axis) => sum(places.map((place) => place[axis])) / places.length);
-    label(context, text, x, y + (places.length > 2 ? 0 : 17), "center", 14, true);
+    let [x, y] = [0, 1].map((axis) => sum(places.map((place) => place[axis])) / places.length);
+    if (measure.kind === "length") y += 17;
+    if (measure.kind === "angle") {
+      const [dx, dy] = [places[1][0] - x, places[1][1] - y]; // beyond the corner, where no arm is
+      const away = Math.max(hypot(dx, dy), 1);
+      [x, y] = [places[1][0] + (dx / away) * 54, places[1][1] + (dy / away) * 30];
+    }
+    label(context, text, x, y, "center", 14, true);
   }
 }
 
@@ -255,12 +286,22 @@ function label(context, text, x, y, align, size, pill = false) {
 
 function drawCross(context, [x, y], arm) {
   const gap = 3;
-  stroke(context, () => {
-    for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-      context.moveTo(x + dx * gap, y + dy * gap);
-      context.lineTo(x + dx * arm, y + dy * arm);
-    }
-  }, "#ffffff", 1.3);
+  stroke(
+    context,
+    () => {
+      for (const [dx, dy] of [
+        [1, 0],
+        [-1, 0],
+        [0, 1],
+        [0, -1],
+      ]) {
+        context.moveTo(x + dx * gap, y + dy * gap);
+        context.lineTo(x + dx * arm, y + dy * arm);
+      }
+    },
+    "#ffffff",
+    1.3,
+  );
 }
 
 // The photograph around the cursor, larger, in the corner that the cursor is not in.
