@@ -19,7 +19,7 @@ WINDOWS = {
     "measuring_dark.png": (1240, 860, "dark"),
     "measuring_narrow.png": (400, 860, "dark"),
 }
-COLOURS = 96
+COLOURS = 250
 
 
 def pictures(calibration: dp.Calibration) -> dict[str, bytes]:
@@ -50,14 +50,14 @@ def pictures(calibration: dp.Calibration) -> dict[str, bytes]:
 
 def _measure(page, corners: list[list[float]]) -> None:
     """A row of the board, then the area of four by two squares; the cursor stays on a corner."""
-    for number in (0, 8):
+    for number in (45, 53):
         page.mouse.click(*_place(page, corners[number]))
     page.locator("[data-tool=area]").click()
-    for number in (19, 23, 41, 37):
+    for number in (10, 14, 32, 28):
         page.mouse.click(*_place(page, corners[number]))
     page.locator("#m-finish").click()
     page.locator("#m-photo").evaluate("canvas => canvas.blur()")
-    page.mouse.move(*_place(page, corners[52]))
+    page.mouse.move(*_place(page, corners[35]))
 
 
 def _place(page, pixel: list[float]) -> tuple[float, float]:
@@ -70,5 +70,7 @@ def _place(page, pixel: list[float]) -> tuple[float, float]:
 def _smaller(png: bytes) -> bytes:
     """The same picture with a palette, in a third of the bytes."""
     small = io.BytesIO()
-    Image.open(io.BytesIO(png)).convert("RGB").quantize(COLOURS).save(small, "PNG", optimize=True)
+    Image.open(io.BytesIO(png)).convert("RGB").quantize(
+        COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+    ).save(small, "PNG", optimize=True)
     return small.getvalue()

@@ -306,6 +306,10 @@ def test_beyond_the_horizon_and_the_lens_it_says_so(
     assert "the camera came without its uncertainty" in page.locator("#m-facts").inner_text()
     option = page.locator("#m-plane option").all_inner_texts()
     assert option == ["the given plane, y = 1.5", "the plane, z = 0"]
+    page.locator("#m-plane").select_option("1")
+    page.mouse.move(*place(page, 320, 331))
+    assert "the camera itself lies in the plane" in page.locator("#m-cursor").inner_text()
+    assert page.locator("#m-plan-text").inner_text() == "The camera sees nothing of this plane."
 
 
 @pytest.mark.slow

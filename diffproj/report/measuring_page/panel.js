@@ -155,13 +155,14 @@ const INCLUDED = {
 };
 
 function fillFacts(data, scene) {
+  byId("m-doubts").hidden = !data.model.doubts;
+  byId("m-doubts").textContent = `Doubtful: ${data.model.doubts}`;
   const [width, height] = data.size;
   const reduced =
     data.shown[0] < width
       ? ` It is shown from ${data.shown[0]} × ${data.shown[1]} px; coordinates are those of the original.`
       : "";
   const facts = [
-    data.model.doubts ? `Doubtful: ${data.model.doubts}` : "",
     INCLUDED[data.model.includes],
     `You measure on the plane ${equationOf(scene.map.plane)}${data.unit ? `, in ${data.unit}` : ", in the calibration's unit"}: what does not lie in it reads wrong. Its own place counts as exact.`,
     data.model.region ? "Hatched: no corner of the calibration lay there, and only the lens model tells the lens." : "",

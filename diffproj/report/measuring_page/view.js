@@ -47,27 +47,41 @@ function bringIntoSight(view, pixel) {
 
 // ------------------------------------------------------------------------------------------------- what lies over it
 
-// Where pixels see no point of the plane: rows of the photograph, cut into runs whose ends are found by bisection.
+// Where pixels see no point of the plane: cell by cell, each cut where its edges cross the limit, found by bisection.
 function shadeOf(scene, [width, height]) {
-  const nowhere = new Path2D();
-  const [rows, columns] = [Math.min(180, height), 48];
-  const lost = (u, v) => pointAt(scene.map, [u, v]).point === null;
-  for (let row = 0; row < rows; row++) {
-    const [top, v] = [(row * height) / rows, ((row + 0.5) * height) / rows - 0.5];
-    let start = lost(-0.5, v) ? 0 : null;
-    for (let column = 1; column <= columns; column++) {
-      const x = (column * width) / columns;
-      if (lost(x - 0.5, v) === (start !== null)) continue;
-      let [low, high] = [x - width / columns, x];
-      for (let round = 0; round < 6; round++) {
-        const middle = (low + high) / 2;
-        if (lost(middle - 0.5, v) === (start !== null)) low = middle;
-        else high = middle;
-      }
-      if (start === null) start = high;
-      else [start] = [(nowhere.rect(start, top, low - start, height / rows + 0.5), null)];
+  const [columns, rows] = [72, 54];
+  const lost = ([x, y]) => pointAt(scene.map, [x - 0.5, y - 0.5]).point === null;
+  const vertex = (row, column) => [(column * width) / columns, (row * height) / rows];
+  const known = Array.from({ length: rows + 1 }, (_, row) =>
+    Array.from({ length: columns + 1 }, (_, column) => lost(vertex(row, column))),
+  );
+  const crossing = (inside, outside) => {
+    for (let round = 0; round < 8; round++) {
+      const middle = [(inside[0] + outside[0]) / 2, (inside[1] + outside[1]) / 2];
+      if (lost(middle)) inside = middle;
+      else outside = middle;
     }
-    if (start !== null) nowhere.rect(start, top, width - start, height / rows + 0.5);
+    return inside;
+  };
+  const nowhere = new Path2D();
+  for (let row = 0; row < rows; row++) {
+    for (let column = 0; column < columns; column++) {
+      const corners = [
+        [row, column],
+        [row, column + 1],
+        [row + 1, column + 1],
+        [row + 1, column],
+      ];
+      const outline = corners.flatMap(([i, j], n) => {
+        const [k, l] = corners[(n + 1) % 4];
+        const [here, next] = [known[i][j], known[k][l]];
+        const ends = [vertex(i, j), vertex(k, l)];
+        const cut = here === next ? [] : [here ? crossing(ends[0], ends[1]) : crossing(ends[1], ends[0])];
+        return here ? [ends[0], ...cut] : cut;
+      });
+      outline.forEach(([x, y], n) => nowhere[n ? "lineTo" : "moveTo"](x, y));
+      if (outline.length) nowhere.closePath();
+    }
   }
   return nowhere;
 }
