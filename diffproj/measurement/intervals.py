@@ -17,7 +17,7 @@ from diffproj.measurement.quantity import Quantity
 from diffproj.measurement.shapes import length
 from diffproj.measurement.student import normal_reach
 
-ROUNDS, TURNED = 8, 1e-5
+ROUNDS, TURNED = 8, 1e-4
 """How often the direction of the errors that change a quantity most is sought anew where the last ones lead, and by how
 much less it has to turn for that to end: its error counts in square."""
 

@@ -282,7 +282,7 @@ function extreme(scene, points, valueOf, value, slopes, side, reach) {
     ];
     const moves = slope.some((part) => part !== 0) && slope.every(Number.isFinite);
     const next = moves ? towards(slope) : direction;
-    if (next.every((part, e) => Math.abs(part - direction[e]) < 1e-5)) break;
+    if (next.every((part, e) => Math.abs(part - direction[e]) < 1e-4)) break;
     direction = next;
   }
   return { best, where };
