@@ -161,12 +161,15 @@ def test_near_the_horizon_intervals_are_open_and_lopsided(javascript: Callable[[
     measured = dp.measure(pixels, camera, floor, pixel_sigma=1.0)
     body = """const points = given.pixels.map((pixel) => measurePoint(scene, pixel));
     const row = ({ value, deviation, low, high }) => [value, deviation, low, high];
-    return points.slice(1).map((point, n) => row(measureLength(scene, [points[n], point])))"""
+    const lengths = points.slice(1).map((point, n) => row(measureLength(scene, [points[n], point])));
+    return { lengths, bent: points.map((point) => isBent(scene, point)) }"""
     lengths = measured.lengths()
     wanted = torch.stack([lengths.value, lengths.deviation, *lengths.interval()], dim=-1)
-    found = numbers(run(javascript, body, given(camera, floor, pixels, 1.0)))
+    found = run(javascript, body, given(camera, floor, pixels, 1.0))
     assert bool(wanted[:, 3].isinf().any())
-    same(found, wanted)
+    same(numbers(found["lengths"]), wanted)
+    assert found["bent"] == measured.nonlinear.tolist()
+    assert set(found["bent"]) == {True, False}
 
 
 def test_two_poses_and_few_residuals_count(javascript: Callable[[str, Any], Any]) -> None:

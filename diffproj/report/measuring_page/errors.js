@@ -368,6 +368,13 @@ function measureCoordinate(scene, point, axis) {
   return measureNumber(scene, [point], ([place]) => ({ value: place[axis], gradient: (_, step) => step[axis] }));
 }
 
+// Whether a point's deviations mislead, as close to the horizon: see `nonlinear` of the library.
+function isBent(scene, point) {
+  const found = [0, 1, 2].map((axis) => measureCoordinate(scene, point, axis));
+  const most = Math.max(...found.map(({ deviation }) => deviation));
+  return found.some(({ nonlinear, deviation }) => nonlinear && deviation > 1e-9 * most);
+}
+
 function deviationsOf({ shared, own, lost, nowhere }) {
   const steps = [...shared, ...own];
   const isLost = (axis) => nowhere || lost.some((step) => step[axis] !== 0);

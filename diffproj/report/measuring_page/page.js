@@ -91,7 +91,10 @@ function renderPlan() {
 function changed() {
   results = sheet.measures.map((measure) => ({
     quantities: quantitiesOf(scene, measure),
-    measured: measure.points.map(({ pixel }) => measurePoint(scene, pixel)),
+    measured: measure.points.map(({ pixel }) => {
+      const found = measurePoint(scene, pixel);
+      return { ...found, nonlinear: found.point !== null && isBent(scene, found) };
+    }),
   }));
   overlay.texts = sheet.measures.map((measure, m) => {
     const [main] = results[m].quantities;

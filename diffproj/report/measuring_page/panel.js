@@ -93,7 +93,7 @@ function fillPoints(sheet, results, unit, actions) {
               })
             : numberCell("–", {}),
         ),
-        element("td", { class: "m-remark", text: remarksOf([measured]) }),
+        element("td", { class: "m-remark", text: remarksOf([measured], [measured]) }),
         deleteCell(`gone-${key}`, `Delete point ${name}`, () => actions.deletePoint(m, n)),
       ]);
     }),
@@ -127,7 +127,7 @@ function fillAnswer(sheet, results, unit) {
     const lines = point
       ? "xyz".split("").map((axis, i) => `${axis} ${withDeviation(point[i], spread[i], unit ?? "")}`)
       : ["–"];
-    return show(measure.name, lines[0], lines.slice(1).join(", "), remarksOf(measured));
+    return show(measure.name, lines[0], lines.slice(1).join(", "), remarksOf(measured, measured));
   }
   if (!quantities.length)
     return show(measure.name, "–", WANTED[measure.kind][measure.points.length] ?? "", remarksOf(measured));

@@ -170,7 +170,7 @@ function remarksOf(measured, quantities = []) {
   if (lost) remarks.push(REASONS[lost.reason]);
   if (measured.some(({ point, extrapolated }) => point !== null && extrapolated))
     remarks.push("extrapolated: the calibration saw no corner there");
-  if (quantities.some(({ nonlinear }) => nonlinear)) remarks.push("lopsided: take the interval");
+  if (quantities.some(({ nonlinear }) => nonlinear)) remarks.push("lopsided: its deviation misleads");
   return remarks.join("; ");
 }
 
