@@ -1,0 +1,78 @@
+"""What a report holds, in its order, and what stands above it."""
+
+import warnings
+from collections.abc import Iterable
+
+import diffproj
+from diffproj.calibration.result import Calibration
+from diffproj.calibration.validation import CrossValidation
+from diffproj.report.accuracy import accuracy_part
+from diffproj.report.coverage import coverage_part
+from diffproj.report.document import Part, document, render
+from diffproj.report.facts import Facts
+from diffproj.report.folds import folds_part
+from diffproj.report.lens import lens_part, lens_title
+from diffproj.report.parameters import parameters_part
+from diffproj.report.photographs import photographs_part
+from diffproj.report.pictures import pictures
+from diffproj.report.residuals import residuals_part
+from diffproj.report.shape import shape_part
+from diffproj.report.usage import usage_part
+from diffproj.report.verdict import verdict_part
+from diffproj.targets.images import Orientation, Source
+from diffproj.targets.target import Target
+
+
+def contents(
+    calibration: Calibration,
+    photographs: Source | Iterable[Source] | None,
+    folds: CrossValidation | int | None,
+    target: Target | None,
+    orientation: Orientation,
+    title: str,
+    camera_file: str,
+    more: Iterable[Part] = (),
+) -> str:
+    """The whole page; the arguments are those of `write_report`, checked.
+
+    Raises:
+        ValueError: the photographs are not those of the views, or no size is known.
+    """
+    found = pictures(
+        photographs, calibration.views.names, calibration.views.size or calibration.camera.size, orientation
+    )
+    if found.size is None:
+        raise ValueError(
+            "calibration: want one whose image size is known, got none; give views a size, dp.Views(pixels, "
+            "size=(width, height)), or the photographs"
+        )
+    facts = Facts(calibration, found.size)
+    with warnings.catch_warnings():  # what is to be known is in the report
+        warnings.simplefilter("ignore", UserWarning)
+        parts = [
+            verdict_part(facts),
+            photographs_part(facts, found),
+            residuals_part(facts),
+            coverage_part(facts),
+            lens_part(facts),
+            parameters_part(facts),
+            accuracy_part(facts),
+            shape_part(facts),
+            folds_part(facts, folds, target),
+            usage_part(facts, camera_file),
+        ]
+    return document(title, [*parts, *more], _lead(facts))
+
+
+def _lead(facts: Facts) -> str:
+    """The line below the title."""
+    width, height = facts.size
+    return render(
+        "lead.html",
+        views=len(facts.seen_views),
+        corners=int(facts.used.sum()),
+        width=width,
+        height=height,
+        lens=lens_title(facts),
+        version=diffproj.__version__,
+    )
