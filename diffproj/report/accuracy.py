@@ -223,12 +223,12 @@ def _on_plane(facts: Facts, plane: Plane) -> Float[np.ndarray, "k 2"] | None:
     return points[:, :2].to("cpu", torch.float64).numpy() if bool(valid.all()) else None
 
 
-def _covered(axes: svg.Axes, region: list[tuple[float, float]] | None, pattern: str) -> Markup:
+def _covered(axes: svg.Axes, region: Float[np.ndarray, "k 2"] | None, pattern: str) -> Markup:
     """A line around a region, and hatching outside of it."""
     if region is None:
         return Markup()
     left, top, width, height = axes.field
-    inner = "L".join(f"{x:.1f} {y:.1f}" for x, y in region)
+    inner = "L".join(f"{x:.1f} {y:.1f}" for x, y in region.tolist())
     hatching = Markup('<path class="{}" fill-rule="evenodd" d="{}M{}Z"/>').format(
         pattern, f"M{left} {top}h{width}v{height}h{-width}Z", inner
     )

@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Iterable
 
-import diffproj
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.validation import CrossValidation
 from diffproj.report.accuracy import accuracy_part
@@ -74,5 +73,4 @@ def _lead(facts: Facts) -> str:
         width=width,
         height=height,
         lens=lens_title(facts),
-        version=diffproj.__version__,
     )

@@ -94,7 +94,7 @@ def _distances(facts: Facts) -> Markup:
         for hull in (facts.outlines[v] for v in facts.seen_views)
     ]
     axes = svg.Axes((0, svg.reach(far.tolist())), (0, svg.reach([100 * part for part in parts_of_image], 50)))
-    spots = svg.dots(axes.at(zip(far, [100 * p for p in parts_of_image], strict=True)), "large pale")
+    spots = svg.dots(axes.at(np.stack([far, 100 * np.array(parts_of_image)], axis=-1)), "large pale")
     drawn = [axes.drawn(f"distance of the target, {facts.unit}", "width in the image, %"), spots]
     label = f"Distances from {svg.plain(float(far.min()), 3)} to {svg.plain(float(far.max()), 3)} {facts.unit}"
     caption = "How far away the target was, and how much of the image's width it filled, one dot a view."

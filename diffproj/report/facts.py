@@ -115,7 +115,8 @@ class Facts:
         hulls = []
         for pixels, used in zip(self.pixels, self.used, strict=True):
             points = pixels[used].astype(np.float32)
-            hulls.append(cv2.convexHull(points).reshape(-1, 2) if len(points) > 2 else points[:0])
+            hull = cv2.convexHull(points).reshape(-1, 2) if len(points) > 2 else points[:0]
+            hulls.append(hull.astype(float))
         return hulls
 
     @cached_property

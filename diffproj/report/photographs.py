@@ -73,13 +73,13 @@ def _card(facts: Facts, view: int, address: str | None, magnification: float) ->
     known, used = facts.known[view], facts.used[view]
     pixels, residuals = facts.pixels[view], facts.residuals[view]
     rings = svg.rings(pixels[used], 0.008 * max(width, height), "seen")
-    ends = list(zip(pixels[known], pixels[known] + magnification * residuals[known], strict=True))
+    ends = pixels[known], pixels[known] + magnification * residuals[known]
     parts += [
-        Markup('<g class="under">{}{}</g>').format(rings, svg.segments(ends, "")),
+        Markup('<g class="under">{}{}</g>').format(rings, svg.segments(*ends, "")),
         rings,
-        svg.segments(ends, "off"),
+        svg.segments(*ends, "off"),
     ]
-    parts.append(svg.segments(_crosses(pixels[facts.rejected[view]], 0.01 * max(width, height)), "off"))
+    parts.append(svg.crosses(pixels[facts.rejected[view]], 0.01 * max(width, height), "off"))
     label = f"{facts.names[view]}: {int(used.sum())} corners"
     if used.any():
         label += f", RMS {svg.plain(float(facts.view_rms[view]), 3)} px"
@@ -104,19 +104,13 @@ def _loupe(facts: Facts, view: int, pictures: Pictures) -> Markup:
     parts = [
         svg.image(left - 0.5, top - 0.5, side, side, address, "pixels"),
         svg.rings([(u, v)], 2.0, "seen"),
-        svg.segments(_crosses(np.array([[u + du, v + dv]]), 1.6), "off", 2),
+        svg.crosses([(u + du, v + dv)], 1.6, "off", 2),
     ]
     label = f"The corner of {facts.names[view]} that fits worst, enlarged: {svg.plain(float(lengths[corner]))} px off"
     box = f"{left - 0.5} {top - 0.5} {side} {side}"
     return Markup('<svg class="picture loupe" viewBox="{}" role="img" aria-label="{}">{}</svg>').format(
         box, label, Markup("").join(parts)
     )
-
-
-def _crosses(places: np.ndarray, arm: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The strokes of crosses at places."""
-    one, other = np.array([arm, arm]), np.array([arm, -arm])
-    return [pair for place in places for pair in ((place - one, place + one), (place - other, place + other))]
 
 
 def _where(facts: Facts, view: int) -> str:

@@ -60,9 +60,13 @@ def _over_image(facts: Facts, places: np.ndarray, residuals: np.ndarray) -> Mark
     magnification = times(facts, ARROW)
     chosen = some(len(places))
     tips = places[chosen] + magnification * residuals[chosen]
-    arrows = zip(axes.at(places[chosen]), axes.at(tips), strict=True)
     drawn = [
-        svg.clipped("arrows", axes, svg.segments(arrows, "bad"), svg.dots(axes.at(places[chosen]), "small")),
+        svg.clipped(
+            "arrows",
+            axes,
+            svg.segments(axes.at(places[chosen]), axes.at(tips), "bad"),
+            svg.dots(axes.at(places[chosen]), "small"),
+        ),
         axes.drawn("u, px", "v, px", grid=False),
     ]
     label = f"Residuals of {len(places)} corners over the image, {magnification:g} times as long"
@@ -91,7 +95,7 @@ def _by_distance(facts: Facts, places: np.ndarray, residuals: np.ndarray) -> Mar
             means.append((middle, mean))
             bands.append((middle, mean - 2 * error, mean + 2 * error))
     chosen = some(len(places))
-    cloud = svg.dots(axes.at(zip(distance[chosen], outward[chosen], strict=True)), "small pale faint")
+    cloud = svg.dots(axes.at(np.stack([distance, outward], axis=-1)[chosen]), "small pale faint")
     band = [(x, low) for x, low, _ in bands] + [(x, top) for x, _, top in reversed(bands)]
     drawn = [
         axes.drawn("distance from the principal point, px", "outward residual, px"),

@@ -53,7 +53,7 @@ def _figure(facts: Facts) -> tuple[Markup, str]:
         )
     tips = nominal[:, :2] + times * off[:, :2]
     parts.append(svg.dots(axes.at(nominal[:, :2]), "small faint"))
-    parts.append(svg.segments(zip(axes.at(nominal[:, :2]), axes.at(tips), strict=True), ""))
+    parts.append(svg.segments(axes.at(nominal[:, :2]), axes.at(tips), ""))
     parts.append(_ellipses(facts, axes, tips, times))
     rms = svg.plain(float(np.sqrt((off**2).sum(-1).mean())))
     label = f"Points of the board off by {rms} {facts.unit} (RMS), at most {svg.plain(most)} out of the plane"

@@ -51,7 +51,8 @@ class Suggestion(NamedTuple):
             )
             if much
         ]
-        return f"{self.place}, its {' and '.join(sides)} side{'s' * (len(sides) > 1)} nearer to the camera"
+        where = "in the middle" if self.place == "middle" else f"at the {self.place}"
+        return f"the board {where}, its {' and '.join(sides)} side{'s' * (len(sides) > 1)} nearer to the camera"
 
 
 def suggestions(facts: Facts) -> list[Suggestion]:
@@ -88,7 +89,7 @@ def place_sketch(facts: Facts, wanted: list[Suggestion]) -> Markup:
     boards = [svg.polyline(axes.at(hull), "outline", closed=True) for hull in facts.outlines if len(hull)]
     boards += [svg.polyline(axes.at(one.outline), "suggested", closed=True) for one in wanted]
     parts.append(svg.clipped("places", axes, *boards))
-    parts += [_number(n, *axes.at([one.outline.mean(0)])[0]) for n, one in enumerate(wanted, start=1)]
+    parts += [_number(n, *axes.at(one.outline.mean(0)[None])[0].tolist()) for n, one in enumerate(wanted, start=1)]
     parts.append(axes.drawn("u, px", "v, px", grid=False))
     label = f"Outlines of the board in {len(facts.seen_views)} views over the image"
     added = f", and {len(wanted)} to add: {'; '.join(one.words for one in wanted)}" if wanted else ""

@@ -6,14 +6,16 @@ Numbers are in units of the picture's own, which is scaled to the room it gets; 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from markupsafe import Markup
 
 from diffproj.report.document import asset
 
-Place = Sequence[float] | np.ndarray
-"""Two coordinates."""
+Points = Iterable[Sequence[float]] | np.ndarray
+"""Places `(N, 2)`, as an array or one by one."""
 STYLE = asset("figures.css")
 WIDTH, HEIGHT = 420.0, 300.0
 LEFT, RIGHT, TOP, BOTTOM = 50.0, 12.0, 10.0, 42.0
@@ -41,19 +43,20 @@ class Axes:
     top: float = TOP
     bottom: float = BOTTOM
 
-    def x(self, value: float) -> float:
-        """Where a value lies across the picture."""
+    def x(self, value: Any) -> Any:
+        """Where a value, or each of an array, lies across the picture."""
         low, high = self.x_range
         return self.left + (value - low) / (high - low) * (self.width - self.left - self.right)
 
-    def y(self, value: float) -> float:
-        """Where a value lies down the picture."""
+    def y(self, value: Any) -> Any:
+        """Where a value, or each of an array, lies down the picture."""
         low, high = self.y_range
         return self.height - self.bottom - (value - low) / (high - low) * (self.height - self.top - self.bottom)
 
-    def at(self, points: Iterable[Place]) -> list[tuple[float, float]]:
-        """Where points lie."""
-        return [(self.x(x), self.y(y)) for x, y in points]
+    def at(self, points: Points) -> Float[np.ndarray, "n 2"]:
+        """Where points lie `(N, 2)`."""
+        x, y = _array(points).T
+        return np.stack([self.x(x), self.y(y)], axis=-1)
 
     @property
     def field(self) -> tuple[float, float, float, float]:
@@ -123,29 +126,38 @@ def line(x1: float, y1: float, x2: float, y2: float, kind: str) -> Markup:
     return Markup('<path class="{}" d="M{} {}L{} {}"/>').format(kind, *map(_n, (x1, y1, x2, y2)))
 
 
-def polyline(points: Iterable[Place], kind: str, closed: bool = False, digits: int = 1) -> Markup:
+def polyline(points: Points, kind: str, closed: bool = False) -> Markup:
     """A line through points; nothing without any."""
-    places = [f"{_n(x, digits)} {_n(y, digits)}" for x, y in points]
-    return Markup('<path class="{}" d="M{}{}"/>').format(kind, "L".join(places), "Z" * closed) if places else Markup()
+    places = "L".join(f"{x:g} {y:g}" for x, y in _short(points))
+    return Markup('<path class="{}" d="M{}{}"/>').format(kind, places, "Z" * closed) if places else Markup()
 
 
-def segments(ends: Iterable[tuple[Place, Place]], kind: str, digits: int = 1) -> Markup:
-    """Many short lines as one shape."""
-    d = "".join(f"M{_n(a, digits)} {_n(b, digits)}l{_n(c - a, digits)} {_n(e - b, digits)}" for (a, b), (c, e) in ends)
+def segments(starts: Points, ends: Points, kind: str, digits: int = 1) -> Markup:
+    """Many short lines as one shape, from each start to its end."""
+    both = np.concatenate([_array(starts), _array(ends)], axis=1)
+    d = "".join(f"M{a:g} {b:g}L{c:g} {e:g}" for a, b, c, e in both.round(digits).tolist())
     return Markup('<path class="{}" d="{}"/>').format(kind, d) if d else Markup()
 
 
-def dots(points: Iterable[Place], kind: str, digits: int = 1) -> Markup:
+def crosses(points: Points, arm: float, kind: str, digits: int = 1) -> Markup:
+    """Many crosses as one shape."""
+    places = _array(points)
+    one, other = np.array([arm, arm]), np.array([arm, -arm])
+    starts, ends = np.concatenate([places - one, places - other]), np.concatenate([places + one, places + other])
+    return segments(starts, ends, kind, digits)
+
+
+def dots(points: Points, kind: str) -> Markup:
     """Many dots as one shape, of the width of its stroke."""
-    d = "".join(f"M{_n(x, digits)} {_n(y, digits)}h0" for x, y in points)
+    d = "".join(f"M{x:g} {y:g}h0" for x, y in _short(points))
     return Markup('<path class="dots {}" d="{}"/>').format(kind, d) if d else Markup()
 
 
-def rings(points: Iterable[Place], radius: float, kind: str) -> Markup:
+def rings(points: Points, radius: float, kind: str) -> Markup:
     """Many circles as one shape."""
     r = _n(radius, 2)
     turn = f"a{r} {r} 0 1 0 {_n(2 * radius, 2)} 0a{r} {r} 0 1 0 {_n(-2 * radius, 2)} 0"
-    d = "".join(f"M{_n(x - radius)} {_n(y)}{turn}" for x, y in points)
+    d = "".join(f"M{x:g} {y:g}{turn}" for x, y in _short(_array(points) - np.array([radius, 0.0])))
     return Markup('<path class="{}" d="{}"/>').format(kind, d) if d else Markup()
 
 
@@ -227,6 +239,17 @@ def plain(value: float, digits: int = 2) -> str:
     if -5 <= power <= 12:
         return f"{round(value, digits - 1 - power):.{max(0, digits - 1 - power)}f}"
     return f"{value:.{digits - 1}e}"
+
+
+def _array(points: Points) -> Float[np.ndarray, "n 2"]:
+    """Places as an array of doubles."""
+    given = points if isinstance(points, np.ndarray) else list(points)
+    return np.asarray(given, dtype=np.float64).reshape(-1, 2)
+
+
+def _short(points: Points) -> list[list[float]]:
+    """Places to a tenth of a unit."""
+    return _array(points).round(1).tolist()
 
 
 def _n(value: float, digits: int = 1) -> str:

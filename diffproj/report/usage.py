@@ -1,5 +1,7 @@
 """The part on using the camera: code to copy, in Python and for OpenCV, with its numbers."""
 
+from pathlib import Path
+
 import torch
 
 from diffproj.lens.models import MODELS
@@ -16,7 +18,9 @@ def usage_part(facts: Facts, camera_file: str) -> Part:
     html = render(
         "usage.html",
         file=repr(camera_file),
-        view=repr(calibration.views.names[facts.usual_view]) if facts.names else "0",
+        whole=Path(camera_file).suffix.lower() == ".json",
+        name=facts.names[facts.usual_view],
+        view=facts.usual_view,
         K=_rows(camera.K.tolist()),
         coefficients="" if lens == "none" else _row(camera.distortion.coefficients.tolist()),  # type: ignore[union-attr]
         kind=type(camera.distortion).__name__,

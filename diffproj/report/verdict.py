@@ -58,7 +58,7 @@ def verdict_part(facts: Facts) -> Part:
         distance=f"{svg.plain(float(facts.distances[facts.usual_view]), 3)} {facts.unit}" if facts.names else "",
         hand=HAND_PX,
         doubts=doubts(facts),
-        wanted=wanted,
+        wanted=[_sentence(one.words) for one in wanted],
         sketches=sketches,
     )
     return Part("Is it good enough?", "verdict", html, svg.STYLE)
