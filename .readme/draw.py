@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import mounting  # beside this file
+import report  # beside this file, too
 
 import diffproj as dp
 from diffproj import figures
@@ -18,6 +19,10 @@ pictures = {
     "mounting.png": figures.png(mounting.figure(), dpi=80),
     "accuracy.png": figures.png(figures.accuracy(dp.AccuracyMap.over_image(calibration, view=0), unit="mm"), dpi=90),
 }
+if first_screen := report.screenshot(replace(calibration, unit="mm")):
+    pictures["report.png"] = first_screen
+else:
+    print("report.png: no Chromium, not drawn")
 folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
 for name, content in pictures.items():
     (folder / name).write_bytes(content)

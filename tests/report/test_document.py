@@ -53,6 +53,12 @@ def test_titles_are_text() -> None:
     assert len(page.texts["script"]) == 2
 
 
+def test_what_is_no_text_is_a_question_mark() -> None:
+    page = document("caf\udce9", parts())
+    assert Outline(page).texts["h1"] == ["caf?"]
+    page.encode()
+
+
 def test_long_titles_lose_their_middle() -> None:
     page = Outline(document("x" * 1000 + "y", parts()))
     assert len(page.texts["h1"][0]) == 300

@@ -1,0 +1,30 @@
+"""The README's picture of a report's first screen, as a headless Chromium shows it."""
+
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import cv2
+
+import diffproj as dp
+
+WIDTH, HEIGHT = 1180, 1120
+SCALE = 0.7
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+def screenshot(calibration: dp.Calibration) -> bytes | None:
+    """The top of the report as a PNG; `None` where there is no browser."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        page, picture = Path(folder, "report.html"), Path(folder, "report.png")
+        dp.write_report(page, calibration)
+        options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--hide-scrollbars"]
+        shot = [f"--screenshot={picture}", f"--window-size={WIDTH},{HEIGHT}", page.as_uri()]
+        subprocess.run([browser, *options, *shot], check=True, capture_output=True)  # noqa: S603
+        image = cv2.imread(str(picture))
+    small = cv2.resize(image, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".png", small, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
