@@ -9,8 +9,8 @@ import cv2
 
 import diffproj as dp
 
-WIDTH, HEIGHT = 1180, 1120
-SCALE = 0.7
+WIDTH, HEIGHT = 1180, 1480
+SCALE = 0.6
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -22,7 +22,13 @@ def screenshot(calibration: dp.Calibration) -> bytes | None:
     with tempfile.TemporaryDirectory() as folder:
         page, picture = Path(folder, "report.html"), Path(folder, "report.png")
         dp.write_report(page, calibration)
-        options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--hide-scrollbars"]
+        options = [
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-background-networking",
+            "--hide-scrollbars",
+        ]
         shot = [f"--screenshot={picture}", f"--window-size={WIDTH},{HEIGHT}", page.as_uri()]
         subprocess.run([browser, *options, *shot], check=True, capture_output=True)  # noqa: S603
         image = cv2.imread(str(picture))

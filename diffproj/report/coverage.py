@@ -23,14 +23,16 @@ def coverage_part(facts: Facts) -> Part:
 
 
 def covered_share(facts: Facts) -> float | None:
-    """Which part of the image the corners surround; `None` where it is not known."""
+    """Which part of the image that the lens sees the corners surround; `None` where it is not known."""
     reach = facts.calibration.region
     if reach is None:
         return None
     width, height = facts.size
     u, v = np.meshgrid((np.arange(96) + 0.5) * width / 96 - 0.5, (np.arange(72) + 0.5) * height / 72 - 0.5)
     pixels = torch.tensor(np.stack([u, v], axis=-1).reshape(-1, 2), dtype=torch.float64, device="cpu")
-    return float(in_region(pixels, reach.to("cpu", torch.float64)).double().mean())
+    _, has_ray = facts.calibration.camera.detach().to("cpu", torch.float64).directions(pixels)
+    inside = in_region(pixels, reach.to("cpu", torch.float64))
+    return float((inside & has_ray).sum() / has_ray.sum().clamp(min=1))
 
 
 def region_line(facts: Facts, axes: svg.Axes, kind: str) -> Markup:

@@ -17,9 +17,11 @@ from diffproj.report.facts import Facts
 
 STEPS, AZIMUTHS = 160, 12
 """Angles from the axis, and directions around it over which the radius is averaged."""
+FARTHEST = 12.0
+"""Times the least of the poorer lenses' errors up to which errors are drawn."""
 NEARLY_SIDEWAYS = 89.0
 """Degrees from the axis up to which a perspective lens is drawn."""
-TITLES = {"none": "none, a pinhole", "fisheye": "fisheye (Kannala-Brandt), 4 coefficients"}
+TITLES = {"none": "pinhole, no distortion", "fisheye": "fisheye (Kannala-Brandt), 4 coefficients"}
 
 
 class Curve(NamedTuple):
@@ -28,7 +30,7 @@ class Curve(NamedTuple):
     Attributes:
         angle: from the axis in degrees.
         radius: how far from the principal point it is seen, in px.
-        deviation: of that, in px; 0 where it is not known.
+        deviation: of that, in px; 0 where there is no covariance, NaN where the lens may end before.
         pinhole: the radius without the lens, in px; infinite at 90 degrees and beyond.
     """
 
@@ -68,7 +70,7 @@ def curve(facts: Facts) -> Curve:
     most = min(_domain_angle(camera, perspective), NEARLY_SIDEWAYS if perspective else 180.0)
     angle = torch.linspace(0, math.radians(most) * (1 - 1e-9), STEPS * 8, dtype=torch.float64, device="cpu")
     radius = _radius(camera, angle)
-    inside = int((radius <= 1.02 * _farthest(facts)).sum())
+    inside = int((radius <= 1.02 * _farthest(facts)).sum())  # none that is not seen
     angle = torch.linspace(0, float(angle[max(1, inside - 1)]), STEPS, dtype=torch.float64, device="cpu")
     radius = _radius(camera, angle)
     pinhole = _radius(Camera(camera.K), angle.clamp(max=math.radians(89.99)))
@@ -79,17 +81,23 @@ def curve(facts: Facts) -> Curve:
 
 
 def _radius(camera: Camera, angle: Tensor) -> Tensor:
-    """How far from the principal point rays at angles `(n,)` are seen `(*B, n)`, in the mean around the axis."""
+    """How far from the principal point rays at angles `(n,)` are seen `(*B, n)`, in the mean around the axis.
+
+    NaN where one of them is not seen.
+    """
     around = torch.arange(AZIMUTHS, dtype=angle.dtype, device=angle.device) * (2 * math.pi / AZIMUTHS)
     side = angle.sin()[:, None]
     rays = torch.stack([side * around.cos(), side * around.sin(), angle.cos()[:, None].expand(-1, AZIMUTHS)], dim=-1)
-    pixels, _ = camera.project(rays.flatten(0, 1))
-    off = pixels - camera.K[..., None, :2, 2]
-    return off.norm(dim=-1).unflatten(-1, (-1, AZIMUTHS)).mean(-1)
+    pixels, valid = camera.project(rays.flatten(0, 1))
+    off = (pixels - camera.K[..., None, :2, 2]).norm(dim=-1)
+    return torch.where(valid, off, torch.nan).unflatten(-1, (-1, AZIMUTHS)).mean(-1)
 
 
 def _deviation(facts: Facts, camera: Camera, angle: Tensor) -> Tensor:
-    """The standard deviation of the radius `(n,)`: how it moves with each independent step of the parameters."""
+    """The standard deviation of the radius `(n,)`: how it moves with each independent step of the parameters.
+
+    NaN from where on a step makes the lens end: nothing is known there.
+    """
     calibration = facts.calibration
     nothing = torch.zeros_like(angle)
     if not calibration.has_covariance:
@@ -156,12 +164,14 @@ def _curve_figure(facts: Facts, found: Curve) -> Markup:
         marks = [(float(np.interp(outermost, found.radius, found.angle)), "outermost corner")]
         flat = found.pinhole <= 1.02 * farthest
         other = list(zip(found.angle[flat], found.pinhole[flat], strict=True))
-    bottom, top = min(0.0, float(low.min())), max(0.0, float(high.max()))
+    told = np.isfinite(found.deviation)
+    bottom = min(0.0, float(y.min()), float(low[told].min(initial=0)))
+    top = max(0.0, float(y.max()), float(high[told].max(initial=0)))
     room = 0.06 * (top - bottom) or 1.0
     axes = svg.Axes(
         (0, max(float(x.max()), *(place for place, _ in marks)) * 1.03), (bottom - room, top + room), top=38
     )
-    band = [*zip(x, low, strict=True), *zip(x[::-1], high[::-1], strict=True)]
+    band = np.stack([np.append(x[told], x[told][::-1]), np.append(low[told], high[told][::-1])], axis=-1)
     parts = [
         axes.drawn(x_label, y_label),
         svg.line(axes.x(0), axes.y(0), axes.x(axes.x_range[1]), axes.y(0), "zero"),
@@ -178,7 +188,8 @@ def _curve_figure(facts: Facts, found: Curve) -> Markup:
     keys = [("line-accent", lens_title(facts).partition(",")[0]), ("box-band", "± one deviation")]
     if other:
         keys.append(("line-faint", "pinhole"))
-    caption = "What the lens does, in the mean around its axis. Beyond the outermost corner the curve is extrapolated."
+    caption = "What the lens does, in the mean around its axis. Beyond the outermost corner the curve is extrapolated"
+    caption += "." if told.all() else "; beyond the band it may end at any place."
     return svg.figure(svg.picture(axes.width, axes.height, label, *parts) + svg.key(*keys), caption)
 
 
@@ -214,9 +225,8 @@ def _comparison_figure(facts: Facts) -> Markup:
     assert comparison is not None  # noqa: S101  # who calls has looked
     worse, deviation = comparison.worse_px.tolist(), comparison.deviation_px.tolist()
     shown = [n for n, value in enumerate(worse) if math.isfinite(value)]
-    ends = [worse[n] + 2 * deviation[n] for n in shown if math.isfinite(deviation[n])]
-    least = min(ends, default=1.0)
-    far = min(svg.reach([*ends, 1e-6]), max(20 * least, 1e-6)) if ends else 1.0
+    ends = sorted(end for n in shown if 0 < (end := worse[n] + 2 * deviation[n]) < math.inf)
+    far = min(1.06 * ends[-1], FARTHEST * ends[0]) if ends else 1.0
     row, left = 26.0, 80.0
     count = len(comparison.models)
     height = svg.TOP + svg.BOTTOM + count * row

@@ -1,5 +1,6 @@
 """Which views to add, and a sketch of them: where the board should be in the image, and how it should be tilted."""
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -20,6 +21,8 @@ SIZE = 0.5
 """Of a suggested board, as a part of the image's shorter side."""
 NINTHS = [f"{down} {across}".strip() or "middle" for down in ("top", "", "bottom") for across in ("left", "", "right")]
 """The ninths of the image, as the verdict calls them, row by row."""
+INWARD, FARTHER = (1.0, 0.85, 0.7, 0.55), tuple(1.08**k for k in range(13))
+"""What is tried until a board is wholly in view: places from a ninth's middle towards the principal point, distances."""
 OUTERMOST = 65.0
 """Degrees of tilt at the rim of the sketch."""
 
@@ -167,23 +170,18 @@ def _outline(facts: Facts, place: str, tilt: tuple[float, float]) -> np.ndarray 
     camera = facts.calibration.camera.detach().to("cpu", torch.float64).without_pose()
     row, column = divmod(NINTHS.index(place), 3)
     width, height = facts.size
-    pixel = camera.K.new_tensor([[(column + 0.5) * width / 3, (row + 0.5) * height / 3]])
-    ray, valid = camera.directions(pixel)
-    if not bool(valid):
-        return None
-    ray = ray[0] / ray[0].norm()
-    nominal = facts.calibration.nominal.detach().to(ray)
+    ninth = camera.K.new_tensor([(column + 0.5) * width / 3, (row + 0.5) * height / 3])
+    nominal = facts.calibration.nominal.detach().to(ninth)
     low, high = nominal[:, :2].amin(0), nominal[:, :2].amax(0)
     (x, y), (x2, y2) = ((low - high) / 2).tolist(), ((high - low) / 2).tolist()
-    corners = ray.new_tensor([[x, y, 0], [x2, y, 0], [x2, y2, 0], [x, y2, 0]])
-    turned = corners @ _tilted(tilt).to(ray).mT
-    extent = float((high - low).norm()) or 1.0
-    distance = float(camera.K[0, 0]) * extent / (SIZE * min(width, height))
-    for _ in range(30):
-        outline, seen = camera.project(turned + distance * ray)
-        if bool(seen.all()) and bool(camera.in_image(outline).all() if camera.size else True):
+    turned = ninth.new_tensor([[x, y, 0], [x2, y, 0], [x2, y2, 0], [x, y2, 0]]) @ _tilted(tilt).to(ninth).mT
+    near = float(camera.K[0, 0]) * (float((high - low).norm()) or 1.0) / (SIZE * min(width, height))
+    for share, farther in itertools.product(INWARD, FARTHER):  # a lens may see nothing in a ninth's middle
+        ray, valid = camera.directions(torch.lerp(camera.K[:2, 2], ninth, share)[None])
+        outline, seen = camera.project(turned + farther * near * ray[0] / ray[0].norm().clamp(min=1e-9))
+        inside = ((outline > -0.5) & (outline < outline.new_tensor([width, height]) - 0.5)).all()
+        if bool(valid.all() & seen.all() & inside):
             return outline.numpy()
-        distance *= 1.08
     return None
 
 

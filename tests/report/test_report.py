@@ -425,8 +425,12 @@ def test_wrong_arguments_are_named(calibration: dp.Calibration, tmp_path: Path) 
     ):
         with pytest.raises(error, match=re.escape(message)):
             dp.write_report(**{"path": file, "calibration": calibration, **wrong})
-    rig = dp.calibrate_rig({"left": dp.example_views("left")[:5], "right": dp.example_views("right")[:5]}, BOARD, "none")
-    with pytest.raises(ValueError, match=r"calibration: want one camera, got a rig of 2; write one for each, of rig\[name"):
+    rig = dp.calibrate_rig(
+        {"left": dp.example_views("left")[:5], "right": dp.example_views("right")[:5]}, BOARD, "none"
+    )
+    with pytest.raises(
+        ValueError, match=r"calibration: want one camera, got a rig of 2; write one for each, of rig\[name"
+    ):
         dp.write_report(file, rig)
     assert not file.exists()
     dp.write_report(file, rig["right"], folds=None)
