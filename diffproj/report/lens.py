@@ -9,6 +9,7 @@ from jaxtyping import Float
 from markupsafe import Markup
 from torch import Tensor
 
+from diffproj.calibration.border import border_with_rays
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import MODELS
 from diffproj.report import svg
@@ -144,9 +145,9 @@ def _ends(facts: Facts) -> str:
     angle = _domain_angle(camera, perspective)
     if angle >= 180 or (perspective and angle >= 89.99):
         return "Its model is one-to-one everywhere, so every pixel has a ray."
-    radius = float(_radius(camera.without_pose(), torch.full((1,), math.radians(angle) * (1 - 1e-9)).double())[0])
-    where = f"{angle:.0f}° from the axis, {radius:.0f} px from the principal point"
-    if radius >= _farthest(facts):
+    edge = torch.full((1,), math.radians(angle) * (1 - 1e-6), dtype=torch.float64, device="cpu")
+    where = f"{angle:.0f}° from the axis, {float(_radius(camera.without_pose(), edge)):.0f} px from the principal point"
+    if float(border_with_rays(camera, facts.size)) == 1:
         return f"Its model ends at {where}, outside of the image, so every pixel has a ray."
     return f"Its model ends at {where}, inside the image: pixels beyond have no ray."
 

@@ -22,7 +22,7 @@ SIZE = 0.5
 NINTHS = [f"{down} {across}".strip() or "middle" for down in ("top", "", "bottom") for across in ("left", "", "right")]
 """The ninths of the image, as the verdict calls them, row by row."""
 INWARD, FARTHER = (1.0, 0.85, 0.7, 0.55), tuple(1.08**k for k in range(13))
-"""What is tried until a board is wholly in view: places from a ninth's middle towards the principal point, distances."""
+"""Tried until a board is wholly in view: places from a ninth's middle towards the principal point, and distances."""
 OUTERMOST = 65.0
 """Degrees of tilt at the rim of the sketch."""
 
