@@ -1,16 +1,18 @@
 """The README's picture of a report's first screen, as a headless Chromium shows it."""
 
+import io
 import shutil
 import subprocess
 import tempfile
 from pathlib import Path
 
-import cv2
+from PIL import Image  # matplotlib brings it
 
 import diffproj as dp
 
 WIDTH, HEIGHT = 1180, 1480
 SCALE = 0.6
+COLOURS = 120
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -31,6 +33,8 @@ def screenshot(calibration: dp.Calibration) -> bytes | None:
         ]
         shot = [f"--screenshot={picture}", f"--window-size={WIDTH},{HEIGHT}", page.as_uri()]
         subprocess.run([browser, *options, *shot], check=True, capture_output=True)  # noqa: S603
-        image = cv2.imread(str(picture))
-    small = cv2.resize(image, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".png", small, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
+        image = Image.open(picture).convert("RGB")
+    small = image.resize((round(SCALE * WIDTH), round(SCALE * HEIGHT)), Image.Resampling.LANCZOS)
+    written = io.BytesIO()
+    small.quantize(COLOURS).save(written, "PNG", optimize=True)
+    return written.getvalue()
