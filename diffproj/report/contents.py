@@ -5,15 +5,17 @@ from collections.abc import Iterable
 
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.validation import CrossValidation
+from diffproj.geometry.plane import Plane
 from diffproj.report.accuracy import accuracy_part
 from diffproj.report.coverage import coverage_part
 from diffproj.report.document import Part, document, render
 from diffproj.report.facts import Facts
 from diffproj.report.folds import folds_part
 from diffproj.report.lens import lens_part, lens_title
+from diffproj.report.measuring import measuring_part
 from diffproj.report.parameters import parameters_part
 from diffproj.report.photographs import photographs_part
-from diffproj.report.pictures import pictures
+from diffproj.report.pictures import Pictures, pictures
 from diffproj.report.residuals import residuals_part
 from diffproj.report.shape import shape_part
 from diffproj.report.usage import usage_part
@@ -30,7 +32,6 @@ def contents(
     orientation: Orientation,
     title: str,
     camera_file: str,
-    more: Iterable[Part] = (),
 ) -> str:
     """The whole page; the arguments are those of `write_report`, checked.
 
@@ -59,8 +60,19 @@ def contents(
             shape_part(facts),
             folds_part(facts, folds, target),
             usage_part(facts, camera_file),
+            *_measuring(facts, found, orientation),
         ]
-    return document(title, [*parts, *more], _lead(facts))
+    return document(title, parts, _lead(facts))
+
+
+def _measuring(facts: Facts, found: Pictures, orientation: Orientation) -> list[Part]:
+    """The page that measures, in the photograph whose distance is the usual one; none without it."""
+    view = facts.usual_view
+    if view not in found.sources or not (facts.converged and facts.planar and facts.seen_views):
+        return []
+    plane = Plane.z(float(facts.calibration.nominal[:, 2].mean()))
+    source, name = found.sources[view], facts.names[view]
+    return [measuring_part(source, facts.calibration, plane, view, orientation=orientation, name=name)]
 
 
 def _lead(facts: Facts) -> str:

@@ -1,16 +1,19 @@
 """The photographs of a report: found by the names of the views, decoded once, and made small enough for a page."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Shaped
+from torch import Tensor
 
 from diffproj.report.document import data_uri
 from diffproj.targets.images import Orientation, Source, as_8_bit, grey, listed
+from diffproj.targets.videos import Frame
 
-MOST_BYTES = 2_400_000
+MOST_BYTES = 1_800_000
 """Of all photographs of a page together; as text they take a third more."""
 LARGEST = 720
 """Pixels of the longer side of a photograph in the page."""
@@ -28,11 +31,13 @@ class Pictures:
         images: grey, in full size; those of views without a photograph are missing.
         others: the names of photographs that belong to no view, for no board was found in them.
         size: of all, width and height in px; `None` where there are none.
+        sources: of the images: a file, or an array or tensor with its colours.
     """
 
     images: dict[int, Shaped[np.ndarray, "h w"]]
     others: tuple[str, ...] = ()
     size: tuple[int, int] | None = None
+    sources: dict[int, Path | np.ndarray | Tensor] = field(default_factory=dict)
 
     def small(self, views: list[int]) -> dict[int, str]:
         """Those of some views as addresses for a page, all together within `MOST_BYTES`."""
@@ -88,7 +93,7 @@ def pictures(
                 f"{len(listing)} others, such as {listing[0].label}; give the photographs that were calibrated on"
             )
         belongs = list(range(len(names)))
-    images = {}
+    images, sources = {}, {}
     for photograph, view in zip(listing, belongs, strict=True):
         if view is None:
             continue
@@ -101,8 +106,9 @@ def pictures(
                 f"{photograph.label}; give the photographs that were calibrated on, and the same orientation"
             )
         images[view] = image
+        sources[view] = image if isinstance(photograph.source, Frame) else photograph.source
     others = tuple(one.name for one, view in zip(listing, belongs, strict=True) if view is None)
-    return Pictures(images, others, size)
+    return Pictures(images, others, size, sources)
 
 
 def _jpeg(image: np.ndarray, side: int) -> bytes:

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, cast, get_args
+from typing import Any, cast, get_args
 
 from diffproj._core.arguments import called, choice, file_path, whole_number
 from diffproj._core.atomic import write_whole
@@ -12,9 +12,6 @@ from diffproj.calibration.rig_result import RigCalibration
 from diffproj.calibration.validation import CrossValidation
 from diffproj.targets.images import Orientation, Source
 from diffproj.targets.target import Target, points_of
-
-if TYPE_CHECKING:  # it loads Jinja2
-    from diffproj.report.document import Part
 
 TITLE = "Calibration of a camera"
 FOLDS = 5
@@ -36,8 +33,9 @@ def write_report(
     In this order: whether it is good enough, for what, what to photograph next and what not to trust; the photographs
     with their corners; the residuals; coverage; the lens and, after `distortion="auto"`, the others; the parameters
     with deviations and correlations; how surely pixels are put back, over the image and over the board's plane; the
-    board's shape; views held out; and code that loads the camera. It opens from disk in any browser, in light and dark,
-    on a telephone and on paper, and asks no network for anything.
+    board's shape; views held out; code that loads the camera; and with photographs a page that measures in one of them,
+    as `write_measuring_page` writes it. It opens from disk in any browser, in light and dark, on a telephone and on
+    paper, and asks no network for anything.
 
     Args:
         path: the file, such as `"report.html"`; one that is there is replaced, whole or not at all.
@@ -83,9 +81,8 @@ def report(
     orientation: Orientation | str = "sensor",
     title: str = TITLE,
     camera_file: str = "camera.json",
-    more: "Iterable[Part]" = (),
 ) -> str:
-    """The text of the report, with more parts at its end; see `write_report`."""
+    """The text of the report; see `write_report`."""
     known = _one_camera(calibration)
     for name, value in (("title", title), ("camera_file", camera_file)):
         if not isinstance(value, str):
@@ -99,7 +96,7 @@ def report(
         )
     from diffproj.report.contents import contents  # here, for it loads Jinja2
 
-    return contents(known, photographs, folds, target, way, title, camera_file, more)
+    return contents(known, photographs, folds, target, way, title, camera_file)
 
 
 def _one_camera(calibration: Any) -> Calibration:

@@ -569,6 +569,29 @@ def _uses(t: Things) -> dict[str, Call]:
             {"target": t.board, "path": folder / "board.svg", "paper": "A5", "dpi": 60, "unit": "mm"},
             3,
         ),
+        "write_measuring_page": Call(
+            dp.write_measuring_page,
+            {
+                "path": folder / "page.html",
+                "photograph": torch.zeros(96, 128, dtype=torch.uint8),
+                "calibration": t.camera,
+                "plane": t.plane,
+                "pixel_sigma": 0.5,
+                "unit": "mm",
+                "orientation": "sensor",
+            },
+            2,
+        ),
+        "write_measuring_page of a view": Call(
+            dp.write_measuring_page,
+            {
+                "path": folder / "page.html",
+                "photograph": np.zeros((96, 128, 3), dtype=np.uint8),
+                "calibration": t.calibration,
+                "view": 0,
+            },
+            2,
+        ),
         "write_report": Call(
             dp.write_report,
             {

@@ -448,3 +448,15 @@ def test_a_report_is_written_whole_or_not_at_all(calibration: dp.Calibration, tm
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
     dp.write_report(file, calibration, folds=None)
     assert Outline(file.read_text(encoding="utf-8")).texts["h1"] == ["Calibration of a camera"]
+
+
+def test_with_photographs_the_report_measures_in_one(calibration: dp.Calibration, tmp_path: Path) -> None:
+    names = calibration.views.names
+    for path, name in zip(photographs(tmp_path, 13, (640, 480)), names, strict=True):
+        path.rename(tmp_path / name)
+    outline = Outline(report(calibration, tmp_path, folds=None))
+    usual = names[Facts(calibration, (640, 480)).usual_view]
+    assert [a["id"] for tag, a in outline.elements if tag == "section"] == [*ANCHORS, "measuring-page"]
+    assert outline.texts["h2"][-1] == f"Measure in {usual}"
+    ids = [a["id"] for _, a in outline.elements if "id" in a]
+    assert len(set(ids)) == len(ids)
