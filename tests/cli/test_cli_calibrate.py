@@ -313,7 +313,7 @@ def test_calibrate_writes_a_report(photographs: Path, tmp_path: Path, capsys: py
     assert code == 0
     assert f"Report in {file}, for any browser\n" in out
     page = file.read_text(encoding="utf-8")
-    assert page.count("data:image/jpeg") == 5
+    assert page.count("data:image/jpeg") == 5 + 1  # and the one to measure in
     assert "No board was found in 5.png." in page
     assert f"dp.load_calibration(&#39;{camera}&#39;)" in page
     rms = float(dp.load_calibration(camera).rms)

@@ -370,9 +370,9 @@ def test_26_large_photographs_stay_below_5_megabytes(calibration: dp.Calibration
     views = dp.Views(views.pixels * 2 + 0.5, names=[f"{n}.png" for n in range(26)], size=(1280, 960))
     found = dp.calibrate(views, BOARD, "brown4")
     page = report(found, photographs(tmp_path, 26, (1280, 960)), folds=None)
-    assert page.count("data:image/jpeg") == 26
+    assert page.count("data:image/jpeg") == 26 + 1  # and the one to measure in
     assert len(page.encode()) < 5e6
-    assert MOST_BYTES * 4 / 3 < 4e6
+    assert MOST_BYTES * 4 / 3 < 2.5e6
 
 
 def test_a_corner_is_enlarged_where_it_is(tmp_path: Path) -> None:
