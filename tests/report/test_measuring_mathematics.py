@@ -20,7 +20,7 @@ LENSES = {
     "brown14": [-0.3, 0.1, 0.001, 0.0006, -0.01, 0.02, 0.01, 0.001, 0.003, -0.001, 0.002, 0.0006, 0.03, -0.02],
     "fisheye": [0.03, -0.01, 0.004, -0.0008],
 }
-QUICK = ("none", "brown5", "fisheye")
+QUICK = ("brown5", "fisheye")
 SOME = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in LENSES]
 SIGMA = 0.5
 SCENE = (
@@ -120,11 +120,11 @@ def test_deviations_hold_the_calibrations_covariance(name: str, javascript: Call
 def test_lengths_areas_and_angles_with_their_intervals(name: str, javascript: Callable[[str, Any], Any]) -> None:
     """Among them a polygon that crosses itself, an angle near 180 degrees, and a length that noise may have made."""
     calibration, plane = uncertain(name), dp.Plane.z(-3.0)
-    pixels = torch.rand(24, 2, dtype=D) * torch.tensor([420.0, 300], dtype=D) + torch.tensor([90.0, 80], dtype=D)
+    pixels = torch.rand(9, 2, dtype=D) * torch.tensor([420.0, 300], dtype=D) + torch.tensor([90.0, 80], dtype=D)
     pixels = torch.cat([pixels, pixels[:1] + 0.6, pixels[1:2] + 3.0, (pixels[2:3] + pixels[3:4]) / 2 + 0.2])
-    pairs = [[n, n + 1] for n in range(0, 24, 2)] + [[0, 24], [1, 25]]
-    triples = [[n, n + 1, n + 2] for n in range(0, 21, 3)] + [[2, 26, 3], [0, 24, 5]]
-    outlines = [[0, 1, 2], [3, 4, 5, 6], [7, 8, 9, 10, 11, 12]]
+    pairs = [[0, 1], [2, 3], [4, 5], [0, 9], [1, 10]]
+    triples = [[0, 1, 2], [4, 3, 5], [2, 11, 3], [0, 9, 5]]
+    outlines = [[0, 1, 2], [3, 4, 5, 6, 7, 8]]
     measured = dp.measure(pixels, calibration, plane, view=0, pixel_sigma=SIGMA)
     assert bool(measured.valid.all())
     data = given(calibration, plane, pixels) | {"pairs": pairs, "triples": triples, "outlines": outlines}
