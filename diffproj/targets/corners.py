@@ -28,12 +28,16 @@ FAINT = 0.15
 VAGUE = 0.15
 """Standard deviation in px from which a corner is doubted."""
 
-LOOSE, TIGHT, LEAST = 0.06, 0.015, 0.15
-"""Distances from where neighbours put a corner from which it is doubted: the first two relative to the spacing, for
-corners that look as good as the others and for those that look worse; the third in px, added to either."""
+LOOSE, TIGHT = (0.06, 0.15), (0.006, 0.1)
+"""Distances from where neighbours put a corner from which it is doubted, for corners that look as good as the others
+and for those that look worse: relative to the spacing, and in px, added to it."""
 
-DEVIATIONS = 6.0
-"""The least such distance in terms of the view's median."""
+DEVIATIONS, WORSE_DEVIATIONS = 6.0, 5.0
+"""The least such distances in terms of the view's median."""
+
+NOISE = 4.0
+"""The least such distance of a corner that looks worse in terms of the deviation that the view's noise gives it: a faint
+corner misfits for its noise alone."""
 
 REACH, NARROW = 0.65, 0.4
 """Radius of the pixels that are fitted, relative to the spacing: for all corners, and for those beside other edges."""
@@ -203,15 +207,17 @@ def _trusted(
     use &= ((grid >= 1) & (grid <= np.array(image.shape[::-1]) - 2)).all(axis=-1)
     if use.sum() < FEWEST:
         return use
-    # Noise alone misfits a fainter corner by more of its own contrast: that is not to look worse.
-    worse = misfit * np.minimum(contrast, 1.0) >= WORSE * usual + 0.01
+    worse = misfit >= WORSE * usual + 0.01
+    noise = sigma * np.minimum(1.0, usual / np.maximum(misfit * contrast, 1e-9))
     spacing = spacing_of(np.where(np.isfinite(grid), grid, 0.0))
     weight, off, limit = use.astype(float), np.zeros(use.shape), np.ones(use.shape)
     for _ in range(4):
         surface = predicted(grid, weight)
         off = np.linalg.norm(np.where(use[..., None], grid - surface.grid, 0.0), axis=-1) / surface.spread
-        scale = DEVIATIONS * float(np.median(off[use]))
-        limit = np.maximum(scale, np.where(worse, TIGHT, LOOSE) * spacing + LEAST)
+        median = float(np.median(off[use]))
+        loose = np.maximum(DEVIATIONS * median, LOOSE[0] * spacing + LOOSE[1])
+        tight = np.maximum(np.maximum(WORSE_DEVIATIONS * median, NOISE * noise), TIGHT[0] * spacing + TIGHT[1])
+        limit = np.where(worse, np.minimum(loose, tight), loose)
         if (off[use] < 0.5 * limit[use]).all():
             break
         weight = use / (1 + (off / (0.5 * limit)) ** 4)
