@@ -35,9 +35,8 @@ and for those that look worse: relative to the spacing, and in px, added to it."
 DEVIATIONS, WORSE_DEVIATIONS = 6.0, 5.0
 """The least such distances in terms of the view's median."""
 
-NOISE = 4.0
-"""The least such distance of a corner that looks worse in terms of the deviation that the view's noise gives it: a faint
-corner misfits for its noise alone."""
+FAINTER = 0.92
+"""Contrast relative to that of the neighbours below which it is not the light that makes a corner faint."""
 
 REACH, NARROW = 0.65, 0.4
 """Radius of the pixels that are fitted, relative to the spacing: for all corners, and for those beside other edges."""
@@ -207,8 +206,9 @@ def _trusted(
     use &= ((grid >= 1) & (grid <= np.array(image.shape[::-1]) - 2)).all(axis=-1)
     if use.sum() < FEWEST:
         return use
-    worse = misfit >= WORSE * usual + 0.01
-    noise = sigma * np.minimum(1.0, usual / np.maximum(misfit * contrast, 1e-9))
+    # Noise alone misfits a corner in fainter light by more of its contrast. What covers a corner makes it alone fainter.
+    light = np.maximum(contrast, FAINTER * cv2.medianBlur(contrast.astype(np.float32), 3))
+    worse = misfit * np.minimum(light, 1.0) >= WORSE * usual + 0.01
     spacing = spacing_of(np.where(np.isfinite(grid), grid, 0.0))
     weight, off, limit = use.astype(float), np.zeros(use.shape), np.ones(use.shape)
     for _ in range(4):
@@ -216,8 +216,8 @@ def _trusted(
         off = np.linalg.norm(np.where(use[..., None], grid - surface.grid, 0.0), axis=-1) / surface.spread
         median = float(np.median(off[use]))
         loose = np.maximum(DEVIATIONS * median, LOOSE[0] * spacing + LOOSE[1])
-        tight = np.maximum(np.maximum(WORSE_DEVIATIONS * median, NOISE * noise), TIGHT[0] * spacing + TIGHT[1])
-        limit = np.where(worse, np.minimum(loose, tight), loose)
+        tight = np.maximum(WORSE_DEVIATIONS * median, TIGHT[0] * spacing + TIGHT[1])
+        limit = np.where(worse, tight, loose)
         if (off[use] < 0.5 * limit[use]).all():
             break
         weight = use / (1 + (off / (0.5 * limit)) ** 4)
