@@ -56,10 +56,11 @@ class Corners(NamedTuple):
     Attributes:
         grid: `(rows, columns, 2)` px; NaN where not visible.
         sigma: `(rows, columns)` px, standard deviation of a coordinate that the noise of the grey values implies. It
-            tells doubtful corners, and is no weight in `calibrate`: on a real board it is a tenth of the residuals, which
-            the print makes. With weights `1 / sigma^2` the RMS of the standardised residuals of the bundled photographs,
-            by fifths of the corners from the surest on, goes from 1.22 to 0.78 and from 1.16 to 0.88 instead of from 0.98
-            to 1.08 and from 0.89 to 1.15; only on rendered boards it is flatter, 0.96 to 1.05 instead of 0.86 to 1.11.
+            tells doubtful corners, and is no weight in `calibrate`: on a real board it is a tenth of the residuals,
+            which the print makes. With weights `1 / sigma^2` the RMS of the standardised residuals of the bundled
+            photographs, by fifths of the corners from the surest on, goes from 1.22 to 0.78 and from 1.16 to 0.88
+            instead of from 0.98 to 1.08 and from 0.89 to 1.15; only on rendered boards it is flatter, 0.96 to 1.05
+            instead of 0.86 to 1.11.
         visible: `(rows, columns)`, false where something hides the corner.
         misfit: the median over the corners; above a third, it is no chessboard.
     """
@@ -210,7 +211,7 @@ def _trusted(
     use &= ((grid >= 1) & (grid <= np.array(image.shape[::-1]) - 2)).all(axis=-1)
     if use.sum() < FEWEST:
         return use
-    # Noise alone misfits a corner in fainter light by more of its contrast. What covers a corner makes it alone fainter.
+    # Noise alone misfits a corner in fainter light by more of its contrast. What covers one makes it alone fainter.
     light = np.maximum(contrast, FAINTER * cv2.medianBlur(contrast.astype(np.float32), 3))
     worse = np.where(use, misfit, 0.0) * np.minimum(light, 1.0) >= WORSE * usual + 0.01
     spacing = spacing_of(np.where(np.isfinite(grid), grid, 0.0))

@@ -94,7 +94,7 @@ def test_a_board_in_a_photograph_of_any_size():
     large[1000 : 1000 + image.shape[0], 1500 : 1500 + image.shape[1]] = image
     found = find_pattern(large, Chessboard(9, 6)).grid
     assert found is not None
-    assert off_grid(found, corners + (1500, 1000)) < 8 / 3
+    assert off_grid(found - (1500, 1000), corners) < 8 / 3
 
 
 @pytest.mark.parametrize("shape", [(12, 200), (200, 15), (1, 1)])
