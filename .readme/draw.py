@@ -4,8 +4,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import measuring_page  # beside this file, as the next one
+import measuring_page  # beside this file, as the next two
 import mounting
+import report
 
 import diffproj as dp
 from diffproj import figures
@@ -20,6 +21,10 @@ pictures = {
     "accuracy.png": figures.png(figures.accuracy(dp.AccuracyMap.over_image(calibration, view=0), unit="mm"), dpi=90),
     **measuring_page.pictures(calibration),
 }
+if first_screen := report.screenshot(replace(calibration, unit="mm")):
+    pictures["report.png"] = first_screen
+else:
+    print("report.png: no Chromium, not drawn")
 folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
 for name, content in pictures.items():
     (folder / name).write_bytes(content)

@@ -152,6 +152,7 @@ __all__ = [
     "save_camera",
     "stack",
     "write_measuring_page",
+    "write_report",
 ]
 
 
