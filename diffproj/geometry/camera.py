@@ -350,8 +350,8 @@ def as_camera(camera: Camera | PinholeCamera, name: str = "camera") -> Camera:
 
 def meeting_camera(camera: Camera, name: str, value: object, length: int) -> Tensor:
     """Check points or pixels against a camera, lift half precision, expand to the common batch shape."""
-    if isinstance(value, Tensor) and _fits(camera, value, length):  # the usual case, and five times as fast
-        return value
+    if not torch.compiler.is_compiling() and isinstance(value, Tensor) and _fits(camera, value, length):
+        return value  # the usual case, and five times as fast
     tensor = check_tensor(name, value, "N", length, like=camera.K)
     if tensor is not value:  # lifted: any precision of the camera holds a half exactly
         tensor = tensor.to(camera.dtype)
