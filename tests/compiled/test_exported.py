@@ -136,6 +136,7 @@ torch.save((points, valid), results)
 """
 
 
+@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")  # PyTorch's own
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["export", "inductor"])
 @pytest.mark.parametrize("lens", ["none", "brown5"])
