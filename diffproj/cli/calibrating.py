@@ -9,12 +9,25 @@ from rich.table import Table
 
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.result import Calibration
+from diffproj.calibration.validation import CrossValidation, cross_validate
+from diffproj.cli.calibrate_document import document
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
 from diffproj.cli.inputs import check_writable, writing
 from diffproj.cli.photographs import find_corners, photographs
-from diffproj.cli.terminal import RESULTS, aligned, in_options, progress_bars, result, rounded
+from diffproj.cli.terminal import (
+    RESULTS,
+    aligned,
+    as_json,
+    detail,
+    in_options,
+    progress_bars,
+    result,
+    rounded,
+    working,
+)
 from diffproj.cli.which_board import given_board
 from diffproj.files.save import save_camera
+from diffproj.lens.models import model_of
 
 
 def run(options: argparse.Namespace) -> int:
@@ -22,38 +35,72 @@ def run(options: argparse.Namespace) -> int:
     check_writable("--output", options.output)
     check_drawing(options.draw)
     board, side, _ = given_board(options)
-    sources = photographs(options.photographs)
+    sources = photographs(options.photographs, options.frames)
     check_no_photograph(options.draw, sources)
+    lens = {"shape": options.shape, "skew": options.skew, "reject_outliers": options.reject_outliers}
     with progress_bars() as bars:
-        views = find_corners(sources, board, bars, orientation=options.orientation)
+        folders = [path for path in options.photographs if path.is_dir()]
+        views = find_corners(sources, board, bars, orientation=options.orientation, in_folders=folders)
+        if options.folds is not None and options.folds > len(views):
+            raise ValueError(f"--folds: want at most the number of views, {len(views)}, got {options.folds}")
         task = bars.add_task("Solving", total=None)
         calibration = calibrate(
             views,
             board,
             options.distortion,
-            shape=options.shape,
-            skew=options.skew,
-            reject_outliers=options.reject_outliers,
             progress=lambda done, total: bars.update(task, completed=done, total=total),
+            **lens,
         )
+    detail(f"Solving: {calibration.message}")
     calibration = replace(calibration, unit=side.unit)
-    if calibration.comparison is not None:
-        result(f"Lenses compared\n{calibration.comparison.summary()}\n")
-    RESULTS.print(_views_table(calibration))
-    result("")
-    RESULTS.print(_parameters_table(calibration))
-    _say_how_it_ended(calibration, options.reject_outliers)
+    folds = None
+    if options.folds is not None:
+        with working("Leaving views out"):
+            model = model_of(calibration.camera.distortion).name
+            folds = cross_validate(views, board, model, options.folds, **lens)
+    try:
+        _write(options, calibration)
+    except OSError:
+        if not options.json:  # what took long to find is not lost
+            _say(calibration, folds, options.reject_outliers)
+        raise
+    # Written before it is told: who reads only the first lines has the file.
+    if options.json:
+        as_json(document(options, calibration, folds))
+        return 0
+    _say(calibration, folds, options.reject_outliers)
+    lost = "; the unit, the poses and the error bars are read from a .json file only"
+    result(f"\nWritten to {options.output}{'' if options.output.suffix.lower() == '.json' else lost}")
+    if options.draw is not None:
+        result(f"Drawn to {options.draw}")
+    return 0
+
+
+def _write(options: argparse.Namespace, calibration: Calibration) -> None:
+    """Write the files.
+
+    Raises:
+        OSError: one cannot be written.
+    """
     if options.draw is not None:
         from diffproj import figures  # here, for it loads matplotlib
 
         write_drawing(options.draw, figures.corners(calibration))
     with writing("--output", options.output):
         save_camera(options.output, calibration)
-    lost = "; the unit, the poses and the error bars are read from a .json file only"
-    result(f"\nWritten to {options.output}{'' if options.output.suffix.lower() == '.json' else lost}")
-    if options.draw is not None:
-        result(f"Drawn to {options.draw}")
-    return 0
+
+
+def _say(calibration: Calibration, folds: CrossValidation | None, reject_outliers: bool) -> None:
+    """Print what was found."""
+    if calibration.comparison is not None:
+        result(f"Lenses compared\n{calibration.comparison.summary()}\n")
+    RESULTS.print(_views_table(calibration))
+    result("")
+    RESULTS.print(_parameters_table(calibration))
+    if folds is not None:
+        result(f"\nErrors on views left out; world: {calibration.unit or 'the unit of --square'} on the board")
+        result(folds.summary())
+    _say_how_it_ended(calibration, reject_outliers)
 
 
 def _views_table(calibration: Calibration) -> Table:

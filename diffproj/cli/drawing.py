@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from diffproj._core.atomic import write_whole
-from diffproj.cli.inputs import check_writable, writing
+from diffproj.cli.inputs import check_not_the_same, check_writable, writing
 
 if TYPE_CHECKING:  # it is slow to load
     from matplotlib.figure import Figure
+
+    from diffproj.targets.images import Photograph
 
 SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -35,14 +37,13 @@ def check_drawing(path: Path | None) -> None:
         import_module("diffproj.figures")
 
 
-def check_no_photograph(path: Path | None, photographs: Iterable[object]) -> None:
+def check_no_photograph(path: Path | None, photographs: Iterable["Photograph | Path"]) -> None:
     """Check that a picture does not replace a photograph.
 
     Raises:
         ValueError: it would.
     """
-    if path is not None and path.exists() and path.resolve() in (Path(str(p)).resolve() for p in photographs):
-        raise ValueError(f"--draw: want another file than the photographs, got {path}; choose another name")
+    check_not_the_same("--draw", path, (one if isinstance(one, Path) else Path(one.label) for one in photographs))
 
 
 def write_drawing(path: Path, figure: "Figure") -> None:

@@ -2,7 +2,7 @@
 
 import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -90,6 +90,16 @@ def check_writable(option: str, path: Path) -> None:
     if not path.parent.is_dir():
         raise ValueError(f"{option}: no such folder: {path.parent}; make it first, or choose another")
     _check_place(option, path.parent)
+
+
+def check_not_the_same(option: str, path: Path | None, read: Iterable[Path]) -> None:
+    """Check that what is written does not replace what is read.
+
+    Raises:
+        ValueError: it would.
+    """
+    if path is not None and path.exists() and path.resolve() in (one.resolve() for one in read):
+        raise ValueError(f"{option}: want another file than those that are read, got {path}; choose another name")
 
 
 def check_folder(option: str, path: Path) -> None:

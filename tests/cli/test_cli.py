@@ -81,7 +81,7 @@ def test_missing_matplotlib_is_found_before_the_work(
     ("arguments", "code", "text"),
     [
         (["help"], 0, "find a camera from photographs of a board"),
-        (["--help"], 0, "'diffproj help COMMAND' tells more about a command."),
+        (["--help"], 0, "'diffproj help COMMAND' tells more about a command, with examples."),
         (["--version"], 0, f"diffproj {dp.__version__}\n"),
         (["calibrat"], 2, "invalid choice: 'calibrat' (choose from"),
         (["help", "nothing"], 2, "invalid choice: 'nothing'"),

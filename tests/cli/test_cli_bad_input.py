@@ -107,8 +107,12 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
     (("calibrate", "photo.png", *BOARD, "--draw", "a.gif"), 2, r"--draw: want a file ending in \.png, \.svg, \.pdf"),
     (("calibrate", "photo.png", *BOARD, "--draw", "gone/a.png"), 1, "--draw: no such folder: gone; make it"),
     (("calibrate", "photo.png", *BOARD, "--draw", "folder.png"), 1, "--draw: want a file, got a folder"),
-    (("calibrate", "photo.png", *BOARD, "--draw", "photo.png"), 1, "--draw: want another file than the photographs"),
-    ((*PHOTO, "camera.json", "--draw", "./photo.png"), 1, "--draw: want another file than the photographs"),
+    (
+        ("calibrate", "photo.png", *BOARD, "--draw", "photo.png"),
+        1,
+        "--draw: want another file than those that are read",
+    ),
+    ((*PHOTO, "camera.json", "--draw", "./photo.png"), 1, "--draw: want another file than those that are read"),
     ((*VIEW, *POINTS, "--draw", "gone/a.pdf"), 1, "--draw: no such folder: gone; make it"),
     (("experiment", "--output", "list.json"), 1, "--output: want a folder, got the file .*list.json"),
     (("experiment", "--output", "list.json/results"), 1, "--output: want a folder, got the file .*list.json"),
@@ -240,7 +244,7 @@ def test_what_nobody_thought_of_is_one_line_too(
     def fail(*_: object) -> None:
         raise AssertionError("two\nlines")
 
-    monkeypatch.setattr("diffproj.cli.measuring.stored_view", fail)
+    monkeypatch.setattr("diffproj.cli.measuring.scene_of", fail)
     assert cli.main([*VIEW, *POINTS]) == 1
     out, err = capsys.readouterr()
     (line,) = err.splitlines()

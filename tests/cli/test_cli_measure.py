@@ -16,18 +16,22 @@ import pytest
 import torch
 
 import diffproj as dp
-from diffproj import cli, synthetic
+from diffproj import synthetic
 from diffproj.cli import shielded
 from diffproj.cli.inputs import HAND
 from diffproj.cli.measure_document import REASONS, between, crosses, listed
 from diffproj.cli.measure_plane import equation
 from diffproj.cli.measure_tables import coordinate, shown
 from diffproj.measurement.choices import HAND_PX
+from tests.cli.commands import parser, runner
 
 D = torch.float64
 BOARD = ("--board", "8x5", "--square", "25")
 CORNERS = ("210.5,133", "402,140.5", "395,300")
 NAMES = [f"{i}.png" for i in range(1, 11)]
+
+run, parsed = runner("measure"), parser("measure")
+pytestmark = pytest.mark.usefixtures("there")
 
 
 @pytest.fixture(scope="module")
@@ -57,30 +61,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     many = dp.Camera(torch.stack([calibration.camera.K] * 2), size=(640, 480))
     dp.save_camera(folder / "many.json", many)
     return folder
-
-
-@pytest.fixture(autouse=True)
-def there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    try:
-        code = cli.main(["measure", *arguments])
-    except SystemExit as error:
-        code = int(error.code or 0)
-    out, err = capsys.readouterr()
-    return code, out, err
-
-
-def parsed(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
-    code, out, err = run(capsys, *arguments, "--json")
-    assert (code, err) == (0, "")
-
-    def refuse(constant: str) -> None:
-        raise AssertionError(constant)
-
-    return json.loads(out, parse_constant=refuse)
 
 
 def pixels(*texts: str) -> torch.Tensor:
