@@ -1,6 +1,6 @@
 """Builds the site: `python .docs/build.py [FOLDER]`, by default in build/docs. Needs the extra `docs`.
 
-The pages are the Markdown files beside this one, in the order of `index.md`, and those of the interface: a page for the
+The pages are the Markdown files beside this one, in the order of `index.md`, and those of the interface: one for the
 names of `diffproj.__all__` and one for each room, out of the docstrings. In the Markdown `dp.calibrate` is linked to its
 page, `choosing.md` to the page beside, `../tests` to the repository. Any warning is an error.
 """
@@ -62,9 +62,7 @@ def linked(text: str, up: str) -> str:
 
 
 def _linked(text: str, up: str) -> str:
-    text = re.sub(
-        r"(?<!\[)`(dp(?:\.[A-Za-z_]\w*)+)([^`]*)`", lambda m: f"[`{m[1]}{m[2]}`]({up}{place_of(m[1])})", text
-    )
+    text = re.sub(r"(?<!\[)`(dp(?:\.[A-Za-z_]\w*)+)([^`]*)`", lambda m: f"[`{m[1]}{m[2]}`]({up}{place_of(m[1])})", text)
     text = re.sub(r"\]\(\.\./", f"]({REPOSITORY}", text)
     return re.sub(
         r"\]\((\w+)\.md(#[\w-]*)?\)",
@@ -97,7 +95,9 @@ def main(folder: Path) -> None:
     guide = [module_of(page) for page in pages()]
     modules = {module.fullname: module for module in guide}
     modules |= {name: pdoc.doc.Module.from_name(name) for name in names}
-    pdoc.render.configure(docformat="google", template_directory=HERE / "theme", footer_text=f"diffproj {dp.__version__}")
+    pdoc.render.configure(
+        docformat="google", template_directory=HERE / "theme", footer_text=f"diffproj {dp.__version__}"
+    )
     for name, module in modules.items():
         file = folder / f"{name.replace('.', '/')}.html"
         file.parent.mkdir(parents=True, exist_ok=True)

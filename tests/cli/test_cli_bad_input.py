@@ -218,7 +218,11 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
     ),
     (("rectify", "empty.png", "--camera", "camera.json", *BOARD), 1, r"empty\.png: want an image, got 0 bytes"),
     (("rectify", "noise.png", "--camera", "camera.json", *BOARD), 1, r"noise\.png: want an image"),
-    (("rectify", "[pg][hr]*.png", "--camera", "camera.json", *BOARD), 1, r"PHOTO: want one photograph, got \d of the form"),
+    (
+        ("rectify", "[pg][hr]*.png", "--camera", "camera.json", *BOARD),
+        1,
+        r"PHOTO: want one photograph, got \d of the form",
+    ),
     (("rectify", "film.mp4", "--camera", "camera.json", *BOARD), 1, "want a photograph, got the video film.mp4; save"),
     (("rectify", "grey.png", "--camera", "camera.json", *BOARD), 1, r"found none in grey\.png\. Check"),
     ((*TOP, "--camera", "camera.json", "--resolution", "nan"), 2, "--resolution: want a positive number"),
