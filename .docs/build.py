@@ -1,7 +1,7 @@
 """Builds the site: `python .docs/build.py [FOLDER]`, by default in build/docs. Needs the extra `docs`.
 
-The pages are the Markdown files beside this one, in the order of `index.md`, and those of the interface: one for the
-names of `diffproj.__all__` and one for each room, out of the docstrings. In the Markdown `dp.calibrate` is linked to its
+The pages are the Markdown files beside this one, in the order of `index.md`, and those of the interface: one for
+`diffproj.__all__` and one for each room, out of the docstrings. In the Markdown `dp.calibrate` is a link to its
 page, `choosing.md` to the page beside, `../tests` to the repository. Any warning is an error.
 """
 

@@ -5,7 +5,7 @@ import difflib
 import os
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 
 class CommandLine(argparse.ArgumentParser):
@@ -19,7 +19,12 @@ class CommandLine(argparse.ArgumentParser):
         else:
             super()._print_message(message, file)
 
-    def refuse(self, unknown: Sequence[str]) -> None:
+    def error(self, message: str) -> NoReturn:
+        """End with a mistake, said as failures are: after how the command is used, the argument and what it wants."""
+        self.print_usage(sys.stderr)
+        self.exit(2, f"{self.prog}: {message.removeprefix('argument ')}\n")
+
+    def refuse(self, unknown: Sequence[str]) -> NoReturn:
         """End with the mistake that these arguments are unknown, and with the options that are spelt alike."""
         known = [option for action in self._actions for option in action.option_strings if option.startswith("--")]
         meant = {text: difflib.get_close_matches(text.partition("=")[0], known, 1) for text in unknown}

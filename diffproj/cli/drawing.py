@@ -1,27 +1,20 @@
 """Pictures that `--draw` asks for: checked before the work, written whole after it."""
 
-import argparse
 from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from diffproj._core.atomic import write_whole
-from diffproj.cli.inputs import check_not_the_same, check_writable, writing
+from diffproj.cli.inputs import check_not_the_same, check_writable, file_ending, writing
 
 if TYPE_CHECKING:  # it is slow to load
     from matplotlib.figure import Figure
 
     from diffproj.targets.images import Photograph
 
-SUFFIXES = (".png", ".svg", ".pdf")
-
-
-def drawing(text: str) -> Path:
-    """Read the name of a picture."""
-    if Path(text).suffix.lower() not in SUFFIXES:
-        raise argparse.ArgumentTypeError(f"want a file ending in {', '.join(SUFFIXES)}, got {text!r}")
-    return Path(text)
+drawing = file_ending(".png", ".svg", ".pdf")
+"""Reads the name of a picture."""
 
 
 def check_drawing(path: Path | None) -> None:

@@ -5,7 +5,7 @@ import functools
 from pathlib import Path
 
 from diffproj.cli.common_options import add_camera, add_photograph, add_plane, add_pose, add_said, describe
-from diffproj.cli.inputs import numbers
+from diffproj.cli.inputs import file_ending, numbers
 from diffproj.cli.units import length
 from diffproj.cli.which_board import check_board
 
@@ -39,8 +39,6 @@ examples:
       --resolution 0.05 --world-file -o ground.tif
 """
 
-SUFFIXES = (".png", ".tif", ".tiff")
-
 
 def add_options(command: argparse.ArgumentParser) -> None:
     """Give the command its description and its options."""
@@ -70,7 +68,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     output.add_argument(
         "-o",
         "--output",
-        type=_picture,
+        type=file_ending(".png", ".tif", ".tiff"),
         default=Path("top.png"),
         metavar="FILE",
         help="the top view: a .png, .tif or .tiff, replaced if there is one (default: top.png)",
@@ -83,12 +81,6 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
     add_said(command)
     command.set_defaults(work="rectifying", check=functools.partial(_check_pose, command))
-
-
-def _picture(text: str) -> Path:
-    if Path(text).suffix.lower() not in SUFFIXES:
-        raise argparse.ArgumentTypeError(f"want a file ending in {', '.join(SUFFIXES)}, got {text!r}")
-    return Path(text)
 
 
 def _extent(text: str) -> tuple[float, ...]:

@@ -279,7 +279,7 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
         (
             (command, *more, "--nonsense"),
             2,
-            f"{command}: error: unrecognized arguments: --nonsense; 'diffproj {command}",
+            f"{command}: unrecognized arguments: --nonsense; 'diffproj {command}",
         )
         for command, more in {
             "board": ("a.pdf", *BOARD),

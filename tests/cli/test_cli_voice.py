@@ -180,7 +180,7 @@ def test_output_that_is_not_taken(arguments: list[str]) -> None:
 def test_a_misspelt_option_is_told_from_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:
     code, _, err = run(capsys, "measure", *PHOTO, *POINTS, "--hieght", "3")
     assert code == 2
-    assert err.endswith("diffproj measure: error: unrecognized arguments: --hieght 3; did you mean --height?\n")
+    assert err.endswith("diffproj measure: unrecognized arguments: --hieght 3; did you mean --height?\n")
     code, _, err = run(capsys, "info", "camera.json", "another.json")
     assert err.endswith("unrecognized arguments: another.json; 'diffproj info --help' lists the options\n")
 
