@@ -62,8 +62,8 @@ def linked(text: str, up: str) -> str:
 
 
 def _linked(text: str, up: str) -> str:
-    text = re.sub(r"(?<!\[)`(dp(?:\.[A-Za-z_]\w*)+)([^`]*)`", lambda m: f"[`{m[1]}{m[2]}`]({up}{place_of(m[1])})", text)
     text = re.sub(r"\]\(\.\./", f"]({REPOSITORY}", text)
+    text = re.sub(r"(?<!\[)`(dp(?:\.[A-Za-z_]\w*)+)([^`]*)`", lambda m: f"[`{m[1]}{m[2]}`]({up}{place_of(m[1])})", text)
     return re.sub(
         r"\]\((\w+)\.md(#[\w-]*)?\)",
         lambda m: f"]({up}{'guide' if m[1] == 'index' else f'guide/{m[1]}'}.html{m[2] or ''})",
