@@ -110,10 +110,9 @@ def in_options(text: str) -> str:
     """What the library says, with the command's options in place of Python's, and without what it has not."""
     text = re.sub(r"^(calibrate|refine|locate|measure): ", "", text)
     text = re.sub(r", or (let fixed or priors hold|fix) the principal point and the lens( \([^)]*\))?", "", text)
+    text = re.sub(r"\b(distortion|shape)=(['\"]?)(\w*)\2", r"--\1 \3", text)
     return (
-        text.replace("distortion=", "--distortion ")
-        .replace("shape=", "--shape ")
-        .replace("skew=True", "--skew")
+        text.replace("skew=True", "--skew")
         .replace("reject_outliers=True", "--reject-outliers")
         .replace("'auto'", "auto")
         .replace("give legacy=True", "give --legacy")
