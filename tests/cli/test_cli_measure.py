@@ -273,7 +273,7 @@ def test_corners_that_no_pose_explains(capsys: pytest.CaptureFixture[str], monke
             ["--points", "1,2"],
             "one of the arguments --board --charuco --aprilgrid --circles --target --view is required",
         ),
-        (["--view", "1.png", *BOARD, "--points", "1,2"], "argument --board: not allowed with argument --view"),
+        (["--view", "1.png", *BOARD, "--points", "1,2"], "--board: not allowed with argument --view"),
         (["photo.png", "--view", "1.png", "--points", "1,2"], "PHOTO: not with --view"),
         (["--view", "1.png", "--square", "25", "--points", "1,2"], "--square: goes with --board"),
         ([*BOARD, "--points", "1,2"], "PHOTO: want a photograph that shows the board, got none"),
