@@ -14,6 +14,7 @@ from diffproj.cli.common_options import (
 )
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import DETECTOR, HAND, numbers, some_path
+from diffproj.cli.measure_page import page_file
 from diffproj.cli.which_board import check_board
 
 DESCRIPTION = """\
@@ -57,6 +58,8 @@ examples:
   diffproj measure --camera camera.json --view left01.jpg \\
       --points 210,133 402,140
   diffproj measure --camera located.json --view mast.jpg --points 2000,1000
+  diffproj measure photo.jpg --camera camera.json --board 9x6 --square 25mm \\
+      --page measure.html
   diffproj measure photo.jpg --camera camera.yaml --board 9x6 --square 25mm \\
       --points-file points.csv --height 12 --pixel-sigma 0.7 --csv > box.csv
 """
@@ -67,19 +70,20 @@ def add_options(command: argparse.ArgumentParser) -> None:
     usage = (
         "%(prog)s PHOTO --camera FILE --board CxR --square SIDE\n"
         "                        --points u,v ... [options]\n"
-        "       %(prog)s --camera FILE --view NAME --points u,v ... [options]"
+        "       %(prog)s --camera FILE --view NAME --points u,v ... [options]\n"
+        "       %(prog)s PHOTO --camera FILE (--view NAME | --board ...) --page F"
     )
     describe(command, DESCRIPTION, EPILOG, usage)
     add_photograph(command, "the photograph, with --board; --view needs none")
     add_camera(command)
-    pixels = command.add_mutually_exclusive_group(required=True)
+    pixels = command.add_mutually_exclusive_group()
     pixels.add_argument(
         "--points",
         type=_pixel,
         nargs="+",
         action="extend",
         metavar="u,v",
-        help="the pixels to measure, in order (these or --points-file)",
+        help="the pixels to measure, in order (these, --points-file or --page)",
     )
     pixels.add_argument(
         "--points-file",
@@ -104,6 +108,13 @@ def add_options(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="draw the board's corners and axes, the points and the lengths into the photograph: a .png, .svg or .pdf, "
         "replaced if there is one",
+    )
+    more.add_argument(
+        "--page",
+        type=page_file,
+        metavar="FILE",
+        help="write an .html page in which anyone measures in PHOTO by clicks, offline, with these error bars; with "
+        "--view PHOTO is that view's photograph",
     )
     forms = add_said(command)
     forms.add_argument("--csv", action="store_true", help="print one table for spreadsheets")
@@ -130,7 +141,11 @@ def _pixel_sigma(text: str) -> float | str:
 
 def _check_which_pose(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Check that a photograph comes with its board, and a view alone."""
-    if options.view is not None and options.photograph is not None:
+    if options.points is None and options.points_file is None and options.page is None:
+        command.error("one of the arguments --points --points-file --page is required")
+    if options.view is not None and options.photograph is None and options.page is not None:
+        command.error("PHOTO: want the photograph of --view for --page, got none")
+    if options.view is not None and options.photograph is not None and options.page is None:
         command.error(
             "PHOTO: not with --view, whose pose the camera file holds; leave the photograph out, or give --board and "
             "--square"
