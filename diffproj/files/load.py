@@ -48,7 +48,11 @@ def load_camera(path: PathLike, format: FormatName | None = None, camera: str | 
         ...     dp.load_camera(f"{folder}/camera.yaml")
         Camera(f 1.0, 1.0 px, c 0.0, 0.0 px, pinhole, 640 x 480 px, no pose, torch.float64)
     """
-    document = Document.read(file_path("path", path))
+    return _chosen(Document.read(file_path("path", path)), format, camera)
+
+
+def _chosen(document: Document, format: FormatName | None = None, camera: str | int | None = None) -> Camera:  # noqa: A002
+    """The camera of a file that is asked for."""
     found = found_in(document, format)
     try:
         return found.chosen(camera)
@@ -104,9 +108,13 @@ def load(path: PathLike) -> Camera | Calibration | RigCalibration:
         OSError: there is no such file, or it cannot be read.
         ValueError: as for `load_camera`.
     """
-    document = Document.read(file_path("path", path))
+    return content_of(Document.read(file_path("path", path)))
+
+
+def content_of(document: Document) -> Camera | Calibration | RigCalibration:
+    """What a file in hand holds; see `load`."""
     found = _own(document, own_json.read_rig) or _own(document, own_json.read_calibration)
-    return load_camera(path) if found is None else found
+    return _chosen(document) if found is None else found
 
 
 def _own(document: Document, read: Callable[[Document], T | None]) -> T | None:
