@@ -95,4 +95,4 @@ def calibrate(
 
     if isinstance(views, list | tuple) and any(isinstance(one, Views) for one in views):
         return each_calibrated(views, target, distortion, chosen, one_camera)
-    return one_camera(as_views(views), chosen)
+    return one_camera(as_views(views), chosen)  # type: ignore[arg-type]
