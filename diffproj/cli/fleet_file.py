@@ -12,6 +12,8 @@ from diffproj.cli.fleet_folder import Searched
 from diffproj.files import own_json
 from diffproj.files.trees import json_lines
 
+BEGINNING = '{"name": '
+"""How each line starts."""
 DONE = "camera"
 """The key that only lines of cameras have, and not those of failures."""
 
@@ -33,6 +35,8 @@ def done_before(path: Path, asked: Mapping[str, Any]) -> dict[str, dict[str, Any
     remedy = "choose another file, or remove it"
     try:
         lines = json_lines(text)
+        if text and not text.startswith(BEGINNING):
+            raise ValueError("no line of a fleet")  # noqa: TRY301
         found = {line["name"]: line for line in lines}
         other = next((line["asked"] for line in lines if line["asked"] != json.loads(json.dumps(asked))), None)
     except (KeyError, TypeError, ValueError):
