@@ -1,5 +1,6 @@
 """What a rig's fit comes to: how it ended, the cameras at their places, and each camera as a calibration."""
 
+import hashlib
 from collections.abc import Mapping
 from functools import partial
 
@@ -34,6 +35,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
     joint = _Late(found, noise)
     R, t = found.problem.cameras(found.shared)
     cameras, calibrations = {}, {}
+    fingerprint = hashlib.blake2b(found.shared.cpu().numpy().tobytes(), digest_size=12).hexdigest()
     status, cause = _verdict(found, noise, alone)
     for c, name in enumerate(names):
         data, kind = views.data[name], found.parameters.kinds[c]
@@ -59,6 +61,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
             skew=kind.skew,
             degrees_of_freedom=noise.freedom[c],
             displacements=displacements(found),
+            rig=fingerprint,
             _covariance=partial(_of_camera, found, joint, c),
             _others=partial(_others, found, alone[name], name, posed.R, posed.t),
         )
