@@ -10,7 +10,7 @@ phi the dispersion (`dispersion.py`): how much the moments contradict each other
 """
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -97,7 +97,7 @@ def plain_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
     """The covariance for one noise of all cameras and independent corners: what verdicts go by."""
     freedom = noise.freedom.clamp(min=0)
     pooled = (torch.where(freedom > 0, noise.variance * freedom, 0.0)).sum() / freedom.sum().clamp(min=1)
-    frame: dict[str, Tensor] = {}
+    frame: dict[str, Any] = {}
     if found.restraint is not None:
         few, restraint = found.parameters.few, found.restraint
         wide = (few, 0, few, 0)
