@@ -73,8 +73,8 @@ class Nested:
                     continue  # no lens has it
                 held = [name for group in groups if group not in inside for name in group]
                 options = early.but(fixed=(*early.fixed, *held))
-                fits[inside] = self._fit(options, self._start(fits, inside), DENOMINATOR in inside)
-        return self._fit(self.chosen, self._start(fits, tuple(groups)), DENOMINATOR in groups)
+                fits[inside] = self._fit(options, self._start(fits, inside), inside)
+        return self._fit(self.chosen, self._start(fits, tuple(groups)), tuple(groups))
 
     def _groups(self) -> list[tuple[str, ...]]:
         """The groups of which some parameters are free; none for a short lens."""
@@ -97,10 +97,10 @@ class Nested:
         local = zip(*(solution.local for solution in fewer), strict=True)
         return shared, tuple(torch.stack(parts)[best] for parts in local)
 
-    def _fit(self, options: Options, start: tuple[Tensor, Pose], rational: bool = False) -> Fit:
-        """The lowest fit that is found from there."""
+    def _fit(self, options: Options, start: tuple[Tensor, Pose], inside: tuple[tuple[str, ...], ...] = ()) -> Fit:
+        """The lowest fit that is found from there, with these groups."""
         found, _ = minimised(self.data, options, self.parameters, *start, self.reference)
         steps: dict[str, Any] = {"max_iterations": options.max_iterations, "tolerance": options.tolerance}
         limit = options.outlier_limit
-        found = second_look(found, self.straight, reject=limit, long_valley=rational, **steps)
-        return restrained(found, *start, self.size, reject=limit, **steps) if rational else found
+        found = second_look(found, self.straight, reject=limit, long_valley=bool(inside), **steps)
+        return restrained(found, *start, self.size, reject=limit, **steps) if DENOMINATOR in inside else found

@@ -1,0 +1,1 @@
+"""Pages that need nothing but a browser: the report on a calibration."""
