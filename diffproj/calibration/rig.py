@@ -43,7 +43,7 @@ def calibrate_rig(
     Args:
         views_by_camera: corners `(V, N, 2)` by the camera's name. Cameras may miss any moments, and views any corners;
             a view with fewer than 4 takes no part. Sizes may differ.
-        target: anything with `.points (N, 3)` on z = 0, such as `Chessboard`; its unit is the world's.
+        target: a board, `Landmarks` without sigma, or anything with `.points (N, 3)`; its unit is the world's.
         distortion: which lens to fit, as for `calibrate`; or one by camera.
         moments: by camera, the name or number of each view's moment. Left out, the views' names are the moments', with
             the camera's own name taken out where they would share none: `left03.jpg` and `right03.jpg` are `03.jpg`.
@@ -92,9 +92,9 @@ def rig_calibrated(
     # What is held has to be known by camera before each is calibrated on its own; a known camera brings its lens.
     kinds = {name: Parametrisation.of(known[name]) if name in known else Parametrisation(lens[name]) for name in lens}
     parameters = RigParameters(views.names, tuple(kinds.values()))
-    if chosen.shape == "free" or moved is not None:
-        for data in views.data.values():
-            data.check_options("image", False, "free")
+    freed = chosen.shape == "free" or moved is not None
+    if freed and bool((views.data[views.names[0]].given_points.detach()[:, 2] != 0).any()):
+        raise ValueError("shape: want 'flat' for points that are not all on z = 0, got 'free'")
     fixed, points = held_points(chosen.fixed, len(views.points))
     names, positions = held(parameters, fixed)
     own = alone(views, target, lens, known, names, chosen, who)
@@ -109,7 +109,7 @@ def rig_calibrated(
         positions,
         chosen,
     )
-    if chosen.shape == "free" or moved is not None:
+    if freed:
         found = with_shape(found, points, chosen, moved)
     rig = rig_outcome(found, own)
     if chosen.throw and rig.status != Status.CONVERGED:

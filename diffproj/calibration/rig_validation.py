@@ -90,7 +90,8 @@ def cross_validate_rig(
 
     Args:
         views_by_camera: corners by the camera's name, as for `calibrate_rig`; moment i is left out of fit i mod k.
-        target: anything with `.points (N, 3)` on z = 0.
+        target: a board, `Landmarks` without sigma, or anything with `.points (N, 3)`. Errors of points in space are
+            distances from the pixels' rays.
         distortion: the lens, or one by camera.
         folds: k.
         moments: of each view, by camera, as for `calibrate_rig`.

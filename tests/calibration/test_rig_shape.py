@@ -13,9 +13,9 @@ BOARD = dp.Chessboard(4, 3, 30.0)
 BUNDLED = {name: dp.example_views(name) for name in ("left", "right")}
 
 
-def scene(noise: float = 0.1, missing: int = 1) -> tuple[dict[str, dp.Views], Tensor]:
+def scene(noise: float = 0.1, missing: int = 1, seed: int = 0) -> tuple[dict[str, dp.Views], Tensor]:
     """Two cameras without a lens that see a badly printed board at eight moments, each of which misses some."""
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(seed)
     K = torch.tensor([[[500.0, 0, 320], [0, 510, 240], [0, 0, 1]], [[380, 0, 310], [0, 370, 250], [0, 0, 1]]], dtype=D)
     poses = dp.synthetic.random_cameras(dp.Camera(K[0], size=(640, 480)), BOARD, 8, distance=(1.2, 1.8), seed=3)
     printed = BOARD.points.to(D) + 0.3 * torch.randn(12, 3, generator=generator, dtype=D)
@@ -76,6 +76,30 @@ def test_minimum_and_covariance_are_those_of_the_slow_obvious_way() -> None:
         assert torch.equal(own.covariance.points, rig.covariance.points)
         assert own.covariance.names[: len(own.parameters.names)] == own.parameters.names
         assert torch.allclose(own.covariance.view(0), own.covariance.view(0).mT)
+
+
+@pytest.mark.slow
+def test_sampling_reproduces_the_covariance() -> None:
+    """Squared errors of focal lengths, of the other camera's place and of the points, over their variances."""
+    squares: dict[str, list[Tensor]] = {"focal": [], "place": [], "points": []}
+    t = torch.tensor([-40.0, 3, 5], dtype=D)
+    for seed in range(30):
+        views, printed = scene(seed=seed, missing=0)
+        rig = dp.calibrate_rig(views, BOARD, "none", shape="free")
+        # The printed board in the frame, and at the size, that the target's points have.
+        a, b = (points - points.mean(0) for points in (BOARD.points.to(D), printed))
+        U, S, Vh = torch.linalg.svd(a.mT @ b)
+        size = float(S.sum() / a.square().sum())
+        truth = b @ (U @ Vh).mT / size + BOARD.points.to(D).mean(0)
+        squares["points"].append(((rig.points - truth) / rig.points_deviation).square().flatten())
+        spread = rig.covariance.deviations
+        off = torch.stack([rig[name].camera.K[0, 0] for name in ("a", "b")]) - torch.tensor([500.0, 380], dtype=D)
+        squares["focal"].append((off / torch.stack([spread[f"{name}.f_x"] for name in ("a", "b")])).square())
+        variance = rig.place_covariance("b").diagonal()[3:]
+        squares["place"].append((rig.cameras["b"].t - t / size).square() / variance)
+    for name, found in squares.items():
+        print(name, torch.cat(found).mean())
+        assert 0.5 < torch.cat(found).mean() < 1.25, name
 
 
 def test_one_camera_that_sees_all_is_as_alone() -> None:
