@@ -329,6 +329,21 @@ def booleans(name: str, value: object, device: torch.device | None = None) -> Te
     return found
 
 
+def first_of(values: Tensor, wrong: Tensor) -> str:
+    """The first of the values that are wrong, and where it is among several, for a message: `"-0.1 at (3, 2)"`.
+
+    Args:
+        values: numbers.
+        wrong: which of them are, or of the rows, matrices and so on that they make up.
+    """
+    place = tuple(wrong.nonzero()[0].tolist())
+    found = values.detach()[place].tolist()
+    text = f"{found:.6g}" if isinstance(found, float) else f"{found}"
+    if len(place) == 0 or wrong.numel() == 1:
+        return text
+    return f"{text} at {place[0] if len(place) == 1 else place}"
+
+
 def meeting(*values: object) -> Kind | None:
     """The first of these that has a floating-point dtype and a device: what arrays among them are to be like."""
     for value in values:

@@ -49,6 +49,8 @@ def adjust(
             standard deviation)`; numbers or tensors `(*B,)`. Names are `height`, `tilt`, `roll`, `heading`, `position`
             (`x` and `y`), `focal`, `principal_point`, `distortion`, `f_x`, `k1` and so on; `turn_x`, `turn_y` and
             `turn_z` are degrees about the camera's own axes in the place of the three angles. What has a prior is free.
+            A camera that looks straight down may lean beyond the vertical: as `Camera.mounting` has it, its tilt then
+            folds back below 90, and roll and heading, be they known, are told half a turn further.
         fixed: names of the pose that keep the camera's values.
         free: intrinsics that are to be found too, such as `"focal"`. All others keep the camera's values.
         tied_focal: `f_x : f_y` keeps the camera's ratio where `focal` is free.

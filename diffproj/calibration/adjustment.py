@@ -29,6 +29,9 @@ NOTHING = 1e-12
 """Deviation, relative to the value, that is rounding: of what was held."""
 VERTICAL = 3.0
 """Deviations of the tilt within which an axis may be vertical."""
+VERTICAL_WORDS = (
+    "the axis may be vertical: beyond it, tilt folds back, and roll and heading are told half a turn further"
+)
 ANY_ANGLE = 180 / 3**0.5
 """Deviation of an angle in degrees of which nothing is known."""
 ROUNDED = 1e-7
@@ -161,6 +164,8 @@ class Adjustment(Calibration):
                 kind = " degrees" if name in MOUNTING[:3] else unit if name in MOUNTING else ""
                 known = " (not known)" if spread == torch.inf else f" ± {spread:.4f}" if spread else " (fixed)"
                 lines.append(f"{name:<16}{value:z12.4f}{known}{kind}")
+        if 90 - abs(values["tilt"]) < VERTICAL * spreads["tilt"] < torch.inf:
+            lines.append(VERTICAL_WORDS)
         for one, part in zip(self.observations, self.parts, strict=True):
             rms = float(part.detach().square().mean().sqrt())
             lines.append(f"{type(one).__name__:<16}{part.shape[-2]:5d} seen, residuals {rms:.2f} deviations")

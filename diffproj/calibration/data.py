@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._core.arguments import Array, tensor_of
+from diffproj._core.arguments import Array, first_of, tensor_of
 from diffproj._core.numerics import in_float64
 from diffproj.calibration.distinct import shares
 from diffproj.calibration.losses import SMALLEST
@@ -79,11 +79,16 @@ class Data:
             weights = _weights_of(pixel_sigma, views)
         if weights is not None:
             given = _of_corners("weights", weights, views)
-            counted = given.detach()[visible]
-            if not bool(((counted >= 0) & counted.isfinite()).all()):
-                raise ValueError("weights: want finite numbers of at least 0, got others at corners that were seen")
-            if not bool(((counted == 0) | ((counted >= SMALLEST) & (counted <= 1 / SMALLEST))).all()):
-                raise ValueError(f"weights: want 0 or numbers from {SMALLEST:g} to {1 / SMALLEST:g}, got others")
+            counted = torch.where(visible, given.detach(), 0.0)
+            wrong = ~((counted >= 0) & counted.isfinite())
+            if bool(wrong.any()):
+                got = f"{first_of(counted, wrong)}, a corner that was seen"
+                raise ValueError(f"weights: want finite numbers of at least 0, got {got}")
+            wrong = ~((counted == 0) | ((counted >= SMALLEST) & (counted <= 1 / SMALLEST)))
+            if bool(wrong.any()):
+                raise ValueError(
+                    f"weights: want 0 or numbers from {SMALLEST:g} to {1 / SMALLEST:g}, got {first_of(counted, wrong)}"
+                )
             self.given_weights = torch.where(visible, given, 0.0)
             self.weights = self.given_weights.detach().reshape(self.pixels.shape[:-1])
             visible = visible & (self.given_weights.detach() > 0)
@@ -123,7 +128,8 @@ class Data:
         if int(self.used.any(-1).sum(-1).amax()) > 1:
             raise ValueError(
                 "target: want landmarks without sigma, or one view: several views see a landmark off in the same way, "
-                "which calibrate and refine do not carry; dp.locate does, for each view"
+                "which calibrate and refine do not carry; dp.locate does, for each view; on z = 0, shape='free' with "
+                "priors={'points': sigma} finds where they are, of landmarks without sigma"
             )
 
     def task(self, model: LensModel, **options: Any) -> Task:
@@ -156,10 +162,12 @@ def _of_corners(name: str, value: Tensor | Array | float, views: Views) -> Tenso
 def _weights_of(pixel_sigma: Tensor | Array | float, views: Views) -> Tensor:
     """One over the variance of each corner."""
     given = _of_corners("pixel_sigma", pixel_sigma, views)
-    counted = given.detach()[views.visible]
+    counted = torch.where(views.visible, given.detach(), 1.0)
     least, most = SMALLEST**0.5, SMALLEST**-0.5
-    if not bool(((counted >= least) & (counted <= most)).all()):
-        raise ValueError(f"pixel_sigma: want standard deviations in px from {least:g} to {most:g}, got others")
+    wrong = ~((counted >= least) & (counted <= most))
+    if bool(wrong.any()):
+        got = first_of(counted, wrong)
+        raise ValueError(f"pixel_sigma: want standard deviations in px from {least:g} to {most:g}, got {got}")
     return torch.where(views.visible, given, 1.0).square().reciprocal()
 
 
@@ -179,7 +187,7 @@ def _check_inside(views: Views, pixels: Tensor, used: Tensor) -> None:
 
 def _check_points(points: Tensor) -> None:
     if not bool(points.isfinite().all()):
-        raise ValueError("target: want finite points, got others")
+        raise ValueError(f"target: want finite points, got {first_of(points, ~points.isfinite().all(-1))}")
     if len(points) < 4:
         why = ", for three leave up to four poses open" if len(points) == 3 else ""
         raise ValueError(

@@ -22,6 +22,8 @@ TOLERANCE, ROUNDING = 1e-13, 1e-12
 """Part of the cost that another step may still bring, and that rounding may."""
 ROBUST_STEPS, NEWTON = 40, 20
 """Steps of reweighting, which shrink slowly under a robust loss, before at most so many of Newton's."""
+UNDETERMINED_STEPS = 30
+"""Steps where there are fewer residuals than unknowns: many places explain them, and the solver would go on long."""
 POOR = 9.0
 """Cost per spare residual from which on other starts are tried."""
 RESTRAINT = 1e-8
@@ -91,11 +93,15 @@ def best(task: Task, steps: int) -> Found:
     own, R = task.own(), task.camera.R.reshape(-1, 3, 3)
     prior = task.known.prior(own, task.batch)
     begin = task.known.begin(own, prior)
-    found = _descended(task, R, begin, prior, (), steps)
+    basis, none = task.known.basis(begin), torch.zeros(len(begin), dtype=torch.long, device=begin.device)
+    few = spare(task, Found(task.known.parameters(R), basis, prior, begin, none, none, begin[:, 0])) < 0
+    steps = min(steps, UNDETERMINED_STEPS) if bool(few.all()) else steps
+    found = descended(task, R, begin, prior, (), steps)
     if not task.pieces or steps == 0:
         return found
     left = spare(task, found)
-    poor = (found.status == Status.DIVERGED) | ~(2 * found.cost <= POOR * left.clamp(min=1))
+    # Where there are fewer residuals than unknowns, another start tells no more.
+    poor = (found.status == Status.DIVERGED) | (~(2 * found.cost <= POOR * left.clamp(min=1)) & (left >= 0))
     if not bool(poor.any()):
         return found
     camera = task.known.parameters(R).unpack(begin, (len(begin),), task.camera.size)
@@ -108,11 +114,11 @@ def best(task: Task, steps: int) -> Found:
     rows = (cost + _away(rotations, first)).topk(min(TRIED, K), dim=0, largest=False).indices
     k, each = len(rows), torch.arange(P, device=rows.device)
     many = Prior(*(part.expand(k, *part.shape).flatten(0, 1) for part in prior[:2]))
-    near = _descended(task, rotations[rows, each].flatten(0, 1), values[rows, each].flatten(0, 1), many, (k,), FEW)
+    near = descended(task, rotations[rows, each].flatten(0, 1), values[rows, each].flatten(0, 1), many, (k,), FEW)
     away = _away(near.parameters.rotation(near.values), first.repeat(k, 1, 1))
     chosen = (near.cost + away).nan_to_num(torch.inf).reshape(k, P).argmin(0) * P + each
     R = R if near.parameters.start is None else near.parameters.start[chosen]
-    other = _descended(task, R, near.values[chosen], prior, (), steps)
+    other = descended(task, R, near.values[chosen], prior, (), steps)
     ends = [torch.where(one.status == Status.CONVERGED, one.cost, torch.inf) for one in (other, found)]
     better = poor & (ends[0] < ends[1])
     start = None
@@ -130,7 +136,11 @@ def _away(R: Tensor, first: Tensor) -> Tensor:
     return HAIR * (3 - (R * first).sum((-2, -1)))
 
 
-def _descended(task: Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[int, ...], steps: int) -> Found:
+def descended(task: Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[int, ...], steps: int) -> Found:
+    """The minimum that the solver reaches from values `(P, q)`, whose turns are about rotations `(P, 3, 3)`.
+
+    `more` is the shape of the starts that stand in front of the batch of cameras.
+    """
     parameters = task.known.parameters(R)
     evidence = task.evidence(parameters, more)
     basis = task.known.basis(begin)

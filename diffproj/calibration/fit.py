@@ -22,6 +22,8 @@ from diffproj.calibration.two_poses import found_again, settled
 
 MAX_REJECTION_ROUNDS = 10
 """Maximum number of rounds of outlier rejection."""
+HARDLY = 1e-6
+"""Variance that is added to that of a residual, relative to the noise: one that the pose takes up tells nothing."""
 WEIGHING_ROUNDS = (6, 3)
 """How often uncertain landmarks are weighed anew: where the pixels' noise is estimated, and where it is known."""
 
@@ -119,7 +121,7 @@ class Fit:
         """Number of residual components minus number of free parameters, `(P,)`; views count by their shares."""
         used = self.task.used
         shared = self.task.names if self.task.basis is None else range(self.task.basis.shape[-1])
-        spare = 2 * used.sum(-1) - POSE * used.any(-1)
+        spare = 2 * used.sum(-1) - (POSE - self.task.pose_known) * used.any(-1)
         spare = (spare if self.task.shares is None else spare * self.task.shares).sum(-1) - len(shared)
         return spare if self.task.restraint is None else spare + self.restrained
 
@@ -184,8 +186,8 @@ def fit(
 ) -> Fit:
     """Minimise; with `reject`, leave out corners whose residual exceeds that many robust std, and repeat.
 
-    A camera's robust std is 1.4826 times the median absolute residual component (Rousseeuw and Leroy 1987). At most
-    `MAX_REJECTION_ROUNDS` rounds are run.
+    A camera's robust std is 1.4826 times the median absolute residual component (Rousseeuw and Leroy 1987); where the
+    noise is known, that counts: see `inliers`. At most `MAX_REJECTION_ROUNDS` rounds are run.
     """
     with torch.inference_mode():  # a fifth faster where call overhead dominates; derivatives are added afterwards
         found = _fit(task, shared, local, reject, max_iterations, tolerance, progress)
@@ -207,7 +209,7 @@ def _fit(
     tolerance: float,
     progress: Progress | None,
 ) -> Fit:
-    given = inliers = task.used
+    given = near = task.used
     rounds = 1 if reject is None else 1 + MAX_REJECTION_ROUNDS
     total = rounds * max_iterations
 
@@ -225,8 +227,8 @@ def _fit(
             # Views left with fewer than four corners are no longer used; their pose is sought anew, they may come back.
             every = replace(task, used=given)
             solution = found_again(every, solution, ~task.used.any(-1))
-            inliers = _inliers(every, solution, reject)
-            kept = inliers & (inliers.sum(-1, keepdim=True) >= 4)
+            near = inliers(every, task.used, solution, reject)
+            kept = near & (near.sum(-1, keepdim=True) >= 4)
             changed = (kept != task.used).any(-1).any(-1)
             if not bool(changed.any()):
                 break
@@ -237,7 +239,7 @@ def _fit(
             iterations = iterations + torch.where(changed, again.iterations, 0)
     if progress is not None:
         progress(total, total)
-    return Fit(task, solution._replace(iterations=iterations), given & ~inliers)
+    return Fit(task, solution._replace(iterations=iterations), given & ~near)
 
 
 def normal_tensors(value: Any) -> Any:
@@ -250,15 +252,49 @@ def normal_tensors(value: Any) -> Any:
     return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
 
 
-def _inliers(task: Task, solution: Solution, limit: float) -> Tensor:
-    """Which of the given corners are inliers `(P, V, N)`, by their weighted residuals."""
-    residual = task.problem.linearise(solution.shared, solution.local)[:, :, -1]
+def inliers(task: Task, used: Tensor, solution: Solution, limit: float) -> Tensor:
+    """Which corners are inliers `(P, V, N)`, by their weighted residuals.
+
+    Where the noise is known, the limit is in its deviations; then of each view with more than four corners the one that
+    speaks most against the others is left out, too, and no more of them at a time: among few corners a wrong one makes
+    all residuals large, its own even less so than others' (Baarda 1968).
+
+    Args:
+        task: with all corners that may count.
+        used: those of them that the solution was found from `(P, V, N)`.
+        solution: the last.
+        limit: in standard deviations.
+    """
+    panel = task.problem.linearise(solution.shared, solution.local)
     if task.weights is not None:
-        residual = residual * task.weights.sqrt().unsqueeze(2)
+        panel = panel * task.weights.sqrt()[:, :, None, None]
+    residual = panel[:, :, -1]
     # With exact corners the residuals are rounding errors, none of which may count as an outlier.
     least = 1e-6 if task.objective == "image" else 1e-9 * float(task.points.abs().amax())
-    sigma = _robust_sigma(residual, task.used, task.shares).clamp(min=least)
-    return task.used & (residual.square().sum(2) <= (limit * sigma[:, None, None]).square())
+    known = task.known_noise and task.loss is None
+    sigma = _robust_sigma(residual, task.used, task.shares).clamp(min=1.0 if known else least)
+    near = residual.square().sum(2) <= (limit * sigma[:, None, None]).square()
+    if known:
+        size = _against_others(panel[:, :, -7:-1], residual, used)
+        worst = size == torch.where(used, size, -1.0).amax(-1, keepdim=True)
+        alone = ~used | (worst & (used.sum(-1, keepdim=True) > 4))
+        near = near & ~(alone & (size > limit**2))
+    return task.used & near
+
+
+def _against_others(by_pose: Tensor, residual: Tensor, used: Tensor) -> Tensor:
+    """The squares of residuals `(P, V, 2, N)` over their covariance, of noise 1 and a pose found from the used ones."""
+    rows = torch.where(used[:, :, None, None], by_pose, 0.0).flatten(-2)
+    W = rows @ rows.mT
+    size = W.diagonal(dim1=-2, dim2=-1)
+    scale = torch.where(size > 0, size, 1.0).rsqrt()
+    inverse = torch.linalg.pinv(W * scale.unsqueeze(-1) * scale.unsqueeze(-2), hermitian=True)
+    J = (by_pose * scale[..., None, None]).permute(0, 1, 4, 3, 2)  # (P, V, N, 2, 6)
+    taken = J @ inverse.unsqueeze(2) @ J.mT
+    identity = torch.eye(2, dtype=J.dtype, device=J.device)
+    C = identity + torch.where(used[..., None, None], -1.0, 1.0) * taken + HARDLY * identity
+    e = residual.mT.unsqueeze(-1)
+    return (e.mT @ torch.linalg.solve_ex(C, e)[0]).squeeze(-1).squeeze(-1).nan_to_num(0.0).clamp(min=0)
 
 
 def _robust_sigma(residual: Tensor, used: Tensor, shares: Tensor | None) -> Tensor:

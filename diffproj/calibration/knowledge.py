@@ -1,7 +1,7 @@
 """`Knowledge`: which parameters of a camera are to be found, which keep their values, and what is known of them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -66,6 +66,14 @@ class Knowledge:
         if self.tied:
             basis[:, 1, moving.index(0)] = (values[:, 1] / values[:, 0]).detach()
         return basis
+
+    def about(self, own: Tensor, batch: Sequence[int]) -> "Knowledge":
+        """The same with priors about these values `(P, q)`, of P cameras of batch shape `*B`, where none was said."""
+        told = [
+            replace(one, mean=own[:, list(one.where)].reshape(*batch, -1)) if one.mean is None else one
+            for one in self.priors
+        ]
+        return replace(self, priors=tuple(told))
 
     def prior(self, own: Tensor, batch: Sequence[int]) -> Prior:
         """The priors about the camera's own values `(P, q)`, with their graph; P cameras of this batch shape."""

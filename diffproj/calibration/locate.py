@@ -1,6 +1,7 @@
 """`locate`: where a known camera stood, from the corners of a target in each view."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Unpack
 
@@ -8,15 +9,18 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from diffproj._core.arguments import flag
+from diffproj._core.arguments import flag, words
 from diffproj._core.warn import warn_caller
 from diffproj.calibration import start
+from diffproj.calibration.adjustment import Adjustment
 from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.circle_centres import with_true_centres
+from diffproj.calibration.constraints import Priors
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit, fit
+from diffproj.calibration.known_poses import known_poses
 from diffproj.calibration.mismatch import CameraMismatchWarning, described
-from diffproj.calibration.options import LocateOptions, locate_options
+from diffproj.calibration.options import LocateOptions, Options, locate_options
 from diffproj.calibration.outcome import outcome
 from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.result import Calibration
@@ -43,6 +47,8 @@ def locate(
     target: Target,
     camera: Camera | PinholeCamera | Calibration,
     *,
+    fixed: Sequence[str] = (),
+    priors: Priors | None = None,
     same_target: bool = True,
     **options: Unpack[LocateOptions],
 ) -> Calibration:
@@ -62,8 +68,13 @@ def locate(
     Args:
         views: corners `(*B, V, N, 2)`.
         target: a board, `Landmarks`, or anything with `.points (N, 3)`.
-        camera: batch shape broadcasting to `*B`; its own pose does not matter. A calibration brings its uncertainty
-            along, and the noise of its corners, which few corners do not tell.
+        camera: batch shape broadcasting to `*B`; its own pose does not matter, but for what `fixed` and `priors` say. A
+            calibration brings its uncertainty along, and the noise of its corners, which few corners do not tell.
+        fixed: names of the pose that keep the camera's values in all views, as in `adjust`: `height`, `tilt`, `roll`,
+            `heading`, `position`, and so on, in the world of `Camera.mounted`, z up.
+        priors: what is known of the pose beforehand, by the same names, as in `adjust`: a standard deviation about the
+            camera's own value, or a tuple `(mean, standard deviation)`; numbers or tensors `(*B, V)`. It weighs against
+            the noise of the pixels: give `pixel_sigma` along with it.
         same_target: whether the views show the very target whose shape the calibration fitted, if it did and `target`
             has the same points: its corners then are where the calibration has them, as surely as it knows. Say False
             for another print of it.
@@ -78,7 +89,8 @@ def locate(
 
     Raises:
         TypeError: views are no `dp.Views`, the camera has a lens of another library, or an option is unknown.
-        ValueError: views, target and camera do not fit together, or the image is turned against a tilted sensor.
+        ValueError: views, target and camera do not fit together, the image is turned against a tilted sensor, or names
+            or values of `fixed` and `priors` that cannot be.
         CalibrationError: no pose explains a view.
 
     Example:
@@ -89,7 +101,12 @@ def locate(
         0.16
     """
     shaped = camera if flag("same_target", same_target) else None
-    found = with_true_centres(lambda moved: located(moved, target, camera, shaped, **options), views, target)
+    known = {"fixed": words("fixed", fixed, "several names"), "priors": priors}
+
+    def find(moved: Views) -> Calibration:
+        return located(moved, target, camera, shaped, **known, **options)
+
+    found = with_true_centres(find, views, target)
     if isinstance(target, Chessboard | CircleGrid) and target.turns > 1:
         warn_caller(f"locate: {origin_doubt(target)}")
     if bool(found.ambiguous.any()):
@@ -104,12 +121,17 @@ def located(
     target: Target,
     camera: Camera | PinholeCamera | Calibration,
     shaped: object = None,
+    *,
+    fixed: Sequence[str] = (),
+    priors: Priors | None = None,
     **options: Unpack[LocateOptions],
 ) -> Calibration:
     """The same without a warning; `shaped` may be a calibration that fitted the shape of this target."""
     if isinstance(views, Camera | PinholeCamera | Calibration):
         raise TypeError("locate: want (views, target, camera) in this order, got the camera first")
     chosen = locate_options(options)
+    if fixed or priors is not None:
+        return _with_knowledge(views, target, camera, shaped, chosen, fixed, priors)
     data = Data(views, target, chosen.weights, chosen.pixel_sigma)
     calibration = camera if isinstance(camera, Calibration) else None
     if isinstance(camera, Calibration):
@@ -160,6 +182,31 @@ def located(
     )
     found = Fit(task, joined, rejected)
     return outcome("locate", data, found, camera.size or views.size, chosen.throw, calibration)
+
+
+def _with_knowledge(
+    views: Views,
+    target: Target,
+    camera: Camera | PinholeCamera | Calibration,
+    shaped: object,
+    chosen: Options,
+    fixed: Sequence[str],
+    priors: Priors | None,
+) -> Calibration:
+    """The poses with what is known of them, from those that the corners alone tell."""
+    data = Data(views, target, chosen.weights, chosen.pixel_sigma)
+    calibration = camera if isinstance(camera, Calibration) else None
+    if isinstance(shaped, Calibration) and shaped.shape != "flat":
+        raise ValueError(
+            "fixed, priors: want a calibration with a flat target, got one that fitted the target's shape; pass "
+            "same_target=False, or calibration.camera"
+        )
+    posed: Camera | PinholeCamera = camera.camera if isinstance(camera, Calibration) else camera
+    if isinstance(camera, Adjustment):
+        posed = camera.cameras[..., 0]
+    options = vars(chosen.but(throw=False))
+    alone = located(views, target, posed if calibration is None else calibration, **options)
+    return known_poses(data, as_camera(posed).upright(), alone, calibration, chosen, fixed, priors)
 
 
 def _joined(equations: Equations, seen: Tensor) -> Equations:

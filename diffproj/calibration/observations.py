@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.arguments import Array, number, tensor_of
+from diffproj._core.arguments import Array, first_of, number, tensor_of
 from diffproj._core.numerics import broadcast_batches, in_float64
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.observation import (
@@ -72,8 +72,9 @@ class Seen(Observed):
             raise ValueError(f"landmarks: want points (N, 3), or (N, 2) on z = 0, got shape {tuple(given.shape)}")
         points = valued("landmarks", given)
         points = torch.nn.functional.pad(points, (0, 3 - points.shape[-1]))
-        if not bool(points.detach().isfinite().all()):
-            raise ValueError("landmarks: want finite coordinates, got others")
+        lost = ~points.detach().isfinite().all(-1)
+        if bool(lost.any()):
+            raise ValueError(f"landmarks: want finite coordinates, got {first_of(points, lost)}")
         pixels = valued("pixels", pixels, "N", 2)
         if pixels.shape[-2] != len(points):
             raise ValueError(f"pixels: want one for each of {len(points)} landmarks, got {pixels.shape[-2]}")

@@ -30,7 +30,7 @@ class Positions(Copied, Shown):
     @property
     def deviations(self) -> Float[Tensor, "*batch v 3"]:
         """Standard deviations of x, y and z `(*B, V, 3)` in world units."""
-        return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()  # of what was held, rounding is left
 
     def to_dict(self) -> dict[str, list[Any]]:
         """The positions as columns of Python's own numbers, of many cameras one after the other, for `pandas`."""

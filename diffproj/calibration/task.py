@@ -44,6 +44,7 @@ class Task:
         loss: a robust loss, or `None` for least squares.
         prior: on the shared parameters.
         basis: of the shared parameters' free directions `(P, s, q)`, or `None` for all.
+        pose_known: how many of the six coordinates of each pose are held, or known beforehand.
         printed: precision of each displacement of free points `(P, 3 N)`, in the unit of the weights; `None` for 0.
     """
 
@@ -64,6 +65,7 @@ class Task:
     prior: Prior | None = None
     basis: Tensor | None = None
     printed: Tensor | None = None
+    pose_known: int = 0
 
     @property
     def solid(self) -> bool:

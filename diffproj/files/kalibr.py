@@ -5,6 +5,7 @@ height. `T_cam_imu` takes IMU to camera, so the world is the IMU; without it, `T
 this one, and the world is the first camera. `T_imu_cam`, `T_BS` and `body_T_cam0` run the other way.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,9 @@ def read(document: Document) -> Found:
         ValueError: a camera that is neither `pinhole` nor ours, or poses of only some.
     """
     cameras = _cameras(document.mapping)
+    for name, fields in document.mapping.items():
+        if isinstance(fields, dict) and re.fullmatch(r"cam\d+", str(name)) and name not in cameras:
+            raise ValueError(f"{name}: want intrinsics, with a camera_model or distortion_model, got none")
     poses = _poses(cameras)
     return Found({name: _camera(name, fields, poses.get(name)) for name, fields in cameras.items()})
 

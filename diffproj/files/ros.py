@@ -2,7 +2,8 @@
 
 `K` and `D` hold for raw images: they are the camera that is found. `P` holds for rectified images, which have no lens:
 asked for by the name `"rectified"`, its left 3 x 3 numbers are K, and its last column is K t, from the left camera of a
-stereo pair. `rectification_matrix` is no pose. Integer pixel centres.
+stereo pair. `rectification_matrix` is no pose. Integer pixel centres. Without a `distortion_model`, five
+coefficients are those of plumb_bob, as ROS's own reader has it.
 """
 
 import re
@@ -21,7 +22,7 @@ from diffproj.geometry.camera import Camera
 
 MATRIX, LENS, RECTIFIED = (
     ("camera_matrix", "K", "k"),
-    ("distortion_coefficients", "D", "d"),
+    ("distortion_coefficients", "D", "d", "distortion_coefficents"),
     ("projection_matrix", "P", "p"),
 )
 COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
@@ -84,6 +85,8 @@ def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
 
 
 def _camera(fields: dict[str, Any]) -> Found:
+    if "distortion_model" not in fields and _of_old(fields):
+        fields = {**fields, "distortion_model": "plumb_bob"}
     wanted = (MATRIX, LENS, ("distortion_model",))
     missing = [names[0] for names in wanted if _first(fields, names) in (None, ("distortion_model", ""))]
     if missing:
@@ -106,6 +109,12 @@ def _camera(fields: dict[str, Any]) -> Found:
             K_rectified = intrinsics("projection_matrix", P[:, :3])
             aside["rectified"] = camera_of(K_rectified, None, size, (np.eye(3), np.linalg.solve(K_rectified, P[:, 3])))
     return Found({"camera": camera_of(K, lens_of(kind, found), size)}, aside)
+
+
+def _of_old(fields: dict[str, Any]) -> bool:
+    """Whether the lens has the five numbers of plumb_bob, which files had before models were named."""
+    found = _first(fields, LENS)
+    return found is not None and matrix(*found).size == 5
 
 
 def _first(fields: dict[str, Any], names: tuple[str, ...]) -> Any:

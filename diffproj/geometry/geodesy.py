@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.arguments import Array, called
+from diffproj._core.arguments import Array, called, first_of
 from diffproj._core.numerics import check_tensor
 
 WGS84 = "EPSG:4326"
@@ -46,10 +46,11 @@ def metres_from_degrees(
     """
     degrees = _checked("degrees", degrees)
     latitude, longitude = degrees[..., 0], degrees[..., 1]
-    if not bool(((latitude.abs() <= 90) & (longitude.abs() <= 360)).all()):
+    wrong = ~((latitude.abs() <= 90) & (longitude.abs() <= 360))
+    if bool(wrong.any()):
         raise ValueError(
-            "degrees: want latitudes from -90 to 90, then longitudes from -360 to 360, got others; are they exchanged, "
-            "or metres already?"
+            "degrees: want latitudes from -90 to 90, then longitudes from -360 to 360, got "
+            f"{first_of(degrees, wrong)}; are they exchanged, or metres already?"
         )
     if crs is None:
         first = longitude.flatten()[:1]  # The middle is near the points on either side of the date line too.

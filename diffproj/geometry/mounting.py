@@ -152,7 +152,8 @@ class Mounted(CameraParts):
         """Height, tilt, roll, heading and position of the camera: what `mounted` took.
 
         Where it looks straight down or up, heading and roll turn it about the same axis: the roll is 0 then, and the
-        heading that of the picture's top. An image that is turned counts as taken by a camera that is (`upright`).
+        heading that of the picture's top. Where it leans beyond the vertical, by 1 degree say, the tilt is 89
+        and roll and heading are half a turn further. A turned image counts as taken by a turned camera (`upright`).
 
         Raises:
             TypeError: the image is turned, behind a lens of another package.

@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from diffproj._core.arguments import Array
+from diffproj._core.arguments import Array, first_of
 from diffproj._core.numerics import check_tensor
 from diffproj._core.warn import warn_caller
 from diffproj.calibration import ambiguity, mismatch
@@ -150,8 +150,9 @@ def _expands(shape: Sequence[int], to: Sequence[int]) -> bool:
 
 
 def _check_deviations(given: Tensor) -> None:
-    if not bool(((given >= 0) & given.isfinite()).all()):
-        raise ValueError("pixel_sigma: want finite standard deviations of at least 0, got others")
+    wrong = ~((given >= 0) & given.isfinite())
+    if bool(wrong.any()):
+        raise ValueError(f"pixel_sigma: want finite standard deviations of at least 0, got {first_of(given, wrong)}")
 
 
 def _root2(covariance: Tensor) -> Tensor:
@@ -159,9 +160,12 @@ def _root2(covariance: Tensor) -> Tensor:
     seen = covariance.detach()
     size = seen.abs().amax((-2, -1))
     a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    even = seen.isfinite().all() and bool(((seen - seen.mT).abs().amax((-2, -1)) <= 1e-6 * size).all())
-    if not even or bool(((a < 0) | (c < 0) | (a * c - b * b < -1e-6 * size.square())).any()):
-        raise ValueError("pixel_sigma: want symmetric covariances without negative eigenvalues, got others")
+    even = size.isfinite() & ((seen - seen.mT).abs().amax((-2, -1)) <= 1e-6 * size)
+    wrong = ~even | (a < 0) | (c < 0) | (a * c - b * b < -1e-6 * size.square())
+    if bool(wrong.any()):
+        raise ValueError(
+            f"pixel_sigma: want symmetric covariances without negative eigenvalues, got {first_of(seen, wrong)}"
+        )
     first = torch.where(a > 0, torch.where(a > 0, a, 1.0).sqrt(), 0.0)
     across = torch.where(a > 0, b / torch.where(a > 0, first, 1.0), 0.0)
     rest = c - across.square()

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.arguments import Array, called, listing, tensor_of
+from diffproj._core.arguments import Array, called, first_of, listing, tensor_of
 from diffproj._core.copying import Copied
 from diffproj._core.numerics import check_tensor, in_float64
 from diffproj._core.shown import Shown
@@ -104,7 +104,7 @@ def _check_values(points: Tensor) -> None:
         raise ValueError("points: want at least 1, got none")
     lost = ~points.isfinite().all(-1)
     if bool(lost.any()):
-        raise ValueError(f"points: want finite coordinates, got others in row {int(lost.nonzero()[0])}")
+        raise ValueError(f"points: want finite coordinates, got {first_of(points, lost)}")
     spread = points.amax(0) - points.amin(0)
     extent, size = float(spread.amax()), float(points.abs().amax())
     if torch.finfo(points.dtype).eps * size > FINEST * extent > 0:
@@ -148,13 +148,18 @@ def _covariances(sigma: Any, points: Tensor) -> Tensor:
     shape = tuple(given.shape)
     if shape == (count, 3, 3):
         size = given.detach().abs().amax((-2, -1), keepdim=True)
-        even = given.isfinite().all() and bool(((given - given.mT).abs() <= 1e-9 * size).all())
-        if not even or bool((torch.linalg.eigvalsh(given.detach()) < -1e-9 * size.squeeze(-1)).any()):
-            raise ValueError("sigma: want symmetric covariances without negative eigenvalues, got others")
+        even = ((given - given.mT).abs() <= 1e-9 * size).all(-1).all(-1)  # not where some are not finite
+        values = torch.linalg.eigvalsh(torch.where(even[:, None, None], given.detach(), 0.0))
+        wrong = ~even | (values < -1e-9 * size.squeeze(-1)).any(-1)
+        if bool(wrong.any()):
+            raise ValueError(
+                f"sigma: want symmetric covariances without negative eigenvalues, got {first_of(given, wrong)}"
+            )
         return (given + given.mT) / 2
     if shape not in ((), (count,), (count, 3)):
         raise ValueError(f"sigma: want a number, or shape ({count},), ({count}, 3) or ({count}, 3, 3), got {shape}")
-    if not bool(((given >= 0) & (given < math.inf)).all()):
-        raise ValueError("sigma: want finite standard deviations of at least 0, got others")
+    wrong = ~((given >= 0) & (given < math.inf))
+    if bool(wrong.any()):
+        raise ValueError(f"sigma: want finite standard deviations of at least 0, got {first_of(given, wrong)}")
     each = given.unsqueeze(-1) if shape == (count,) else given
     return torch.diag_embed(each.square().expand(count, 3)).clone()

@@ -313,6 +313,23 @@ def test_what_is_lacking_is_named(pieces: str, options: dict[str, Any], text: st
     assert bool(lost.covariance.undetermined_views.all() | lost.covariance.undetermined.any())
 
 
+def test_a_camera_that_may_look_straight_down_says_how_it_is_told() -> None:
+    """It leans beyond the vertical by 0.2 degrees: tilt folds back, and heading and roll are half a turn further."""
+    leaning = made(tilt_deg=89.8, roll_deg=180.0, heading_deg=210.0, height=60.0)
+    points = torch.tensor([[20.0, 10, 0], [-15, 12, 1], [10, -18, 2], [-12, -14, 0], [1, 2, 0.5]], dtype=D)
+    down = made(tilt_deg=90.0, roll_deg=0.0, heading_deg=30.0, height=60.0)
+    found = dp.adjust(down, dp.Seen(points, seen(leaning, points)), fixed=("heading",))
+    assert float(found.mounting.tilt) == pytest.approx(89.8, abs=1e-6)
+    assert float(found.mounting.heading) == pytest.approx(210.0, abs=1e-6)
+    assert "half a turn further" in found.summary()
+
+
+def test_fewer_residuals_than_unknowns_end_soon() -> None:
+    with pytest.raises(dp.CalibrationError, match="the evidence does not tell them apart") as caught:
+        dp.adjust(START, dp.Seen(LANDMARKS[:2], seen()[:2]))
+    assert int(caught.value.calibration.iterations) <= 30  # type: ignore[union-attr]
+
+
 def test_contradictions_are_named() -> None:
     wrong = seen() + torch.tensor([8.0, -5.0], dtype=D) * torch.tensor([1.0, -1, 1, -1, 1, -1], dtype=D).unsqueeze(-1)
     found = dp.adjust(START, [dp.Seen(LANDMARKS, wrong, 0.5), dp.Horizon([[327.13, 20.82], [854.16, 39.22]], 3.0)])

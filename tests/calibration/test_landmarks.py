@@ -186,6 +186,28 @@ def test_a_focal_length_known_to_a_tenth_is_told() -> None:
     assert "times what pixel_sigma says" in known.message
 
 
+@pytest.mark.parametrize(
+    ("center", "known", "value", "deviation"),
+    [
+        ((959.5, 539.5), {}, 1423.90, 159.42),
+        ((960.0, 540.0), {}, 1422.72, 159.17),
+        # As a measurement of both focal lengths, which are one, and of one of them: 50 / sqrt(2), or 50.
+        ((959.5, 539.5), {"priors": {"focal": (1550.0, 50.0)}}, 1499.55, 27.79),
+        ((959.5, 539.5), {"priors": {"f_x": (1550.0, 50.0)}}, 1476.31, 32.76),
+    ],
+)
+def test_a_river_on_one_plane_is_what_scipy_finds(
+    center: tuple[float, float], known: dict[str, object], value: float, deviation: float
+) -> None:
+    """Focal length and pose by `scipy.optimize.least_squares` from the same pixels, and its Jacobian's covariance."""
+    noise = {"pixel_sigma": 3.0} if known else {}
+    camera = camera_of(1550, 1550, *center, (1920, 1080))
+    held = {"tied_focal": True, "fixed": ("principal_point",)}
+    found = dp.refine(seen(RIVER_PIXELS, (1920, 1080)), RIVER, camera, **held, **noise, **known).to_dict()  # type: ignore
+    assert found["f_x"] == pytest.approx(value, abs=0.01)
+    assert found["f_x_deviation"] == pytest.approx(deviation, abs=0.02)
+
+
 # ----------------------------------------------------------------------------------------------------- random scenes
 
 K = T([[1000.0, 0, 639.5], [0, 1000, 479.5], [0, 0, 1]])
@@ -380,6 +402,8 @@ def test_other_mistakes_are_named() -> None:
         dp.refine(views, dp.Landmarks(points), camera, shape="bow")
     with pytest.raises(ValueError, match="pixel_sigma, weights: want one of the two"):
         dp.locate(views, dp.Landmarks(points), camera, pixel_sigma=1.0, weights=1.0)
+    with pytest.raises(ValueError, match=r"pixel_sigma: want standard deviations in px from .*, got -2 at \(0, 3\)"):
+        dp.locate(views, dp.Landmarks(points), camera, pixel_sigma=T([1, 1, 1, -2, 1, 1, 1, 1]))
     with pytest.raises(ValueError, match="plane_residuals|points on z = 0"):
         dp.plane_residuals(camera[None], views, dp.Landmarks(points))
 

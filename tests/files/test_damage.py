@@ -286,6 +286,7 @@ def test_what_nerfstudio_has_and_we_do_not(tmp_path: Path, change: tuple[str, st
         ("camchain.yaml", ("camera_model: pinhole", "camera_model: ds"), "want pinhole, got 'ds'"),
         ("camchain.yaml", ("distortion_model: radtan", "distortion_model: fov"), "got 'fov', which is neither"),
         ("camchain.yaml", ("  distortion_model: radtan\n", ""), "want a distortion_model, got none"),
+        ("camchain.yaml", ("intrinsics: [458", "intrinsic: [458"), "cam0: want intrinsics"),
         ("camchain.yaml", ("T_cn_cnm1", "T_cn_x"), "want T_cam_imu or T_imu_cam as the pose"),
         ("camchain.yaml", ("1.76187114e-05]", "1.76187114e-05, 0.1, 0.2]"), "want 4 coefficients of radtan"),
         ("calib.txt", ("P2:", "P1:"), "P1: want the line once"),

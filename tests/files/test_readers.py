@@ -177,6 +177,22 @@ def test_ros_models(tmp_path: Path, model: str, count: int, kind: str) -> None:
     assert type(lens) is (dp.BrownConrady if kind == "brown" else dp.KannalaBrandt)
 
 
+def test_ros_files_of_before_models_were_named(tmp_path: Path) -> None:
+    """Five coefficients are those of plumb_bob; so are they under a misspelt name. Four may be of a fisheye lens."""
+    path = tmp_path / "ost.yaml"
+    path.write_text(ROS)
+    want = dp.load_camera(path)
+    for text in (
+        ROS.replace("distortion_model: plumb_bob\n", ""),
+        ROS.replace("distortion_coefficients", "distortion_coefficents"),
+    ):
+        assert text != ROS
+        path.write_text(text)
+        found = dp.load_camera(path)
+        assert torch.equal(found.distortion.coefficients, want.distortion.coefficients)  # type: ignore[union-attr]
+        assert torch.equal(found.K, want.K)
+
+
 def test_ros_ini_says_the_same_as_yaml(tmp_path: Path) -> None:
     camera = load(tmp_path, "ost.txt")
     assert numbers(camera)[0] == [369.344588, 367.154330, 320.739078, 203.592450]

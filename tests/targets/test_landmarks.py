@@ -55,7 +55,7 @@ def test_the_line_is_short() -> None:
     [
         (np.zeros((0, 3)), "want at least 1, got none"),
         (np.zeros((4, 4)), r"want shape \(N, 3\), or \(N, 2\) for points on z = 0, got \(4, 4\)"),
-        ([[0, 0, np.nan]] + [[1.0, 2.0, 3.0]] * 3, "want finite coordinates, got others in row 0"),
+        ([[0, 0, np.nan]] + [[1.0, 2.0, 3.0]] * 3, "want finite coordinates, got \\[0.0, 0.0, nan\\] at 0"),
         (
             np.array(SQUARE, dtype=np.float32) + np.float32(642735),
             "want float64 so far from the origin, got float32, which holds 6.43e[+]05 only to 0.04",
