@@ -4,7 +4,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import mounting  # beside this file
+import measuring_page  # beside this file, as the next one
+import mounting
 
 import diffproj as dp
 from diffproj import figures
@@ -17,6 +18,7 @@ pictures = {
     "fig7.png": figures.png(figures.fig7(experiment), dpi=80),
     "mounting.png": figures.png(mounting.figure(), dpi=80),
     "accuracy.png": figures.png(figures.accuracy(dp.AccuracyMap.over_image(calibration, view=0), unit="mm"), dpi=90),
+    **measuring_page.pictures(calibration),
 }
 folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
 for name, content in pictures.items():
