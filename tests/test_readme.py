@@ -62,6 +62,7 @@ def folder(example: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) ->
         seen, _ = calibration.cameras[3].project(places)
         lines = [",".join(map(str, numbers)) for numbers in torch.cat([seen, places], dim=-1).tolist()]
         (folder / name).write_text("\n".join(["u,v,x,y,z", *lines]))
+    shutil.copytree(folder / "photos", folder / "cameras" / "a")
     dp.save_camera(folder / "camera.json", calibration)
     dp.save_camera(folder / "camera.yaml", calibration)
     two = calibration.cameras[:2]
