@@ -148,6 +148,8 @@ __all__ = [
     "rotation_from_euler",
     "run_experiment",
     "save_camera",
+    "write_measuring_page",
+    "write_report",
 ]
 
 

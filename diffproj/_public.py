@@ -82,6 +82,8 @@ from diffproj.paper.experiment import run_experiment as run_experiment
 from diffproj.paper.route import paper_route as paper_route
 from diffproj.paper.setup import PaperSetup as PaperSetup
 from diffproj.paper.setup import paper_setup as paper_setup
+from diffproj.report.measuring_file import write_measuring_page as write_measuring_page
+from diffproj.report.write import write_report as write_report
 from diffproj.targets import synthetic as synthetic
 from diffproj.targets.april_grid import AprilGrid as AprilGrid
 from diffproj.targets.charuco import CharucoBoard as CharucoBoard

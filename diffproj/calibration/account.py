@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -134,14 +135,21 @@ class Account(Shown):
         Raises:
             ValueError: there are many cameras.
         """
+        return str(self.judgement).replace("?.", "?")
+
+    @cached_property
+    def judgement(self) -> advice.Judgement:
+        """The verdict in its parts: the word, the reasons, what to photograph next.
+
+        Raises:
+            ValueError: there are many cameras.
+        """
         if self.views.batch_shape:
             raise ValueError(f"verdict: want one camera, got batch shape {tuple(self.views.batch_shape)}; see message")
         if self.status:
-            return f"Not usable: {self._ends()[0]}."
+            return advice.Judgement("Not usable", (self._ends()[0],))
         if self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics):
-            return f"Poses only, the camera was given: {self.doubts or 'nothing speaks against them'}.".replace(
-                "?.", "?"
-            )
+            return advice.Judgement(advice.POSES_ONLY, (self.doubts or "nothing speaks against them",))
         used = self.used.any(-1)
         unsure = None
         if self.has_covariance:
@@ -150,7 +158,7 @@ class Account(Shown):
         if self.landmarks is not None:
             spare = None if self.degrees_of_freedom is None else float(self.degrees_of_freedom)
             return advice.of_landmarks(int(self.used.any(0).sum()), unsure, self._scatter, spare, self.remarks[0])
-        text = advice.verdict(
+        found = advice.judged(
             advice.Evidence(
                 self.cameras,
                 used,
@@ -164,9 +172,11 @@ class Account(Shown):
             )
         )
         if self.displacements is None:
-            return text
+            return found
         off = float(self.displacements.square().sum(-1).mean().sqrt())
-        return f"{text} As printed, the target's points lie {off:.2g} world units (RMS) off their nominal places."
+        return replace(
+            found, note=f"As printed, the target's points lie {off:.2g} world units (RMS) off their nominal places."
+        )
 
     @property
     def _scatter(self) -> float:

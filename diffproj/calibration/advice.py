@@ -36,6 +36,7 @@ ODD = 3.0
 """Times the median RMS of all views from which on a view is named."""
 OTHER_LENS = "another lens"
 """What a remark says of residuals that another lens would explain."""
+POSES_ONLY = "Poses only, the camera was given"
 ACROSS, DOWN = ("left", "", "right"), ("top", "", "bottom")
 
 
@@ -72,8 +73,42 @@ class Evidence:
         return OTHER_LENS in self.remarks
 
 
-def verdict(seen: Evidence) -> str:
-    """Good or weak, why, and what to photograph next, in two or three sentences."""
+@dataclass(frozen=True)
+class Judgement:
+    """A verdict in its parts.
+
+    Attributes:
+        word: `Good`, `Weak` or `Not usable`; or `POSES_ONLY`.
+        reasons: why, in a few words each.
+        remedies: what to do next, the most useful first; for a good calibration, what would make it better still.
+        bare: the ninths of the image that hardly a corner reached, such as `top left`.
+        tilt: whether the board should be photographed tilted more, or about its other axis.
+        views: how many more photographs it should have at least.
+        note: what else is to be known.
+    """
+
+    word: str
+    reasons: tuple[str, ...]
+    remedies: tuple[str, ...] = ()
+    bare: tuple[str, ...] = ()
+    tilt: bool = False
+    views: int = 0
+    note: str = ""
+
+    @property
+    def good(self) -> bool:
+        """Whether it is known well."""
+        return self.word == "Good"
+
+    def __str__(self) -> str:
+        text = f"{self.word}: {'; '.join(self.reasons)}"
+        if self.remedies:
+            text += f". {'Better still' if self.good else 'Next'}: {'; '.join(self.remedies)}"
+        return f"{text}. {self.note}".rstrip()
+
+
+def judged(seen: Evidence) -> Judgement:
+    """Good or weak, why, and what to photograph next."""
     normals = seen.cameras.R[seen.used][..., 2].detach()
     tilt = float(torch.rad2deg(normals[:, 2].abs().clamp(max=1).acos()).amax())
     covered = _covered(seen)
@@ -81,10 +116,11 @@ def verdict(seen: Evidence) -> str:
     one_axis = tilt >= LOW_TILT and seen.different >= 2 and _second_spread(normals) < ONE_AXIS
     if seen.other_lens:
         remedies.append("no photograph yet, but the lens model that the remark on the residuals names")
-    if seen.different < FEW_VIEWS:
-        more = ENOUGH_VIEWS - round(seen.different)
+    more = ENOUGH_VIEWS - round(seen.different) if seen.different < FEW_VIEWS else 0
+    if more:
         remedies.append(f"{more} more photographs, the board at other places, distances and tilts")
-    if tilt < LOW_TILT or (seen.unsure is not None and seen.unsure > UNSURE and not seen.other_lens):
+    tilted = tilt < LOW_TILT or (seen.unsure is not None and seen.unsure > UNSURE and not seen.other_lens)
+    if tilted:
         remedies.append("the board tilted by 20 to 50 degrees, about both axes")
     elif one_axis:
         remedies.append("the board tilted about its other axis too")
@@ -96,13 +132,11 @@ def verdict(seen: Evidence) -> str:
     odd = _odd(seen)
     if odd:
         remedies.append(f"another look at {_listed(odd)}, whose corners fit far worse than the others'")
-    text = f"Weak: {'; '.join(faults)}" if faults else f"Good: {_praise(seen, tilt, covered)}"
-    if remedies:
-        text += f". {'Next' if faults else 'Better still'}: {'; '.join(remedies)}"
-    return text + "."
+    word, reasons = ("Weak", faults) if faults else ("Good", _praise(seen, tilt, covered))
+    return Judgement(word, tuple(reasons), tuple(remedies), tuple(bare), tilted or one_axis, more)
 
 
-def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | None, remarks: str) -> str:
+def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | None, remarks: str) -> Judgement:
     """The same of a camera that was calibrated on so many landmarks.
 
     Args:
@@ -123,9 +157,9 @@ def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | 
     if OTHER_LENS in remarks:
         faults.append("this lens model does not fit the lens")
     if not faults:
-        known = f"; focal length and principal point are known to {100 * unsure:.1g} %" if unsure else ""
-        return f"Good: {count} landmarks are met to {sigma:.2g} px in each coordinate{known}."
-    return f"Weak: {'; '.join(faults)}." + f" Next: {'; '.join(dict.fromkeys(remedies))}." * bool(remedies)
+        known = [f"focal length and principal point are known to {100 * unsure:.1g} %"] if unsure else []
+        return Judgement("Good", (f"{count} landmarks are met to {sigma:.2g} px in each coordinate", *known))
+    return Judgement("Weak", tuple(faults), tuple(dict.fromkeys(remedies)))
 
 
 def _percent(part: float) -> str:
@@ -159,12 +193,12 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
     return faults
 
 
-def _praise(seen: Evidence, tilt: float, covered: Tensor | None) -> str:
+def _praise(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
     where = "" if covered is None else f", cover {100 * float(covered.nanmean()):.0f} % of the image"
-    text = f"{round(seen.different)} views differ{where} and are tilted by up to {tilt:.0f} degrees"
+    praise = [f"{round(seen.different)} views differ{where} and are tilted by up to {tilt:.0f} degrees"]
     if seen.unsure:
-        text += f"; focal lengths and principal point are known to {100 * seen.unsure:.1g} % of the focal length"
-    return f"{text}; corners scatter by {seen.sigma:.2g} px in each coordinate"
+        praise.append(f"focal lengths and principal point are known to {100 * seen.unsure:.1g} % of the focal length")
+    return [*praise, f"corners scatter by {seen.sigma:.2g} px in each coordinate"]
 
 
 def _covered(seen: Evidence) -> Tensor | None:

@@ -8,6 +8,7 @@ from typing import get_args
 from diffproj.calibration.shape_names import Shape
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import add_orientation, camera_file, some_path
+from diffproj.cli.reporting import report_file
 from diffproj.cli.which_board import add_kinds, add_measures, check_board
 from diffproj.lens.names import LensModel
 
@@ -26,6 +27,7 @@ hidden files and those that are no photographs. Copies count once.
 EPILOG = """\
 examples:
   diffproj calibrate photos/ --board 9x6 --square 25mm
+  diffproj calibrate photos/ --board 9x6 --square 25mm --report report.html
   diffproj calibrate left*.jpg --board 9x6 --square 25mm -o camera.yaml
   diffproj calibrate wide/ --board 11x8 --square 3cm --distortion auto \\
       --draw wide.png
@@ -99,6 +101,13 @@ def add_options(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="draw where in the image the corners lie and how far off they are: a .png, .svg or .pdf, replaced if "
         "there is one",
+    )
+    file.add_argument(
+        "--report",
+        type=report_file,
+        metavar="FILE",
+        help="write a report: one .html file for any browser, with the verdict, what to photograph next, the "
+        "photographs with their corners, residuals, lens, accuracy and views held out; replaced if there is one",
     )
     command.set_defaults(work="calibrating", check=functools.partial(_check_together, command))
 

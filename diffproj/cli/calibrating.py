@@ -12,6 +12,7 @@ from diffproj.calibration.result import Calibration
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
 from diffproj.cli.inputs import check_writable, writing
 from diffproj.cli.photographs import find_corners, photographs
+from diffproj.cli.reporting import check_report, report_text, write_page
 from diffproj.cli.terminal import RESULTS, aligned, in_options, progress_bars, result, rounded
 from diffproj.cli.which_board import given_board
 from diffproj.files.save import save_camera
@@ -21,6 +22,7 @@ def run(options: argparse.Namespace) -> int:
     """Run the command."""
     check_writable("--output", options.output)
     check_drawing(options.draw)
+    check_report(options.report)
     board, side, _ = given_board(options)
     sources = photographs(options.photographs)
     check_no_photograph(options.draw, sources)
@@ -47,12 +49,16 @@ def run(options: argparse.Namespace) -> int:
         from diffproj import figures  # here, for it loads matplotlib
 
         write_drawing(options.draw, figures.corners(calibration))
+    page = report_text(calibration, options, sources, board)
     with writing("--output", options.output):
         save_camera(options.output, calibration)
     lost = "; the unit, the poses and the error bars are read from a .json file only"
     result(f"\nWritten to {options.output}{'' if options.output.suffix.lower() == '.json' else lost}")
     if options.draw is not None:
         result(f"Drawn to {options.draw}")
+    if page:
+        write_page(options.report, page)
+        result(f"Report in {options.report}, for any browser")
     return 0
 
 

@@ -5,6 +5,7 @@ import functools
 
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import DETECTOR, HAND, LARGEST_NUMBER, add_orientation, numbers, some_path
+from diffproj.cli.measure_page import page_file
 from diffproj.cli.units import Length, height
 from diffproj.cli.which_board import add_kinds, add_measures, check_board
 
@@ -48,6 +49,8 @@ examples:
   diffproj measure --camera camera.json --view left01.jpg \\
       --points 210,133 402,140
   diffproj measure --camera located.json --view mast.jpg --points 2000,1000
+  diffproj measure photo.jpg --camera camera.json --board 9x6 --square 25mm \\
+      --page measure.html
   diffproj measure photo.jpg --camera camera.yaml --board 9x6 --square 25mm \\
       --points-file points.csv --height 12 --pixel-sigma 0.7 --csv > box.csv
 
@@ -63,7 +66,8 @@ def add_options(command: argparse.ArgumentParser) -> None:
     command.usage = (
         "%(prog)s PHOTO --camera FILE --board CxR --square SIDE\n"
         "                        --points u,v ... [options]\n"
-        "       %(prog)s --camera FILE --view NAME --points u,v ... [options]"
+        "       %(prog)s --camera FILE --view NAME --points u,v ... [options]\n"
+        "       %(prog)s PHOTO --camera FILE (--view NAME | --board ...) --page F"
     )
     photograph = command.add_argument(
         "photograph", type=some_path, metavar="PHOTO", help="the photograph, with --board; --view needs none"
@@ -78,14 +82,14 @@ def add_options(command: argparse.ArgumentParser) -> None:
         help="the camera file, in any format that 'diffproj info' reads. A .json from 'diffproj calibrate' brings the "
         "camera's own uncertainty along; other programs' files do not (required)",
     )
-    pixels = command.add_mutually_exclusive_group(required=True)
+    pixels = command.add_mutually_exclusive_group()
     pixels.add_argument(
         "--points",
         type=_pixel,
         nargs="+",
         action="extend",
         metavar="u,v",
-        help="the pixels to measure, in order (these or --points-file)",
+        help="the pixels to measure, in order (these, --points-file or --page)",
     )
     pixels.add_argument(
         "--points-file",
@@ -131,6 +135,13 @@ def add_options(command: argparse.ArgumentParser) -> None:
         help="draw the board's corners and axes, the points and the lengths into the photograph: a .png, .svg or .pdf, "
         "replaced if there is one",
     )
+    more.add_argument(
+        "--page",
+        type=page_file,
+        metavar="FILE",
+        help="write an .html page in which anyone measures in PHOTO by clicks, offline, with these error bars; with "
+        "--view PHOTO is that view's photograph",
+    )
     command.set_defaults(work="measuring", check=functools.partial(_check_which_pose, command))
 
 
@@ -164,7 +175,11 @@ def _pixel_sigma(text: str) -> float | str:
 
 def _check_which_pose(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Check that a photograph comes with its board, and a view alone."""
-    if options.view is not None and options.photograph is not None:
+    if options.points is None and options.points_file is None and options.page is None:
+        command.error("one of the arguments --points --points-file --page is required")
+    if options.view is not None and options.photograph is None and options.page is not None:
+        command.error("PHOTO: want the photograph of --view for --page, got none")
+    if options.view is not None and options.photograph is not None and options.page is None:
         command.error(
             "PHOTO: not with --view, whose pose the camera file holds; leave the photograph out, or give --board and "
             "--square"

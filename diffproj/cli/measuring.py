@@ -12,6 +12,7 @@ from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawi
 from diffproj.cli.inputs import DETECTOR, HAND
 from diffproj.cli.measure_csv import as_csv
 from diffproj.cli.measure_document import PixelNoise, document
+from diffproj.cli.measure_page import check_page, write_page
 from diffproj.cli.measure_plane import plane_at_height
 from diffproj.cli.measure_tables import say, shown
 from diffproj.cli.points_file import Pixel, read_points
@@ -28,6 +29,7 @@ def run(options: argparse.Namespace) -> int:
     check_drawing(options.draw)
     if options.photograph is not None:
         check_no_photograph(options.draw, [options.photograph])
+    check_page(options.page)
     given = _given_pixels(options)
     scene = stored_view(options) if options.view is not None else new_photograph(options)
     noise = _noise(options, scene)
@@ -35,6 +37,12 @@ def run(options: argparse.Namespace) -> int:
         plane = plane_at_height(scene, options.height)
     else:
         plane = Plane(torch.tensor(options.plane[:3], dtype=torch.float64, device="cpu"), options.plane[3])
+    if options.page is not None:
+        write_page(options, scene, plane, DETECTOR if noise.source == DETECTOR else noise.sigma)
+        if not given:
+            page = str(options.page)
+            result(json.dumps({"page": page}) if options.json else f"Written to {page}: open it in a browser")
+            return 0
     pixels = torch.tensor([[pixel.u, pixel.v] for pixel in given], dtype=torch.float64, device="cpu")
     sigma = DETECTOR if noise.source == DETECTOR else noise.sigma
     measured = measure(pixels, scene.calibration, plane, scene.view, sigma)
@@ -50,6 +58,8 @@ def run(options: argparse.Namespace) -> int:
         say(found, scene)
         if options.draw is not None:
             result(f"\nDrawn to {options.draw}")
+        if options.page is not None:
+            result(f"\nPage written to {options.page}")
     return 0
 
 
@@ -57,6 +67,8 @@ def _given_pixels(options: argparse.Namespace) -> list[Pixel]:
     """The pixels to measure, named by their numbers where they have no names."""
     if options.points_file is not None:
         return read_points(options.points_file)
+    if options.points is None:
+        return []
     return [Pixel(str(number), u, v) for number, (u, v) in enumerate(options.points, start=1)]
 
 

@@ -17,7 +17,7 @@ from diffproj.measurement.quantity import Quantity
 from diffproj.measurement.shapes import length
 from diffproj.measurement.student import normal_reach
 
-ROUNDS, TURNED = 8, 1e-5
+ROUNDS, TURNED = 8, 1e-4
 """How often the direction of the errors that change a quantity most is sought anew where the last ones lead, and by how
 much less it has to turn for that to end: its error counts in square."""
 
@@ -80,9 +80,12 @@ def norm_interval(
     def signed(points: Tensor) -> Tensor:
         there, turned = torch.func.vmap(function)(points.flatten(0, -3))
         there, turned = there.reshape(w.shape), turned.reshape(r.shape) ^ supplement
+        along_u = (u * there).sum(-1)
+        if limit == torch.inf:  # nothing turns, and the slope of what is infinite would be NaN
+            return along_u
         size = length(there)
         beyond = limit / torch.where(size > 0, size, 1.0) - 1
-        return (u * there).sum(-1) * torch.where(turned, beyond, 1.0)
+        return along_u * torch.where(turned, beyond, 1.0)
 
     slopes = (u.unsqueeze(-1) * spread.rows()).sum(-2)
     smallest, down = _extreme(spread, signed, r, slopes, -1, reach)

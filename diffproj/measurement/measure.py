@@ -94,7 +94,7 @@ def measure(
     known, middle, doubtful, number, posed = None, None, "", 0, None
     if isinstance(calibration, Calibration):
         number = view_number(chosen_view(calibration, view), calibration.views.names)
-        camera, known, middle = _at_view(calibration, number)
+        camera, known, middle = at_view(calibration, number)
         posed = calibration.posed[..., number]
         parameters = calibration.parameters.of_camera
         doubtful = doubts(calibration, number)
@@ -170,7 +170,7 @@ def _degrees_of_freedom(calibration: Calibration | Camera | PinholeCamera, like:
     return like.new_full(like.shape[:-2], torch.inf) if found is None else found.to(like).expand(like.shape[:-2])
 
 
-def _at_view(calibration: Calibration, number: int) -> tuple[Camera, Tensor | None, Tensor | None]:
+def at_view(calibration: Calibration, number: int) -> tuple[Camera, Tensor | None, Tensor | None]:
     """The camera at the pose of a view, the covariance of both, and the point `(3,)` that the pose turns about in it.
 
     Of many cameras some may have no pose, for they used no corner of the view. What is not known is `None`. The

@@ -70,7 +70,7 @@ def document(title: str, parts: Sequence[Part], lead: str = "") -> str:
         for text in texts:
             if f"</{tag}" in text.lower() or "<!--" in text:
                 raise ValueError(f"{tag}: want text without </{tag} and <!--, got some; write the < as an escape")
-    return render(
+    page = render(
         "document.html",
         title=shortened(title),
         lead=Markup(lead),  # noqa: S704  # made by a template
@@ -79,6 +79,7 @@ def document(title: str, parts: Sequence[Part], lead: str = "") -> str:
         scripts=[Markup(text) for text in scripts],  # noqa: S704
         policy=Markup(_policy(styles, scripts)),  # noqa: S704
     )
+    return page.encode("utf-8", "replace").decode()  # names of files may hold what is no text
 
 
 def render(template: str, **values: Any) -> Markup:

@@ -28,12 +28,15 @@ FAINT = 0.15
 VAGUE = 0.15
 """Standard deviation in px from which a corner is doubted."""
 
-LOOSE, TIGHT, LEAST = 0.06, 0.015, 0.15
-"""Distances from where neighbours put a corner from which it is doubted: the first two relative to the spacing, for
-corners that look as good as the others and for those that look worse; the third in px, added to either."""
+LOOSE, TIGHT = (0.06, 0.15), (0.006, 0.1)
+"""Distances from where neighbours put a corner from which it is doubted, for corners that look as good as the others
+and for those that look worse: relative to the spacing, and in px, added to it."""
 
-DEVIATIONS = 6.0
-"""The least such distance in terms of the view's median."""
+DEVIATIONS, WORSE_DEVIATIONS = 6.0, 5.0
+"""The least such distances in terms of the view's median."""
+
+FAINTER = 0.92
+"""Contrast relative to that of the neighbours below which it is not the light that makes a corner faint."""
 
 REACH, NARROW = 0.65, 0.4
 """Radius of the pixels that are fitted, relative to the spacing: for all corners, and for those beside other edges."""
@@ -52,7 +55,12 @@ class Corners(NamedTuple):
 
     Attributes:
         grid: `(rows, columns, 2)` px; NaN where not visible.
-        sigma: `(rows, columns)` px, standard deviation of a coordinate that the noise of the grey values implies.
+        sigma: `(rows, columns)` px, standard deviation of a coordinate that the noise of the grey values implies. It
+            tells doubtful corners, and is no weight in `calibrate`: on a real board it is a tenth of the residuals,
+            which the print makes. With weights `1 / sigma^2` the RMS of the standardised residuals of the bundled
+            photographs, by fifths of the corners from the surest on, goes from 1.22 to 0.78 and from 1.16 to 0.88
+            instead of from 0.98 to 1.08 and from 0.89 to 1.15; only on rendered boards it is flatter, 0.96 to 1.05
+            instead of 0.86 to 1.11.
         visible: `(rows, columns)`, false where something hides the corner.
         misfit: the median over the corners; above a third, it is no chessboard.
     """
@@ -203,15 +211,18 @@ def _trusted(
     use &= ((grid >= 1) & (grid <= np.array(image.shape[::-1]) - 2)).all(axis=-1)
     if use.sum() < FEWEST:
         return use
-    # Noise alone misfits a fainter corner by more of its own contrast: that is not to look worse.
-    worse = misfit * np.minimum(contrast, 1.0) >= WORSE * usual + 0.01
+    # Noise alone misfits a corner in fainter light by more of its contrast. What covers one makes it alone fainter.
+    light = np.maximum(contrast, FAINTER * cv2.medianBlur(contrast.astype(np.float32), 3))
+    worse = np.where(use, misfit, 0.0) * np.minimum(light, 1.0) >= WORSE * usual + 0.01
     spacing = spacing_of(np.where(np.isfinite(grid), grid, 0.0))
     weight, off, limit = use.astype(float), np.zeros(use.shape), np.ones(use.shape)
     for _ in range(4):
         surface = predicted(grid, weight)
         off = np.linalg.norm(np.where(use[..., None], grid - surface.grid, 0.0), axis=-1) / surface.spread
-        scale = DEVIATIONS * float(np.median(off[use]))
-        limit = np.maximum(scale, np.where(worse, TIGHT, LOOSE) * spacing + LEAST)
+        median = float(np.median(off[use]))
+        loose = np.maximum(DEVIATIONS * median, LOOSE[0] * spacing + LOOSE[1])
+        tight = np.maximum(WORSE_DEVIATIONS * median, TIGHT[0] * spacing + TIGHT[1])
+        limit = np.where(worse, tight, loose)
         if (off[use] < 0.5 * limit[use]).all():
             break
         weight = use / (1 + (off / (0.5 * limit)) ** 4)

@@ -100,6 +100,13 @@ def test_plain_numbers(shown: dict[str, Any]) -> None:
     assert two._repr_html_()
 
 
+def test_plain_numbers_of_a_calibration_hold_its_noise_and_its_deviations() -> None:
+    found = dp.calibrate(dp.example_views("left")[:4], dp.Chessboard(), pixel_sigma=0.2)
+    numbers = found.to_dict()
+    assert numbers["pixel_sigma"] == pytest.approx(0.2)
+    assert numbers["f_x_deviation"] == float(found.covariance.deviations["f_x"])
+
+
 def test_numbers_for_people() -> None:
     assert rounded(123.456, 0.0234) == ("123.456", "0.023")
     assert rounded(123.456, 234.0) == ("120", "230")

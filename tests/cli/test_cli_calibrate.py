@@ -304,3 +304,31 @@ def test_calibrate_draws(
     assert code == 0
     assert f"Drawn to {file}\n" in out
     assert file.read_bytes().startswith(start)
+
+
+def test_calibrate_writes_a_report(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the photographs, that without a board among them, and the camera file's name in the code to copy."""
+    file, camera = tmp_path / "report.html", tmp_path / "camera.json"
+    code, out, _ = calibrate(capsys, photographs, "--distortion", "none", "-o", camera, "--report", file)
+    assert code == 0
+    assert f"Report in {file}, for any browser\n" in out
+    page = file.read_text(encoding="utf-8")
+    assert page.count("data:image/jpeg") == 5 + 1  # and the one to measure in
+    assert "No board was found in 5.png." in page
+    assert f"dp.load_calibration(&#39;{camera}&#39;)" in page
+    rms = float(dp.load_calibration(camera).rms)
+    assert f"{rms:.3g} px" in page
+
+
+def test_a_report_that_cannot_be_written_is_told_before_the_work(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, err = calibrate(
+        capsys, photographs, "-o", tmp_path / "camera.json", "--report", tmp_path / "no" / "a.html"
+    )
+    assert code == 1
+    assert err.startswith("diffproj: --report: no such folder: ")
+    code, _, err = calibrate(capsys, photographs, "-o", tmp_path / "camera.json", "--report", tmp_path / "report.pdf")
+    assert code == 2
+    assert "--report: want a file ending in .html, got" in err
+    assert list(tmp_path.iterdir()) == []

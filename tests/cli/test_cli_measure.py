@@ -288,7 +288,7 @@ def test_corners_that_no_pose_explains(capsys: pytest.CaptureFixture[str], monke
         (["--view", "1.png", "--points", "-1,2,3"], "got '-1,2,3'"),
         (["--view", "1.png", "--points", "1,nan"], "got '1,nan'"),
         (["--view", "1.png", "--points", "1,2", "photo.png"], "got 'photo.png'; the photograph comes first"),
-        (["--view", "1.png"], "one of the arguments --points --points-file is required"),
+        (["--view", "1.png"], "one of the arguments --points --points-file --page is required"),
         (
             ["--points", "1,2"],
             "one of the arguments --board --charuco --aprilgrid --circles --target --view is required",
@@ -308,6 +308,47 @@ def test_options_are_checked_first(arguments: list[str], message: str, capsys: p
     code, out, err = run(capsys, "--camera", "nowhere.json", *arguments)
     assert (code, out) == (2, "")
     assert message in err
+
+
+def test_a_page_to_measure_in(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Of a new photograph, on a box, along with points; and of a view's own photograph alone."""
+    new, stored = tmp_path / "new.html", tmp_path / "stored.html"
+    box = ("photo.png", "--camera", "camera.json", *BOARD, "--height", "12", "--points", *CORNERS)
+    code, out, err = run(capsys, *box, "--page", str(new))
+    assert (code, err) == (0, "")
+    assert f"Page written to {new}" in " ".join(out.split())
+    arguments = ("photo.png", "--camera", "camera.json", "--view", "1.png", "--page", str(stored))
+    code, out, err = run(capsys, *arguments)
+    assert (code, out, err) == (0, f"Written to {stored}: open it in a browser\n", "")
+    code, out, _ = run(capsys, *arguments, "--json")
+    assert json.loads(out) == {"page": str(stored)}
+    models = []
+    for path in (new, stored):
+        found = re.search(r'id="measuring-data">(.*?)</script>', path.read_text(encoding="utf-8"))
+        assert found
+        models.append(json.loads(found[1]))
+    assert [plane["offset"] for plane in models[0]["model"]["planes"]] == [-12.0, 0.0]
+    assert [plane["offset"] for plane in models[1]["model"]["planes"]] == [0.0]
+    assert models[0]["size"] == [640, 480]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("small.png", "--view", "1.png", "--page", "page.html"), 1, "photograph: want 640 x 480 px"),
+        (("nowhere.png", "--view", "1.png", "--page", "page.html"), 1, "nowhere.png"),
+        (("photo.png", "--view", "1.png", "--page", "page.pdf"), 2, "--page: want a file ending in .html or .htm"),
+        (("photo.png", "--view", "1.png", "--page", "nowhere/page.html"), 1, "--page: no such folder: nowhere"),
+        (("--view", "1.png", "--page", "page.html"), 2, "PHOTO: want the photograph of --view for --page"),
+    ],
+)
+def test_no_page_without_its_photograph(
+    arguments: tuple[str, ...], code: int, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found, out, err = run(capsys, "--camera", "camera.json", *arguments)
+    assert (found, out) == (code, "")
+    assert message in err
+    assert not Path("page.html").exists()
 
 
 def test_help(capsys: pytest.CaptureFixture[str]) -> None:

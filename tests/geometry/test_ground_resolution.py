@@ -134,6 +134,16 @@ def test_expanded_pixels(camera: dp.Camera) -> None:
 
 
 @pytest.mark.parametrize("name", ["none", "5", "fisheye"])
+def test_many_cameras_give_what_each_gives(name: str, K: Tensor) -> None:
+    camera, uv = seen_through(name, K), pixels()
+    scales = torch.tensor([1.0, 1.5, 0.7], dtype=D)
+    cameras = camera.at(camera.R.expand(3, 3, 3), scales[:, None] * camera.t)
+    together, _ = dp.ground_resolution(uv.expand(3, *uv.shape), cameras, dp.Plane.z(0.0))
+    for k in range(3):
+        torch.testing.assert_close(together[k], dp.ground_resolution(uv, cameras[k], dp.Plane.z(0.0))[0])
+
+
+@pytest.mark.parametrize("name", ["none", "5", "fisheye"])
 def test_gradients_straight_above_the_plane_and_where_there_is_none(name: str, K: Tensor) -> None:
     """Straight above all directions are alike, and the root of the difference of both has no slope."""
     K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=D, requires_grad=True)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import diffproj as dp
+from diffproj.geometry.intrinsics import upright
 
 D = torch.float64
 POINTS = torch.tensor([[0.0, 0, 0], [120, -40, 10], [-90, 70, -20], [60, 80, 30], [-100, -60, 5]], dtype=D)
@@ -123,3 +124,12 @@ def test_files_of_opencv_hold_what_needs_no_pose(tmp_path: Path) -> None:
         dp.save_camera(tmp_path / "camera.yml", turned)
     dp.save_camera(tmp_path / "camera.yml", turned.upright().without_pose())
     torch.testing.assert_close(dp.load_camera(tmp_path / "camera.yml").K, turned.upright().K)
+
+
+@pytest.mark.parametrize(("f_x", "f_y"), [(500.0, 510.0), (500.0, -510.0), (-500.0, 510.0)])
+def test_what_is_upright_already_is_not_turned(f_x: float, f_y: float) -> None:
+    """A mirrored image is mirrored and no more: not turned by half a turn as well."""
+    K = torch.tensor([[f_x, 0, 320], [0, f_y, 240], [0, 0, 1]], dtype=D)
+    found, cosine, sine = upright(K)
+    assert torch.equal(found, K)
+    assert (float(cosine), float(sine)) == (1.0, 0.0)

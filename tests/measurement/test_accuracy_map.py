@@ -34,6 +34,8 @@ def test_the_grid_reaches_the_edges(calibration: dp.Calibration) -> None:
     assert accuracy.pixels[0, 0].tolist() == [0, 0]
     assert accuracy.pixels[-1, -1].tolist() == [639, 479]
     assert accuracy.pixels.shape == (11, 14, 2)
+    coarse = dp.AccuracyMap.over_image(calibration, step=1000, view=0)
+    assert coarse.pixels.tolist() == [[[0, 0], [639, 0]], [[0, 479], [639, 479]]]
 
 
 def test_resolution_is_a_finite_difference(calibration: dp.Calibration) -> None:

@@ -4,43 +4,11 @@ import base64
 import hashlib
 import json
 import re
-from html.parser import HTMLParser
 
 import pytest
 
 from diffproj.report.document import Part, document, json_block, shortened
-
-VOID = {"meta", "link", "br", "img", "input", "hr"}
-HOSTILE = '</title></style></script><script>alert("1")</script><img src=x onerror=alert(1)> \'"&amp; \u2028 日本 🎯'
-
-
-class Outline(HTMLParser):
-    """The elements of a page, with their attributes and texts; fails where one is not closed in its turn."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.texts: dict[str, list[str]] = {}
-        self.feed(page)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, dict(attributes)))
-        if tag not in VOID:
-            self.open.append(tag)
-            self.texts.setdefault(tag, []).append("")
-
-    def handle_startendtag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, dict(attributes)))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if self.open:
-            self.texts[self.open[-1]][-1] += data
+from tests.report.outline import HOSTILE, Outline
 
 
 def parts() -> list[Part]:
@@ -83,6 +51,12 @@ def test_titles_are_text() -> None:
     assert not [a for tag, a in page.elements if tag == "img"]
     assert not [name for _, a in page.elements for name in a if name.startswith("on")]
     assert len(page.texts["script"]) == 2
+
+
+def test_what_is_no_text_is_a_question_mark() -> None:
+    page = document("caf\udce9", parts())
+    assert Outline(page).texts["h1"] == ["caf?"]
+    page.encode()
 
 
 def test_long_titles_lose_their_middle() -> None:

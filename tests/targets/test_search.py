@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import diffproj as dp
+from diffproj.targets import search
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.detection import BoardNotFoundError, BoardNotFoundWarning, detect
 from diffproj.targets.lattice import as_grid, lattices
@@ -67,6 +68,87 @@ def test_a_small_board_in_a_large_photograph_and_a_large_one():
     assert np.linalg.norm(detect(image, board).pixels[0].numpy() - corners, axis=-1).max() < 0.15
 
 
+def straight(columns, rows, side, margin=None):
+    """A board seen frontally, slightly blurred, on white, and its corners by row and column."""
+    margin = side if margin is None else margin
+    inside = np.kron(np.indices((rows + 1, columns + 1)).sum(axis=0) % 2, np.ones((side, side))) * 200 + 20
+    image = np.pad(inside, margin, constant_values=230).astype(np.uint8)
+    across, down = (margin + side * np.arange(1, count + 1) - 0.5 for count in (columns, rows))
+    return cv2.GaussianBlur(image, (0, 0), 0.8), np.stack(np.meshgrid(across, down), axis=-1)
+
+
+def off_grid(found, corners):
+    """The farthest that a found corner is from the true one, in whichever order the board was found."""
+    turns = (corners, corners[::-1], corners[:, ::-1], corners[::-1, ::-1])
+    return min(float(np.nanmax(np.linalg.norm(found - turn, axis=-1))) for turn in turns)
+
+
+def test_a_board_in_a_photograph_of_any_size():
+    """Small squares in a small photograph show in a larger copy of it, and in a large one in a larger copy than most."""
+    image, corners = straight(9, 6, 7)
+    found = find_pattern(image, Chessboard(9, 6)).grid
+    assert found is not None
+    assert off_grid(found, corners) < 7 / 3
+    image, corners = straight(9, 6, 8)
+    large = np.full((1700, 2600), 230, np.uint8)
+    large[1000 : 1000 + image.shape[0], 1500 : 1500 + image.shape[1]] = image
+    found = find_pattern(large, Chessboard(9, 6)).grid
+    assert found is not None
+    assert off_grid(found - (1500, 1000), corners) < 8 / 3
+
+
+@pytest.mark.parametrize("shape", [(12, 200), (200, 15), (1, 1)])
+def test_a_strip_has_no_room_for_a_board(shape):
+    assert find_pattern(np.zeros(shape, np.uint8), Chessboard(9, 6)) == (None, (0, 0))
+
+
+def test_cloth_is_no_board():
+    """A pattern as fine as a screen's or a fabric's is not even told as another board."""
+    image, _ = straight(40, 30, 4, margin=60)
+    assert find_pattern(image, Chessboard(9, 6)) == (None, (0, 0))
+
+
+def test_a_small_print_beside_a_larger_board_is_none():
+    """Where a larger board is in view, what looks like the one asked for is likely a part of another print."""
+    image, _ = straight(12, 9, 40)
+    small, _ = straight(5, 4, 10)
+    image = np.pad(image, ((0, 0), (0, 200)), constant_values=230)
+    image[200 : 200 + small.shape[0], -150 : -150 + small.shape[1]] = small
+    found = find_pattern(image, Chessboard(5, 4))
+    assert found.grid is None
+    assert found.seen == (12, 9)
+
+
+def with_holes(monkeypatch):
+    """Every third corner escapes the search."""
+    whole = search.lattices
+
+    def lattices(saddles):
+        for cells in whole(saddles):
+            yield {cell: number for cell, number in cells.items() if sum(cell) % 3}
+
+    monkeypatch.setattr(search, "lattices", lattices)
+
+
+@pytest.mark.parametrize(("inverted", "margin"), [(False, 25), (True, 25), (False, 3)])
+def test_where_a_part_is_found_other_detectors_are_asked(monkeypatch, inverted, margin):
+    """Dark and light exchanged as well, and without the white margin that the first of them needs."""
+    with_holes(monkeypatch)
+    image, corners = straight(9, 6, 25, margin=margin)
+    found = find_pattern(255 - image if inverted else image, Chessboard(9, 6)).grid
+    assert found is not None
+    assert np.isfinite(found).all()
+    assert off_grid(found, corners) < 25 / 3
+
+
+def test_where_no_detector_finds_the_board_the_part_is_told(monkeypatch):
+    with_holes(monkeypatch)
+    image, _ = straight(9, 6, 25)
+    monkeypatch.setattr(cv2, "findChessboardCorners", lambda *_: (False, None))
+    monkeypatch.setattr(cv2, "findChessboardCornersSB", lambda *_, flags: (False, None))
+    assert find_pattern(image, Chessboard(9, 6)) == (None, (9, 6))
+
+
 # --------------------------------------------------------------------------------------------- where no board is
 
 
@@ -122,6 +204,21 @@ def test_what_stands_beside_a_board_by_chance_is_no_part_of_it():
     assert extent_of(grid) == (9, 6)
     grid[:, 9] = grid[:, 8] + (1, 0)
     assert matched(grid, Chessboard(9, 6)) is None
+
+
+def test_a_board_without_one_of_its_sides_is_none_and_one_with_holes_is():
+    """Where a whole side is hidden, nothing says where the board ends; rows and columns may be exchanged."""
+    grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), axis=-1)
+    holes = grid.copy()
+    holes[2:4, 3:6] = np.nan
+    turned = matched(holes.swapaxes(0, 1), Chessboard(9, 6))
+    assert turned is not None
+    assert np.array_equal(turned, holes, equal_nan=True)
+    grid[5, 3:] = np.nan
+    assert matched(grid, Chessboard(9, 6)) is None
+    assert extent_of(grid) == (9, 5)
+    assert matched(grid[:5], Chessboard(6, 6)) is None
+    assert extent_of(np.full((4, 4, 2), np.nan)) == (0, 0)
 
 
 def test_patterns_of_a_chessboard_are_one_pattern():

@@ -1,0 +1,54 @@
+"""The report that `--report` asks for: checked before the work, written whole after it."""
+
+import argparse
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from diffproj._core.atomic import write_whole
+from diffproj.calibration.result import Calibration
+from diffproj.cli.inputs import check_writable, writing
+
+SUFFIXES = (".html", ".htm")
+
+
+def report_file(text: str) -> Path:
+    """Read the name of a report."""
+    if Path(text).suffix.lower() not in SUFFIXES:
+        raise argparse.ArgumentTypeError(f"want a file ending in .html, got {text!r}")
+    return Path(text)
+
+
+def check_report(path: Path | None) -> None:
+    """Find out before the long work whether a report can be written, where one is asked for.
+
+    Raises:
+        ModuleNotFoundError: Jinja2 is missing.
+        ValueError: there is no such folder.
+        OSError: its folder cannot be written to.
+    """
+    if path is not None:
+        check_writable("--report", path)
+        import_module("jinja2")
+
+
+def report_text(calibration: Calibration, options: argparse.Namespace, photographs: Sequence[Any], board: Any) -> str:
+    """The report on a calibration; empty where none is asked for."""
+    if options.report is None:
+        return ""
+    from diffproj.report.write import report  # here, for it takes a while to load
+
+    return report(
+        calibration, photographs, target=board, orientation=options.orientation, camera_file=str(options.output)
+    )
+
+
+def write_page(path: Path, text: str) -> None:
+    """Write a page.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    with writing("--report", path):
+        write_whole(path, text)

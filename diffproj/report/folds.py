@@ -1,0 +1,125 @@
+"""The part on views held out: what the camera is worth on photographs that it was not fitted to."""
+
+import math
+from typing import NamedTuple
+
+from jaxtyping import Float
+from markupsafe import Markup
+from torch import Tensor
+
+from diffproj.calibration.result import CalibrationError
+from diffproj.calibration.validation import CrossValidation, cross_validate
+from diffproj.report import svg
+from diffproj.report.document import Part, render
+from diffproj.report.facts import Facts
+from diffproj.targets.landmarks import Landmarks
+from diffproj.targets.target import Target
+
+FEWEST = 4
+"""Views with corners below which none can be spared."""
+DEFAULT = 5
+CLOSE = 1.5
+"""Times the fitted error up to which the held-out one is close to it."""
+
+
+class Points(NamedTuple):
+    """A target of points alone.
+
+    Attributes:
+        points: in the world.
+    """
+
+    points: Float[Tensor, "n 3"]
+
+
+def folds_part(facts: Facts, folds: CrossValidation | int | None, target: Target | None) -> Part:
+    """The errors on views held out."""
+    found, why = _validated(facts, folds, target)
+    figure, rows, means = Markup(), [], {}
+    if found is not None:
+        table = found.to_dict()
+        names = ("in_sample_px", "held_out_px", "in_sample_world", "held_out_world")
+        rows = [
+            [str(fold), *map(_shown, row)] for fold, *row in zip(*(table[n] for n in ("fold", *names)), strict=True)
+        ]
+        means = {name: _rms(table[name]) for name in names}
+        rows.append(["all", *map(_shown, means.values())])
+        figure = _figure(table["in_sample_px"], table["held_out_px"])
+    html = render(
+        "folds.html",
+        why=why,
+        rows=rows,
+        figure=figure,
+        unit=facts.unit,
+        count=len(rows) - 1,
+        held_out_px=svg.plain(means.get("held_out_px", math.nan), 3),
+        held_out_world=svg.plain(means.get("held_out_world", math.nan)),
+        in_sample_px=svg.plain(means.get("in_sample_px", math.nan), 3),
+        close=means.get("held_out_px", math.inf) <= CLOSE * means.get("in_sample_px", 0.0),
+        lost=0 if found is None else int(found.lost.sum()),
+    )
+    return Part("Views held out", "held-out", html, svg.STYLE)
+
+
+def _validated(
+    facts: Facts, folds: CrossValidation | int | None, target: Target | None
+) -> tuple[CrossValidation | None, str]:
+    """The cross-validation, or why there is none."""
+    calibration = facts.calibration
+    if isinstance(folds, CrossValidation):
+        return folds, ""
+    if folds is None:
+        return None, "It was not asked for: folds=5 refits without each fifth of the views in turn."
+    if not facts.converged:
+        return None, "The camera was not found, so there is nothing to test."
+    if len(facts.seen_views) < FEWEST:
+        return None, f"It takes {FEWEST} views, and here are {len(facts.seen_views)}: none can be spared for a test."
+    if any(value == 0 for value in facts.deviations.values()):
+        return None, "Some parameters were held; give dp.cross_validate(...) with the same options as folds."
+    if target is None:
+        target = Landmarks(calibration.nominal) if calibration.landmarks else Points(calibration.nominal)
+    views = calibration.views[facts.seen_views].hiding(calibration.rejected[facts.seen_views])
+    try:
+        return (
+            cross_validate(
+                views,
+                target,
+                calibration.parameters.lens,
+                min(folds, len(views)),
+                shape=calibration.shape,
+                skew=calibration.skew,
+                objective=calibration.objective,
+            ),
+            "",
+        )
+    except (CalibrationError, ValueError) as error:
+        return None, f"It failed: {error}"
+
+
+def _rms(values: list[float]) -> float:
+    return math.sqrt(sum(value * value for value in values) / len(values))
+
+
+def _shown(value: float) -> str:
+    return svg.plain(value, 4) if math.isfinite(value) else "failed"
+
+
+def _figure(fitted: list[float], held_out: list[float]) -> Markup:
+    count = len(fitted)
+    row = max(9.0, min(30.0, 300 / count))
+    height = svg.TOP + svg.BOTTOM + row * count
+    axes = svg.Axes((0, svg.reach([*fitted, *held_out])), (0, count), height=height)
+    parts = [axes.drawn("RMS, px", "fold", y_ticks=[])]
+    places = [svg.TOP + (n + 0.5) * row for n in range(count)]
+    for n, (y, one, other) in enumerate(zip(places, fitted, held_out, strict=True), start=1):
+        if row > 13:
+            parts.append(svg.text(svg.LEFT - 6, y + 4, str(n), "end", "tick"))
+        if math.isfinite(one + other):
+            parts.append(svg.line(axes.x(one), y, axes.x(other), y, "faint"))
+    finite = [n for n in range(count) if math.isfinite(fitted[n] + held_out[n])]
+    parts.append(svg.dots([(axes.x(fitted[n]), places[n]) for n in finite], "large faint"))
+    parts.append(svg.dots([(axes.x(held_out[n]), places[n]) for n in finite], "large"))
+    label = f"RMS of {count} folds, fitted and held out"
+    keys = svg.key(("dot-faint", "views of the fit"), ("dot", "views held out"))
+    caption = "One line a fold. The held-out dot should not lie far to the right of the other."
+    return svg.figure(svg.picture(axes.width, axes.height, label, *parts) + keys, caption)

@@ -1,0 +1,161 @@
+"""The first part: whether the camera is known well enough, for what, what to photograph next, and what not to trust."""
+
+import warnings
+from typing import NamedTuple
+
+import torch
+
+from diffproj.calibration.border import border_with_rays
+from diffproj.calibration.distinct import alike, described
+from diffproj.geometry.plane import Plane
+from diffproj.measurement.measure import measure
+from diffproj.report import svg
+from diffproj.report.document import Part, render
+from diffproj.report.facts import Facts
+from diffproj.report.suggestions import place_sketch, suggestions, tilt_sketch
+
+HAND_PX = 0.5
+"""Standard deviation of a coordinate that a hand picked on a screen."""
+HEADINGS = {
+    "Good": ("good", "Good: the camera is known well"),
+    "Weak": ("doubt", "Weak: the camera is known, but not well"),
+    "Not usable": ("bad", "Not usable: the camera was not found"),
+}
+
+
+class Use(NamedTuple):
+    """How well something is measured.
+
+    Attributes:
+        what: it is.
+        detector, hand: its deviation in world units where a program found the pixels, and where a hand picked them.
+    """
+
+    what: str
+    detector: str
+    hand: str
+
+
+def verdict_part(facts: Facts) -> Part:
+    """The verdict in words."""
+    judgement = facts.calibration.judgement
+    wanted = suggestions(facts)
+    kind, heading = HEADINGS[judgement.word]
+    sketches = []
+    if facts.planar and facts.seen_views and facts.converged:
+        sketches = [place_sketch(facts, wanted), tilt_sketch(facts, wanted)]
+    html = render(
+        "verdict.html",
+        kind=kind,
+        heading=heading,
+        judgement=judgement,
+        reasons=[_sentence(facts.in_unit(reason)) for reason in judgement.reasons],
+        remedies=[_sentence(remedy) for remedy in judgement.remedies],
+        note=facts.in_unit(judgement.note),
+        figures=_figures(facts),
+        uses=_uses(facts),
+        view=facts.names[facts.usual_view] if facts.names else "",
+        distance=f"{svg.plain(float(facts.distances[facts.usual_view]), 3)} {facts.unit}" if facts.names else "",
+        hand=HAND_PX,
+        doubts=doubts(facts),
+        wanted=[_sentence(one.words) for one in wanted],
+        sketches=sketches,
+    )
+    return Part("Is it good enough?", "verdict", html, svg.STYLE)
+
+
+def doubts(facts: Facts) -> list[str]:
+    """What is not to be trusted, and why, in sentences."""
+    calibration = facts.calibration
+    found = []
+    if facts.converged:
+        told = calibration.doubts
+        found += [text for text in calibration.remarks[0].split("; ") if text and text not in told]
+        found = _joined(found)
+        found += [told] if told else []
+        border = float(border_with_rays(calibration.camera.detach(), facts.size))
+        if border < 1:
+            found.append(
+                f"{100 * (1 - border):.0f} % of the image's border lies beyond the fold of the lens: no rays there"
+            )
+        loose = [name for name, value in facts.deviations.items() if value == float("inf")]
+        if loose:
+            found.append(f"the views do not determine {', '.join(loose)}")
+    if calibration.shares is not None:
+        same = alike(calibration.nominal, calibration.views.pixels.unsqueeze(0), calibration.used.unsqueeze(0))[0]
+        found.append(described(same, calibration.views.names))
+    out = int(facts.rejected.sum())
+    if out:
+        found.append(f"{out} corner{'s' * (out > 1)} lay more than 5 standard deviations off and did not count")
+    idle = [name for view, name in enumerate(facts.names) if view not in facts.seen_views]
+    if idle:
+        found.append(
+            f"{len(idle)} view{'s' * (len(idle) > 1)} did not count, with too few corners: {', '.join(idle[:4])}"
+        )
+    if not calibration.has_covariance:
+        found.append(
+            "the file that it was read from holds no deviations, so nothing here says how sure the numbers are"
+        )
+    return [_sentence(facts.in_unit(text)) for text in found]
+
+
+def _joined(texts: list[str]) -> list[str]:
+    """Remarks: those that begin in the middle of a sentence belong to the one before."""
+    return ["; ".join(texts)] if texts else []
+
+
+def _figures(facts: Facts) -> list[tuple[str, str]]:
+    """The few numbers that everybody asks for."""
+    counts = facts.used.sum(-1)
+    found = [
+        ("views, corners", f"{int((counts > 0).sum())}, {int(counts.sum())}"),
+        ("RMS reprojection error", f"{svg.plain(facts.rms, 3)} px"),
+    ]
+    if facts.converged:
+        f = facts.calibration.shared[0].item()
+        spread = facts.deviations.get("f_x", 0.0)
+        sure = f" ± {svg.plain(spread)}" if 0 < spread < float("inf") else ""
+        found.append(("focal length", f"{f:.{1 if spread > 0.05 or not spread else 3}f}{sure} px"))
+    return found
+
+
+def _uses(facts: Facts) -> list[Use]:
+    """How well points and lengths on the board are measured, from the view whose distance is the usual one."""
+    calibration = facts.calibration
+    if not (facts.converged and facts.planar and calibration.has_covariance and facts.seen_views):
+        return []
+    view = facts.usual_view
+    low, high = calibration.nominal.amin(0), calibration.nominal.amax(0)
+    middle, half = (low + high) / 2, (high - low) / 2
+    along = torch.zeros_like(half)
+    axis = int(half[:2].argmax())
+    along[axis] = half[axis]
+    ends = torch.stack([middle, middle - along, middle + along])
+    pixels, valid = calibration.cameras[view].detach().project(ends)
+    if not bool(valid.all()):
+        return []
+    with warnings.catch_warnings():  # what they say is among the doubts
+        warnings.simplefilter("ignore")
+        found = [
+            measure(pixels, calibration, Plane.z(float(middle[2])), view, sigma) for sigma in ("detector", HAND_PX)
+        ]
+    along_length = ends[2] - ends[1]
+    gradient = torch.cat([torch.zeros_like(along_length), -along_length, along_length]) / along_length.norm()
+    points, lengths = [], []
+    for one in found:
+        joint = one.joint().detach().to(gradient)
+        points.append(torch.linalg.eigvalsh(joint[:3, :3]).amax().clamp(min=0).sqrt())
+        lengths.append((gradient @ joint @ gradient).clamp(min=0).sqrt())
+    return [
+        Use("a point in the middle of the board", *(f"{svg.plain(float(d))} {facts.unit}" for d in points)),
+        Use(
+            f"the board's length, {svg.plain(float(along_length.norm()), 3)} {facts.unit}",
+            *(f"{svg.plain(float(d))} {facts.unit}" for d in lengths),
+        ),
+    ]
+
+
+def _sentence(text: str) -> str:
+    """A remark as a sentence."""
+    text = text.strip().rstrip(".")
+    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith('?') else '.'}"
