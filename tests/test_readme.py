@@ -53,11 +53,16 @@ def folder(example: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) ->
         image = dp.synthetic.photograph(calibration.cameras[number], board, seed=number).numpy()
         cv2.imwrite(str(folder / "photos" / f"{number}.jpg"), image)
     shutil.copy(folder / "photos" / "3.jpg", folder / "photo.jpg")
+    film = cv2.VideoWriter(str(folder / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, calibration.camera.size)
+    for path in sorted((folder / "photos").iterdir()):
+        film.write(cv2.imread(str(path)))
+    film.release()
     for name, height in (("survey.csv", 0.0), ("gcp.csv", -60.0)):  # the corners, each third at a height
         places = board.points.to(D) + height * (torch.arange(len(board.points)) % 3 == 0)[:, None] * torch.eye(3)[2]
         seen, _ = calibration.cameras[3].project(places)
         lines = [",".join(map(str, numbers)) for numbers in torch.cat([seen, places], dim=-1).tolist()]
         (folder / name).write_text("\n".join(["u,v,x,y,z", *lines]))
+    shutil.copytree(folder / "photos", folder / "cameras" / "a")
     dp.save_camera(folder / "camera.json", calibration)
     dp.save_camera(folder / "camera.yaml", calibration)
     two = calibration.cameras[:2]

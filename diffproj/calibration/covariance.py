@@ -33,7 +33,7 @@ from diffproj._core.copying import Copied
 from diffproj._core.numerics import broadcast_batches
 from diffproj._core.shown import Shown, counted, number
 from diffproj.calibration.fields import mask, tensor
-from diffproj.calibration.shape import names_of
+from diffproj.calibration.shape import AXES, names_of
 from diffproj.calibration.solver import Equations
 
 SINGULAR = 2e-15
@@ -88,7 +88,10 @@ class Covariance(Copied, Shown):
         Empty where their places were known.
         """
         first = next((place for place, name in enumerate(self.names) if name == names_of(1)[0]), len(self.names))
-        return self.shared[..., first:, first:]
+        last = first
+        while last < len(self.names) and self.names[last][:1] in AXES and "." not in self.names[last]:
+            last += 1  # behind them stand the other cameras of a rig
+        return self.shared[..., first:last, first:last]
 
     def _facts(self) -> list[str]:
         return [

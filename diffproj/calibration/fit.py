@@ -53,6 +53,22 @@ class Fit:
 
         return Fit(self.task.part(rows), cut(self.solution), self.rejected[rows])
 
+    def alone(self, row: int, views: int) -> "Fit":
+        """The fit of one camera with its first views, as if it had been fitted alone."""
+        one = self.part(torch.tensor([row], device=self.rejected.device))
+        wholes = {name: getattr(one.task, name) for name in ("pixels", "used", "weights", "whitening", "shares")}
+        cut = {name: None if whole is None else whole[:, :views] for name, whole in wholes.items()}
+        if cut["shares"] is not None and bool((cut["shares"] == 1).all()):
+            cut["shares"] = None
+        if one.task.prior is not None and not bool(one.task.prior.whole.any()):
+            cut["prior"] = None  # which other cameras of the batch needed
+        blocks = {name: getattr(one.solution.equations, name)[:, :views] for name in ("E", "W", "h", "c")}
+        solution = one.solution._replace(
+            local=tuple(z[:, :views] for z in one.solution.local),
+            equations=one.solution.equations._replace(**blocks),
+        )
+        return Fit(replace(one.task, **cut), solution, one.rejected[:, :views])
+
     @property
     def knows_noise(self) -> bool:
         """Whether the noise was given: a robust loss takes what was given for weights alone."""

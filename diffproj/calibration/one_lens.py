@@ -28,6 +28,12 @@ def calibrated(
     views: Views, target: Target, distortion: LensModel, chosen: Options, who: str = "calibrate"
 ) -> Calibration:
     """What `calibrate` promises, for one lens and checked options; errors name `who` was asked."""
+    data, found = fitted(views, target, distortion, chosen)
+    return outcome(who, data, found, views.size, chosen.throw)
+
+
+def fitted(views: Views, target: Target, distortion: LensModel, chosen: Options) -> tuple[Data, Fit]:
+    """The minimum alone, with what it is of; nothing is said of it yet."""
     model_named(distortion)
     data = Data(views, target, chosen.weights, chosen.pixel_sigma)
     data.check_options(chosen.objective, chosen.bow, chosen.shape)
@@ -48,7 +54,7 @@ def calibrated(
         found, _ = with_free_points(flat, data, chosen, None)
         limits: dict[str, Any] = {name: getattr(chosen, name) for name in ("max_iterations", "tolerance")}
         found = unfolded(found, flat, views.size, reject=chosen.outlier_limit, **limits)
-    return outcome(who, data, found, views.size, chosen.throw)
+    return data, found
 
 
 def _from_start(

@@ -116,6 +116,7 @@ def outcome(
         displacements=shaped(solution.shared[:, few:].unflatten(-1, (-1, 3))) if task.free else None,
         degrees_of_freedom=shaped(noise.freedom),
         lens_region=None if known is None else known.region,
+        rig=None if known is None else known.rig,
         _covariance=partial(_covariance, found, data, before, known, doubt),
         _others=partial(_others, found, data, before),
         _remarks=partial(remarks, found, status, doubt, of_landmarks=landmarks is not None),

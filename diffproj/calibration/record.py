@@ -55,6 +55,7 @@ class Recorded:
         return {
             "objective": self.objective,
             "unit": self.unit,
+            "rig": self.rig,
             "landmarks": None if self.landmarks is None else list(self.landmarks),
             "skew": self.skew,
             "causes": list(self.causes),
@@ -122,6 +123,7 @@ class Recorded:
             degrees_of_freedom=_freedom(fields, batch),
             lens_region=_region(fields),
             unit=_unit(fields.get("unit")),
+            rig=_rig(fields.get("rig")),
             landmarks=_landmarks(fields.get("landmarks"), N),
             displacements=tensor(fields, "displacements", (*batch, N, 3)) if present(fields, "displacements") else None,
             _covariance=None if covariance is None else partial(_same, covariance),
@@ -225,6 +227,13 @@ def _unit(unit: Any) -> str | None:
     if not isinstance(unit, str | None):
         raise ValueError(f"unit: want a text, got {unit!r}")  # noqa: TRY004
     return unit
+
+
+def _rig(rig: Any) -> str | None:
+    """Which rig the camera is of; files of earlier releases lack it."""
+    if not isinstance(rig, str | None):
+        raise ValueError(f"rig: want a text, got {rig!r}")  # noqa: TRY004
+    return rig
 
 
 def _size(size: Any) -> tuple[int, int] | None:

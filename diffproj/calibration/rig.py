@@ -7,14 +7,17 @@ one pose a camera relative to the first, one pose of the target a moment. It com
 from collections.abc import Mapping
 from typing import Any, Unpack
 
+from torch import Tensor
+
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import CalibrationError
 from diffproj.calibration.rig_alone import alone, checked_cameras, lenses
 from diffproj.calibration.rig_fit import rig_fit
-from diffproj.calibration.rig_options import RigOptions, held, held_places, rig_options
+from diffproj.calibration.rig_options import RigOptions, held, held_places, held_points, rig_options
 from diffproj.calibration.rig_outcome import rig_outcome
 from diffproj.calibration.rig_problem import RigParameters
 from diffproj.calibration.rig_result import RigCalibration
+from diffproj.calibration.rig_shape import with_shape
 from diffproj.calibration.rig_start import rig_start
 from diffproj.calibration.rig_views import Moments, rig_views
 from diffproj.calibration.solver import Status
@@ -40,14 +43,14 @@ def calibrate_rig(
     Args:
         views_by_camera: corners `(V, N, 2)` by the camera's name. Cameras may miss any moments, and views any corners;
             a view with fewer than 4 takes no part. Sizes may differ.
-        target: anything with `.points (N, 3)` on z = 0, such as `Chessboard`; its unit is the world's.
+        target: a board, `Landmarks` without sigma, or anything with `.points (N, 3)`; its unit is the world's.
         distortion: which lens to fit, as for `calibrate`; or one by camera.
         moments: by camera, the name or number of each view's moment. Left out, the views' names are the moments', with
             the camera's own name taken out where they would share none: `left03.jpg` and `right03.jpg` are `03.jpg`.
         cameras: known beforehand, by name: cameras, calibrations, or a rig that was calibrated before. Their intrinsics
             are what is started from, or held; their poses count where the rig is held, `fixed=("rig",)`.
-        options: `fixed`, `weights`, `loss`, `reject_outliers`, `max_iterations`, `tolerance`, `progress` and `throw`:
-            see `RigOptions`.
+        options: `fixed`, `shape`, `weights`, `loss`, `reject_outliers`, `max_iterations`, `tolerance`, `progress` and
+            `throw`: see `RigOptions`.
 
     Returns:
         The rig, in float64.
@@ -77,15 +80,23 @@ def rig_calibrated(
     cameras: Any,
     chosen: Any,
     who: str,
+    moved: Tensor | None = None,
 ) -> RigCalibration:
-    """What `calibrate_rig` promises, for checked options; errors name `who` was asked."""
+    """What `calibrate_rig` promises, for checked options; errors name `who` was asked.
+
+    With `moved (N, 3)` the target's points are known to lie so far from where it has them.
+    """
     views = rig_views(views_by_camera, target, moments, chosen.weights, who)
     known = checked_cameras(cameras, views.names)
     lens = lenses(distortion, views.names)
     # What is held has to be known by camera before each is calibrated on its own; a known camera brings its lens.
     kinds = {name: Parametrisation.of(known[name]) if name in known else Parametrisation(lens[name]) for name in lens}
     parameters = RigParameters(views.names, tuple(kinds.values()))
-    names, positions = held(parameters, chosen.fixed)
+    freed = chosen.shape == "free" or moved is not None
+    if freed and bool((views.data[views.names[0]].given_points.detach()[:, 2] != 0).any()):
+        raise ValueError("shape: want 'flat' for points that are not all on z = 0, got 'free'")
+    fixed, points = held_points(chosen.fixed, len(views.points))
+    names, positions = held(parameters, fixed)
     own = alone(views, target, lens, known, names, chosen, who)
     seen = {name: one.seen for name, one in own.items()}
     start = rig_start(views, seen, held_places(parameters, positions, known), who)
@@ -98,6 +109,8 @@ def rig_calibrated(
         positions,
         chosen,
     )
+    if freed:
+        found = with_shape(found, points, chosen, moved)
     rig = rig_outcome(found, own)
     if chosen.throw and rig.status != Status.CONVERGED:
         raise CalibrationError(f"{who}: {rig.message}", rig)

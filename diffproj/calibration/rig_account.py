@@ -79,11 +79,21 @@ class RigAccount(Shown):
             spread = one.covariance.deviations if self.has_covariance else {}
             parts = [
                 f"{key} {_spread(float(value), spread.get(key), 2 if index < 4 else 5)}"
-                for index, (key, value) in enumerate(zip(one.parameters.names, one.shared.tolist(), strict=True))
+                for index, (key, value) in enumerate(zip(one.parameters.few_names, one.shared.tolist(), strict=False))
             ]
             lines += [f"  {', '.join(parts[:4])} px", *([f"  {', '.join(parts[4:])}"] if parts[4:] else [])]
             if name != self.names[0]:
                 lines += self._place(name)
+        first = self.calibrations[self.names[0]]
+        if first.displacements is not None:
+            off = first.displacements.square().mean(0).sqrt().tolist()
+            texts = [f"{value:.4f}" for value in off]
+            if self.has_covariance:
+                spread = first.points_deviation
+                told = spread.isfinite().all(-1)
+                sure = spread[told].square().mean(0).sqrt().tolist()
+                texts = [f"{text} ± {value:.4f}" for text, value in zip(texts, sure, strict=True)]
+            lines.append(f"points off by {', '.join(texts)} world units in x, y, z (RMS)")
         lines += [f"RMS {self.rms:.4f} px", *(self.message.split("; "))]
         return "\n".join(lines)
 

@@ -15,7 +15,8 @@ from diffproj.calibration.rig_options import free_directions
 from diffproj.calibration.rig_problem import RigParameters, RigProblem
 from diffproj.calibration.rig_start import RigStart
 from diffproj.calibration.rig_views import RigViews
-from diffproj.calibration.solver import Equations, solve
+from diffproj.calibration.shape import Restraint
+from diffproj.calibration.solver import Equations, Prior, solve
 from diffproj.calibration.task import NEGLIGIBLE_PX
 
 READMITTED = 10.0
@@ -40,6 +41,8 @@ class RigFit:
         basis: of the free directions of the shared unknowns `(1, s, q)`, or `None` for all.
         loss: a robust loss, or `None`.
         restrained: cameras whose terms below the line are held, for without that their lens folds.
+        restraint: what fixes the frame of free points; `None` where none are free.
+        positions: of the shared unknowns that are held.
     """
 
     views: RigViews
@@ -55,6 +58,13 @@ class RigFit:
     basis: Tensor | None
     loss: Loss | None
     restrained: tuple[str, ...] = ()
+    restraint: Restraint | None = None
+    positions: tuple[int, ...] = ()
+
+    @property
+    def prior(self) -> Prior | None:
+        """What is minimised besides the residuals."""
+        return prior_of(self.restraint, self.parameters)
 
     @property
     def parameters(self) -> RigParameters:
@@ -97,7 +107,7 @@ def rig_fit(
     if below:  # two terms of a rational lens that nearly cancel: on its own, the camera's was kept from that
         positions = sorted({*positions, *(position for one in below.values() for position in one)})
         found = _fitted(views, parameters, intrinsics, start, inliers, positions, options)
-    return replace(found, restrained=tuple(below))
+    return replace(found, restrained=tuple(below), positions=tuple(positions))
 
 
 def _folding(found: RigFit) -> dict[str, list[int]]:
@@ -136,38 +146,67 @@ def _fitted(
     given = {name: views.data[name].used[0] for name in views.names}
     used = {name: _enough(inliers[name] & ~start.apart[name].unsqueeze(-1)) for name in views.names}
     with torch.inference_mode():
-        fit = _Rounds(views, parameters, start.R, basis, options)
+        fit = Rounds(views, parameters, start.R, basis, options)
         fit.solve(used, shared, local)
         apart = fit.reviewed(given, start.apart)
         if any(bool((apart[name] != start.apart[name]).any()) for name in views.names):
             used = {name: _enough(inliers[name] & ~apart[name].unsqueeze(-1)) for name in views.names}
             fit.solve(used, fit.shared, fit.local)
-        rejected = {name: given[name] & apart[name].unsqueeze(-1) for name in views.names}
-        if options.outlier_limit is not None:
-            for _ in range(MAX_REJECTION_ROUNDS):
-                kept = fit.inliers(given, options.outlier_limit)
-                kept = {name: kept[name] & ~apart[name].unsqueeze(-1) for name in views.names}
-                rejected = {name: given[name] & ~kept[name] for name in views.names}
-                enough = {name: _enough(part) for name, part in kept.items()}
-                if all(torch.equal(enough[name], fit.used[name]) for name in views.names):
-                    break
-                fit.solve(enough, fit.shared, fit.local)
-        found = fit.at_the_minimum(rejected, apart)
+        found = fit.at_the_minimum(fit.without_outliers(given, apart), apart)
+    return in_normal_tensors(found)
+
+
+def in_normal_tensors(found: RigFit) -> RigFit:
+    """The fit outside of inference mode."""
     state = normal_tensors((found.shared, found.local, found.equations, found.problem.base))
-    problem = RigProblem(views, parameters, state[3], found.used)
+    problem = RigProblem(found.views, found.parameters, state[3], found.used)
     return replace(found, shared=state[0], local=state[1], equations=state[2], problem=problem)
 
 
-class _Rounds:
+def prior_of(restraint: Restraint | None, parameters: RigParameters) -> Prior | None:
+    """What restrains free points, as the solver takes it."""
+    if restraint is None:
+        return None
+    few = parameters.few
+    held = torch.nn.functional.pad(restraint.alone + restraint.printed, (few, 0))
+    root = torch.nn.functional.pad(restraint.root, (0, 0, few, 0))
+    return Prior(torch.zeros_like(held), torch.diag_embed(held), root=root)
+
+
+class Rounds:
     """The solver's rounds, each from where the last ended."""
 
     def __init__(
-        self, views: RigViews, parameters: RigParameters, base: Tensor, basis: Tensor | None, options: Options
+        self,
+        views: RigViews,
+        parameters: RigParameters,
+        base: Tensor,
+        basis: Tensor | None,
+        options: Options,
+        restraint: Restraint | None = None,
     ) -> None:
         self.views, self.parameters, self.base, self.basis, self.options = views, parameters, base, basis, options
+        self.restraint, self.prior = restraint, prior_of(restraint, parameters)
         self.iterations, self.round = 0, 0
 
+    def without_outliers(self, given: dict[str, Tensor], apart: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Which of the given corners are left out `(V_c, N)`: of views apart, and outliers, if they are to be."""
+        names = self.views.names
+        rejected = {name: given[name] & apart[name].unsqueeze(-1) for name in names}
+        if self.options.outlier_limit is None:
+            return rejected
+        for _ in range(MAX_REJECTION_ROUNDS):
+            kept = self.inliers(given, self.options.outlier_limit)
+            kept = {name: kept[name] & ~apart[name].unsqueeze(-1) for name in names}
+            rejected = {name: given[name] & ~kept[name] for name in names}
+            enough = {name: _enough(part) for name, part in kept.items()}
+            if all(torch.equal(enough[name], self.used[name]) for name in names):
+                break
+            self.solve(enough, self.shared, self.local)
+        return rejected
+
     def solve(self, used: dict[str, Tensor], shared: Tensor, local: tuple[Tensor, ...]) -> None:
+        """A round on these corners, from unknowns `(1, s)` and poses of the target."""
         options, self.used = self.options, used
         self.problem = RigProblem(self.views, self.parameters, self.base, used)
         self.every = sum(int(part.sum()) for part in used.values())
@@ -184,6 +223,7 @@ class _Rounds:
             local,
             local_size=POSE,
             loss=options.loss,
+            prior=self.prior,
             basis=self.basis,
             max_iterations=options.max_iterations,
             tolerance=options.tolerance,
@@ -204,6 +244,7 @@ class _Rounds:
 
     @property
     def shared_device(self) -> torch.device:
+        """Where it computes."""
         return self.base.device
 
     def residuals(self, used: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -233,12 +274,15 @@ class _Rounds:
         return kept
 
     def at_the_minimum(self, rejected: dict[str, Tensor], apart: dict[str, Tensor]) -> RigFit:
+        """Where the last round ended, with the unknowns counted from there."""
         base, t = self.problem.cameras(self.shared)
         shared = self.shared.clone()
         for c in range(1, len(base)):
             shared[0, self.parameters.pose(c)] = torch.cat([torch.zeros_like(t[c]), t[c]])
         problem = self.problem.rebased(base)
         _, equations = problem.equations(shared, self.local, self.options.loss)
+        if self.prior is not None:
+            equations = equations._replace(U=equations.U + self.prior.whole)
         return RigFit(
             self.views,
             problem,
@@ -252,6 +296,7 @@ class _Rounds:
             self.iterations,
             self.basis,
             self.options.loss,
+            restraint=self.restraint,
         )
 
 

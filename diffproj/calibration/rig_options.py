@@ -1,12 +1,13 @@
 """The options of a rig's calibration, and which unknowns they hold."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict
 
 import torch
 from torch import Tensor
 
 from diffproj._core.arguments import Array
+from diffproj.calibration.constraints import of_points
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.options import Options, Progress, calibration_options
 from diffproj.calibration.parametrisation import SKEW, Parametrisation
@@ -21,7 +22,12 @@ class RigOptions(TypedDict, total=False):
         fixed: what keeps its value. `"intrinsics"` of all cameras, `"rig"`, their poses; names or groups of parameters
             as in `calibrate` (`"k3"`, `"distortion"`, `"principal_point"`, ...), of all cameras that have them; or any
             of these of one camera, as `"left.intrinsics"`, `"left.k3"`, `"right.pose"`. Values are those of `cameras`;
-            where there is none, as in `calibrate`, the middle of the image and 0 for the lens.
+            where there is none, as in `calibrate`, the middle of the image and 0 for the lens. With free points,
+            `"points_z"` keeps them in the plane.
+        shape: of the target. `"flat"`, the default, has its points where the target says. `"free"` fits the place of
+            every point, in the plane and out of it, to all cameras together: `RigCalibration.points` then is the target
+            as it was printed. Its origin, axes and size as a whole stay the target's, in the sense of least squares.
+            That takes six views that differ, over all cameras.
         weights: of the corners, by camera, each broadcasting to `(V, N)`: one over the variance of their coordinates,
             in px^-2; or one number. A corner of weight 0 takes no part. 1 everywhere if left out.
         loss: a robust loss such as `dp.Huber(0.5)`, its scale in pixels; least squares if left out.
@@ -35,6 +41,7 @@ class RigOptions(TypedDict, total=False):
     """
 
     fixed: Sequence[str]
+    shape: Literal["flat", "free"]
     weights: Mapping[str, Tensor | Array | float] | float | None
     loss: Loss | None
     reject_outliers: bool | float
@@ -54,7 +61,16 @@ def rig_options(who: str, given: Mapping[str, Any]) -> Options:
     unknown = [name for name in given if name not in RigOptions.__annotations__]
     if unknown:
         raise TypeError(f"{who}: want options of {', '.join(RigOptions.__annotations__)}, got {unknown[0]!r}")
+    if given.get("shape") == "bow":
+        raise ValueError("shape: want 'flat' or 'free' for a rig, got 'bow'; free points find a bow, too")
     return calibration_options(who, given)
+
+
+def held_points(fixed: Sequence[str], points: int) -> tuple[tuple[str, ...], list[int]]:
+    """The names that are left for the cameras, and which coordinates of free points are held, numbers from 0."""
+    axes = [axis for name in fixed for axis in of_points(name)]
+    names = tuple(name for name in fixed if not of_points(name))
+    return names, [number for number in range(3 * points) if number % 3 in axes]
 
 
 def held(parameters: RigParameters, fixed: Sequence[str]) -> tuple[dict[str, tuple[str, ...]], list[int]]:

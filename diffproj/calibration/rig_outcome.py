@@ -1,5 +1,6 @@
 """What a rig's fit comes to: how it ended, the cameras at their places, and each camera as a calibration."""
 
+import hashlib
 from collections.abc import Mapping
 from functools import partial
 
@@ -14,7 +15,7 @@ from diffproj.calibration.rig_fit import RigFit
 from diffproj.calibration.rig_result import RigCalibration
 from diffproj.calibration.rig_uncertainty import CameraNoise, camera_noise, of_camera, plain_covariance, rig_covariance
 from diffproj.calibration.solver import Status
-from diffproj.calibration.verdict import MAX_RELATIVE_STD
+from diffproj.calibration.verdict import FEWEST_FOR_A_SHAPE, MAX_RELATIVE_STD
 from diffproj.geometry.camera import Camera
 
 FAR_WORSE, FAR_OFF = 10.0, 0.002
@@ -34,6 +35,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
     joint = _Late(found, noise)
     R, t = found.problem.cameras(found.shared)
     cameras, calibrations = {}, {}
+    fingerprint = hashlib.blake2b(found.shared.cpu().numpy().tobytes(), digest_size=12).hexdigest()
     status, cause = _verdict(found, noise, alone)
     for c, name in enumerate(names):
         data, kind = views.data[name], found.parameters.kinds[c]
@@ -58,6 +60,8 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
             pixel_sigma=noise.pixel_variance[c].sqrt(),
             skew=kind.skew,
             degrees_of_freedom=noise.freedom[c],
+            displacements=displacements(found),
+            rig=fingerprint,
             _covariance=partial(_of_camera, found, joint, c),
             _others=partial(_others, found, alone[name], name, posed.R, posed.t),
         )
@@ -84,6 +88,13 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
         _covariance=joint,
         _remarks=partial(_remarks, found, noise, alone, status),
     )
+
+
+def displacements(found: RigFit) -> Tensor | None:
+    """How far the target's points are from where they were given `(N, 3)`; `None` where they were not free."""
+    if not found.parameters.points:
+        return None
+    return found.shared[0, found.parameters.few :].unflatten(-1, (-1, 3)).clone()
 
 
 class _Late:
@@ -137,12 +148,24 @@ def _verdict(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone]) -> t
     known = plain_covariance(found, noise)
     unknown = known.undetermined[0].clone()
     deviation = known.shared[0].diagonal().sqrt()
+    if found.restraint is not None:
+        few = found.parameters.few
+        size = found.views.points.square().sum(-1).mean().sqrt()
+        lost = unknown[few:] & ~found.restraint.unknown[0]
+        lost |= deviation[few:].isfinite() & (deviation[few:] > MAX_RELATIVE_STD * size)
+        views = sum(int(used.any(-1).sum()) for used in found.used.values())
+        if bool(lost.any()) or views < FEWEST_FOR_A_SHAPE:
+            return Status.DEGENERATE, (
+                f"{views} views do not determine the shape of the target together with the cameras: take more moments "
+                "that differ, tilted by 20 to 50 degrees about both axes; or take shape='flat'"
+            )
+        unknown = unknown[:few]
     for c in range(len(found.views.names)):
         own = found.parameters.intrinsics(c)
         f = found.shared[0, own.start].abs()
         unknown[own.start : own.start + 4] |= ~(deviation[own.start : own.start + 4] <= MAX_RELATIVE_STD * f)
     if bool(unknown.any()):
-        lacking = [name for name, lost in zip(found.parameters.names, unknown.tolist(), strict=True) if lost]
+        lacking = [name for name, lost in zip(found.parameters.names, unknown.tolist(), strict=False) if lost]
         return Status.DEGENERATE, (
             f"the views do not determine {', '.join(lacking[:6])}{', ...' * (len(lacking) > 6)}: add moments that "
             "these cameras share with others, and views with the target tilted by 20 to 50 degrees about both axes"
@@ -169,7 +192,7 @@ def _remarks(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone], stat
     for name in names:
         used = found.used[name]
         squares, count = residuals[name].square().sum((-2, -1)), used.sum(-1)
-        if alone[name].remark():
+        if alone[name].remark() and found.restraint is None:  # on its own it had a flat target
             said.append(f"{name}, on its own: {alone[name].remark()}")
         rms = float((squares.sum() / count.sum().clamp(min=1)).sqrt())
         if rms > WORSE_TOGETHER * alone[name].rms and rms > 1e-6:

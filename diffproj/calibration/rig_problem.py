@@ -3,6 +3,7 @@
 The cameras share the moments, the views of a camera its intrinsics and its pose in the rig:
 
     shared    f_x f_y c_x c_y | coefficients | skew | omega (3) | tau (3)     camera after camera; the first has no pose
+              x_0 y_0 z_0 x_1 ...                                             behind them, where the points are free
     local     the pose of the target in the rig, one a moment
 
 A view of camera c at moment m sees the target at `R = R_c R_m`, `t = R_c t_m + t_c`. Its residuals and their
@@ -26,6 +27,7 @@ from diffproj.calibration.losses import Loss
 from diffproj.calibration.parametrisation import POSE, Parametrisation, Pose, moved
 from diffproj.calibration.reprojection import Reprojection
 from diffproj.calibration.rig_views import RigViews
+from diffproj.calibration.shape import by_displacement, names_of
 from diffproj.calibration.solver import Equations, LocalState
 from diffproj.geometry.cayley import turned
 
@@ -40,10 +42,12 @@ class RigParameters:
     Attributes:
         cameras: their names.
         kinds: the parameters of each.
+        points: how many points of the target are free; 0 where their places are known.
     """
 
     cameras: tuple[str, ...]
     kinds: tuple[Parametrisation, ...]
+    points: int = 0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -52,11 +56,16 @@ class RigParameters:
         for number, (camera, kind) in enumerate(zip(self.cameras, self.kinds, strict=True)):
             own = kind.names if number == 0 else (*kind.names, *POSE_NAMES)
             parts += [f"{camera}.{name}" for name in own]
-        return tuple(parts)
+        return (*parts, *names_of(self.points))
 
     @property
     def size(self) -> int:
         """How many there are."""
+        return self.few + 3 * self.points
+
+    @property
+    def few(self) -> int:
+        """How many there are without the displacements of points."""
         return sum(kind.size + POSE for kind in self.kinds) - POSE
 
     def intrinsics(self, camera: int) -> slice:
@@ -102,7 +111,12 @@ class Group:
             given = {c: ones[c] if (w := one.weights) is None else w[0] for c, one in data.items()}
             self.weights = torch.cat([given[c][rows] for c, rows in numbers.items()])
         self.reprojection = Reprojection(
-            views.points, self.pixels.unsqueeze(1), self.used.unsqueeze(1), kind.lens, skew=kind.skew
+            views.points,
+            self.pixels.unsqueeze(1),
+            self.used.unsqueeze(1),
+            kind.lens,
+            skew=kind.skew,
+            free=parameters.points > 0,
         )
         columns = torch.zeros(len(parameters.cameras), kind.size + POSE, dtype=torch.long, device=self.camera.device)
         for c in cameras:
@@ -156,6 +170,8 @@ class RigProblem:
         """Derivatives by intrinsics and by the pose of the view, and residuals `(n, s_g + 7, 2, N)`."""
         R, t = self.view_poses(group, shared, local)
         own = shared[0, group.columns[:, : group.size]]
+        if self.parameters.points:
+            own = torch.cat([own, shared[:, self.parameters.few :].expand(len(own), -1)], dim=-1)
         return group.reprojection.linearise(own, (R.unsqueeze(1), t.unsqueeze(1))).squeeze(1)
 
     def residuals(self, shared: Tensor, local: LocalState) -> list[Tensor]:
@@ -215,11 +231,47 @@ class RigProblem:
                 U.index_put_((where.unsqueeze(-1), where.unsqueeze(-2)), sums, accumulate=True)
                 g.index_put_((where,), pulls, accumulate=True)
             E[group.moment.unsqueeze(-1), group.columns] = by_own[:, own, b:]
+            if self.parameters.points:
+                self._add_points(group, panel, shared, local, (U, E, g))
             W.index_add_(0, group.moment, by_own[:, b:, b:])
             h.index_add_(0, group.moment, residual[:, b:-1])
             c.index_add_(0, group.moment, half)
         one = (x.unsqueeze(0) for x in (U[..., :s, :s], E[:, :s], W, g[..., :s], h, c))
         return cost.unsqueeze(0), Equations(*one)
+
+    def _add_points(
+        self, group: Group, panel: Tensor, shared: Tensor, local: LocalState, sums: tuple[Tensor, Tensor, Tensor]
+    ) -> None:
+        """Add the displacements' part of a group's views, from their weighted panel, to U, E and g.
+
+        Only a point's own residuals depend on its displacement: its block of U is of 3 x 3 blocks.
+        """
+        U, E, g = sums
+        k, few, N = group.size, self.parameters.few, self.parameters.points
+        R, _ = self.view_poses(group, shared, local)
+        by_point = by_displacement(panel[:, None, -4:-1], R.unsqueeze(1))[:, 0]  # (n, 3, 2, N)
+        cross = torch.einsum("nrkp,njkp->nrpj", panel, by_point).flatten(-2)  # (n, k + 7, 3 N)
+        D = self.composition(group, shared, local)
+        rows = torch.cat([cross[:, :k], D.mT @ cross[:, k:-1]], dim=1)  # intrinsics, camera, moment
+        blocks = torch.einsum("nikp,njkp->npij", by_point, by_point)
+        by_own, b, at, place = rows[:, : k + POSE], k + POSE, group.moment, slice(few, few + 3 * N)
+        number = torch.arange(N, device=U.device)
+        columns = torch.arange(few, few + 3 * N, device=U.device)
+        E[:, place].index_add_(0, at, rows[:, b:].mT)
+        if U.ndim == 3:
+            U.index_put_((at[:, None, None], group.columns.unsqueeze(-1), columns), by_own, accumulate=True)
+            U.index_put_((at[:, None, None], columns.unsqueeze(-1), group.columns.unsqueeze(1)), by_own.mT, True)
+            g[:, place].index_add_(0, at, cross[:, -1])
+            inside = U[:, place, place].unflatten(-1, (N, 3)).unflatten(-3, (N, 3))  # (M, N, 3, N, 3)
+            sums_of = torch.zeros_like(inside[:, :, :, 0]).index_add_(0, at, blocks)
+        else:
+            total = by_own.new_zeros(len(group.members), b, 3 * N).index_add_(0, group.slot, by_own)
+            where = group.by_camera
+            U.index_put_((where.unsqueeze(-1), columns), total, accumulate=True)
+            U.index_put_((columns.unsqueeze(-1), where.unsqueeze(1)), total.mT, accumulate=True)
+            g[place] += cross[:, -1].sum(0)
+            inside, sums_of = U[place, place].unflatten(-1, (N, 3)).unflatten(-3, (N, 3)), blocks.sum(0)
+        inside[..., number, :, number, :] += sums_of if U.ndim == 2 else sums_of.transpose(0, 1)
 
     def _by_cameras(self, group: Group, gram: Tensor, shared: Tensor, local: LocalState) -> tuple[Tensor, Tensor]:
         """Products of the rows of views `(n, k + 7, k + 7)`, from the view's pose to the camera's and the moment's.

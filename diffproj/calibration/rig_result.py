@@ -18,6 +18,7 @@ from diffproj.calibration.rig_account import RigAccount
 from diffproj.calibration.rig_problem import cross_matrix
 from diffproj.calibration.rig_record import RigRecorded
 from diffproj.calibration.rig_triangulation import Rig, Triangulation, triangulated
+from diffproj.calibration.shape_names import Shape
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
 
@@ -79,6 +80,29 @@ class RigCalibration(RigAccount, Copied, RigRecorded):
     def names(self) -> tuple[str, ...]:
         """The names of the cameras; the first is the rig's frame."""
         return tuple(self.cameras)
+
+    @property
+    def points(self) -> Float[Tensor, "n 3"]:
+        """The target's points as they were fitted, in world units; as they were given, if their shape was not free."""
+        return next(iter(self.calibrations.values())).points
+
+    @property
+    def points_deviation(self) -> Float[Tensor, "n 3"]:
+        """The standard deviation of each coordinate of `points`, where they were fitted; 0 where not.
+
+        Infinite for points that fewer than two views show. `covariance.points` has how they go together.
+
+        Raises:
+            ValueError: the covariance is not known.
+        """
+        if self.shape == "flat":
+            return torch.zeros_like(self.points)
+        return self.covariance.points.diagonal().sqrt().unflatten(-1, (-1, 3))
+
+    @property
+    def shape(self) -> Shape:
+        """What was fitted of the target's shape."""
+        return next(iter(self.calibrations.values())).shape
 
     @property
     def rms(self) -> float:

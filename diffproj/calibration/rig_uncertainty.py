@@ -10,13 +10,13 @@ phi the dispersion (`dispersion.py`): how much the moments contradict each other
 """
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffproj.calibration.covariance import Covariance, Scores, covariance, local_inverse, reshaped
-from diffproj.calibration.dispersion import believed, contradiction
+from diffproj.calibration.dispersion import FEW_VIEWS, FEW_VIEWS_OF_A_SHAPE, believed, contradiction
 from diffproj.calibration.losses import slope_and_bend
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.rig_fit import RigFit
@@ -55,7 +55,7 @@ def camera_noise(found: RigFit) -> CameraNoise:
     own = torch.stack(
         [free[parameters.columns(c)[: None if c else parameters.kinds[0].size]].sum() for c in range(len(names))]
     )
-    spare = 2 * count.sum(-1) - of_poses - own
+    spare = 2 * count.sum(-1) - of_poses - own - told_points(found) * count.sum(-1) / count.sum().clamp(min=1)
     lost = torch.full_like(spare, torch.nan)
     rows = []
     for c, (name, residual) in enumerate(found.by_camera.items()):
@@ -82,22 +82,58 @@ def camera_noise(found: RigFit) -> CameraNoise:
     return CameraNoise(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
+def told_points(found: RigFit) -> int:
+    """How many of the free points' coordinates the corners tell, and not the frame."""
+    if found.restraint is None:
+        return 0
+    free = ~found.restraint.unknown[0]
+    if found.basis is not None:
+        free = free & (found.basis[0, found.parameters.few :].abs().sum(-1) > 0)
+    root = found.restraint.root[0, free]
+    return int(free.sum()) - int(torch.linalg.matrix_rank(root / root.norm().clamp(min=1e-300)))
+
+
 def plain_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
     """The covariance for one noise of all cameras and independent corners: what verdicts go by."""
     freedom = noise.freedom.clamp(min=0)
     pooled = (torch.where(freedom > 0, noise.variance * freedom, 0.0)).sum() / freedom.sum().clamp(min=1)
-    return covariance(found.equations, found.parameters.names, pooled.unsqueeze(0), basis=found.basis)
+    frame: dict[str, Any] = {}
+    if found.restraint is not None:
+        few, restraint = found.parameters.few, found.restraint
+        wide = (few, 0, few, 0)
+        frame = {
+            "frame": torch.nn.functional.pad(restraint.frame, wide),
+            "printed": torch.nn.functional.pad(torch.diag_embed(restraint.printed), wide),
+        }
+    return covariance(
+        found.equations, found.parameters.names, pooled.unsqueeze(0), basis=found.basis, unseen=unseen(found), **frame
+    )
+
+
+def unseen(found: RigFit) -> Tensor | None:
+    """The shared unknowns that nothing tells `(1, s)`; `None` where no points are free."""
+    if found.restraint is None:
+        return None
+    return torch.nn.functional.pad(found.restraint.unknown, (found.parameters.few, 0))
 
 
 def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
     """The joint covariance, without batch axes; poses are the target's in the rig."""
     problem, state = found.problem, (found.shared, found.local, None)
     _, H = problem.totals(*state, scale=noise.bend)
+    if found.prior is not None:
+        H = H._replace(U=H.U + found.prior.whole)
     _, M = problem.totals(*state, scale=(noise.variance * noise.inflation).nan_to_num(0.0), by_moment=True)
     phi = _dispersion(found, H, M)
     scores = Scores(M.U, M.E, M.W)
     found_one = covariance(
-        H, found.parameters.names, torch.ones_like(phi), basis=found.basis, scores=scores, dispersion=phi
+        H,
+        found.parameters.names,
+        torch.ones_like(phi),
+        basis=found.basis,
+        scores=scores,
+        dispersion=phi,
+        unseen=unseen(found),
     )
     middle = found.views.middle
     R, _ = found.views.frame.world_pose(found.local[0][0], found.local[1][0])
@@ -105,7 +141,17 @@ def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
 
 
 def _dispersion(found: RigFit, H: Equations, M: Equations) -> Tensor:
-    """How much more the moments contradict each other than independent corners would `(1,)`."""
+    """How much more the moments contradict each other than independent corners would `(1,)`.
+
+    Free points follow what the moments want: what is compared is how these pull at the cameras with the points held.
+    """
+    few = found.parameters.few
+    kept = slice(0, few)
+    basis = found.basis
+    if basis is not None:
+        basis = basis[:, :few, basis[0, :few].abs().sum(0) > 0]
+    if basis is not None and basis.shape[-1] == 0:
+        return torch.ones_like(H.g[:, 0])
     seen = torch.stack([_seen(found, name) for name in found.views.names]).any(0)
     if found.free == 0 or int(seen.sum()) < 2:
         return torch.ones_like(H.g[:, 0])
@@ -117,12 +163,13 @@ def _dispersion(found: RigFit, H: Equations, M: Equations) -> Tensor:
         S = own.U - F @ own.E.mT
         leaning = F @ M.E.mT
         K = M.U - leaning - leaning.mT + F @ M.W @ F.mT
-        if found.basis is not None:
-            T = found.basis.mT.unsqueeze(1)
+        u, S, K = u[..., kept], S[..., kept, kept], K[..., kept, kept]
+        if basis is not None:
+            T = basis.mT.unsqueeze(1)
             u, S, K = (T @ u.unsqueeze(-1)).squeeze(-1), T @ S @ T.mT, T @ K @ T.mT
         share = seen.to(u).unsqueeze(0)
         told = contradiction(u, S, K, share, S.sum(1), u.sum(1))
-        return believed(told).clone()
+        return believed(told, FEW_VIEWS_OF_A_SHAPE if found.restraint is not None else FEW_VIEWS).clone()
 
 
 def _seen(found: RigFit, name: str) -> Tensor:
@@ -151,7 +198,9 @@ def of_camera(found: RigFit, joint: Covariance, camera: int) -> Covariance:
         A[:, 3:, :3] = -cross_matrix(arm)
         follow = follow.clone()
         follow[:, :, place] -= A
-    order = [*range(own.start, own.stop), *(i for i in range(s) if not own.start <= i < own.stop)]
+    few = parameters.few
+    others = [i for i in range(few) if not own.start <= i < own.stop]
+    order = [*range(own.start, own.stop), *range(few, s), *others]  # its own, those of the points, those of others
     names = tuple(
         joint.names[i].removeprefix(f"{name}.") if own.start <= i < own.stop else joint.names[i] for i in order
     )

@@ -16,8 +16,10 @@ from diffproj.calibration.rig import rig_calibrated
 from diffproj.calibration.rig_options import RigOptions, rig_options
 from diffproj.calibration.rig_result import RigCalibration
 from diffproj.calibration.rig_views import Moments, rig_views
+from diffproj.geometry.back_projection import back_project
+from diffproj.geometry.plane import Plane
 from diffproj.lens.models import LensModel
-from diffproj.targets.residuals import projected_minus_seen, put_back_minus_known
+from diffproj.targets.residuals import nearest_minus_known, projected_minus_seen, put_back_minus_known
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
@@ -88,7 +90,8 @@ def cross_validate_rig(
 
     Args:
         views_by_camera: corners by the camera's name, as for `calibrate_rig`; moment i is left out of fit i mod k.
-        target: anything with `.points (N, 3)` on z = 0.
+        target: a board, `Landmarks` without sigma, or anything with `.points (N, 3)`. Errors of points in space are
+            distances from the pixels' rays.
         distortion: the lens, or one by camera.
         folds: k.
         moments: of each view, by camera, as for `calibrate_rig`.
@@ -148,12 +151,15 @@ def _held_out(
         found: dict[str, Calibration] = {}
         if len(seen) == 1:
             name = next(iter(seen))
-            found[name] = located(seen[name], target, fit.cameras[name].without_pose(), throw=False)
+            found[name] = located(
+                seen[name], target, fit.cameras[name].without_pose(), fit.calibrations[name], throw=False
+            )
         elif seen:
             chosen = rig_options(who, {"fixed": ("rig", "intrinsics"), "throw": False})
             known = {name: fit.cameras[name] for name in seen}
             theirs = {name: labels[name] for name in seen}
-            found = rig_calibrated(seen, target, "none", theirs, known, chosen, who).calibrations
+            moved = next(iter(fit.calibrations.values())).displacements
+            found = rig_calibrated(seen, target, "none", theirs, known, chosen, who, moved).calibrations
         for name, one in found.items():
             counts = held[name].visible & hidden & one.used.any(-1, keepdim=True)
             total = total.plus(_errors(one, counts, held[name]))
@@ -164,7 +170,16 @@ def _errors(one: Calibration, counts: Tensor, views: Views | None = None) -> _Er
     """Errors of some corners `(V, N)` with the poses of a calibration; infinite where a corner is not projected."""
     pixels = one.views.pixels if views is None else views.pixels.to(one.views.pixels)
     off, projected = projected_minus_seen(one.cameras, one.points, pixels, counts)
-    landed, valid = put_back_minus_known(one.cameras, one.points, pixels, counts)
+    heights = one.points[:, 2]
+    if one.shape == "flat" and bool((heights == 0).all()):
+        landed, valid = put_back_minus_known(one.cameras, one.points, pixels, counts)
+    elif one.shape == "flat":  # landmarks in space, which no plane holds
+        landed, valid = nearest_minus_known(one.cameras, one.points, pixels, counts)
+    else:  # onto the plane through each point as it was printed
+        plane = Plane.per_point([0.0, 0.0, 1.0], heights.expand(counts.shape))
+        found, valid = back_project(pixels, one.cameras, plane)
+        landed, valid = found - one.points, valid & counts
+        landed = torch.where(valid.unsqueeze(-1), landed, 0.0)
     if bool((counts & ~(projected & valid)).any()):
         return _Errors(torch.inf, torch.inf, int(counts.sum()))
     return _Errors(float(off.square().sum()), float(landed.square().sum()), int(counts.sum()))

@@ -4,21 +4,24 @@ Each command is two modules: its command line, with `add_options`, and its work,
 the command line was understood. So help and mistakes wait neither for PyTorch nor for other commands.
 
 Exit codes: 0 done, 1 the work failed (one line says what and what to do), 2 the command was not understood, 130
-interrupted from the keyboard.
+interrupted from the keyboard. A command whose output is no longer read ends without a word, with 1.
 """
 
-import argparse
+import os
 import re
 import sys
+from argparse import RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from importlib import import_module
 
 from diffproj import __version__
+from diffproj.cli.command_line import CommandLine, leave_output
 
 COMMANDS = {
     "board": "write a page with a board to print at true scale",
     "calibrate": "find a camera from photographs of a board, and write a camera file",
     "measure": "measure points, lengths and an area on a plane in a photograph, with error bars",
+    "rectify": "make a metric top view of a plane in a photograph, for GIS too",
     "locate": "find where a camera stood from surveyed landmarks that a photograph shows",
     "convert": "turn a camera file of one program into that of another",
     "info": "tell what is in a camera file, and whether it can be right",
@@ -27,12 +30,43 @@ COMMANDS = {
 """What each command does; the module of its command line has its name."""
 
 
+EPILOG = """\
+'diffproj help COMMAND' tells more about a command, with examples.
+
+examples:
+  diffproj board board.pdf --board 9x6 --square 25mm
+  diffproj calibrate photos/ --board 9x6 --square 25mm -o camera.json
+  diffproj measure part.jpg --camera camera.json --board 9x6 --square 25mm \\
+      --points 210,133 402,140
+
+Results go to standard output, with --json as one document; progress, notes,
+warnings and failures to standard error.
+
+exit codes:
+  0    done
+  1    it failed, one line says why and what to do, and no file is half written
+  2    the command was not understood
+  130  interrupted from the keyboard
+"""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given[:1] == ["help"]:  # `diffproj help measure` is `diffproj measure --help`
         given = [*given[1:], "--help"]
-    options = _parser(given).parse_args(shielded(given))
+    if "_ARGCOMPLETE" in os.environ:
+        return _complete()
+    parser = _parser(given)
+    try:
+        options, unknown = parser.parse_known_args(shielded(given))
+    except OSError as error:  # of the help, on standard output
+        leave_output()
+        if not isinstance(error, BrokenPipeError):
+            print(f"diffproj: standard output: {error.strerror}; send it elsewhere", file=sys.stderr)
+        return 1
+    if unknown:
+        options.command_line.refuse(unknown)
     if "check" in options:  # what options mean together
         options.check(options)
     from diffproj.cli.running import run
@@ -48,12 +82,23 @@ def shielded(arguments: Sequence[str]) -> list[str]:
     return [f" {text}" if re.match(r"-[.\d][^,]*,", text) else text for text in arguments]
 
 
-def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
+def _complete() -> int:
+    """Answer the shell, which asks by `_ARGCOMPLETE` for what may come next; nothing without argcomplete."""
+    try:
+        argcomplete = import_module("argcomplete")
+    except ModuleNotFoundError:
+        return 1
+    argcomplete.autocomplete(_parser(os.environ.get("COMP_LINE", "").split()[1:]))
+    return 1
+
+
+def _parser(arguments: Sequence[str]) -> CommandLine:
     """The parser of the command line, with the options of the command that is called."""
-    parser = argparse.ArgumentParser(
+    parser = CommandLine(
         prog="diffproj",
         description="Pixels of one calibrated camera to world coordinates on known planes.",
-        epilog="'diffproj help COMMAND' tells more about a command.",
+        epilog=EPILOG,
+        formatter_class=RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"diffproj {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")

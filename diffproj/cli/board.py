@@ -2,9 +2,9 @@
 
 import argparse
 import functools
-from pathlib import Path
 
-from diffproj.cli.inputs import LARGEST_NUMBER, numbers
+from diffproj.cli.common_options import add_said, describe
+from diffproj.cli.inputs import LARGEST_NUMBER, file_ending, numbers
 from diffproj.cli.which_board import add_kinds, add_measures, check_board
 
 DESCRIPTION = """\
@@ -19,21 +19,17 @@ examples:
   diffproj board board.pdf --charuco 8x6 --square 25mm --marker 18mm \\
       --dictionary 5X5_100 --paper A3
   diffproj board board.png --aprilgrid 6x6 --tag 22mm --spacing 0.3 --dpi 300
-
-exit codes: 0 done; 1 it failed, one line says why, nothing is written; 2 the
-command was not understood
 """
-
-SUFFIXES = (".pdf", ".svg", ".png")
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
     """Give the command its description and its options."""
-    command.description, command.epilog = DESCRIPTION, EPILOG
-    command.formatter_class = argparse.RawDescriptionHelpFormatter
-    command.usage = "%(prog)s FILE --board CxR --square SIDE [options]"
+    describe(command, DESCRIPTION, EPILOG, "%(prog)s FILE --board CxR --square SIDE [options]")
     command.add_argument(
-        "file", type=_page, metavar="FILE", help="the page: a .pdf, .svg or .png, replaced if there is one"
+        "file",
+        type=file_ending(".pdf", ".svg", ".png"),
+        metavar="FILE",
+        help="the page: a .pdf, .svg or .png, replaced if there is one",
     )
     board = command.add_argument_group("the board")
     add_kinds(board.add_mutually_exclusive_group(required=True))
@@ -47,13 +43,8 @@ def add_options(command: argparse.ArgumentParser) -> None:
         help="A0 to A5, letter, legal, tabloid, or width,height in mm (default: A4)",
     )
     page.add_argument("--dpi", type=_dpi, default=600.0, metavar="N", help="pixels per inch of a .png (default: 600)")
+    add_said(command)
     command.set_defaults(work="printing", check=functools.partial(check_board, command))
-
-
-def _page(text: str) -> Path:
-    if Path(text).suffix.lower() not in SUFFIXES:
-        raise argparse.ArgumentTypeError(f"want a file ending in {', '.join(SUFFIXES)}, got {text!r}")
-    return Path(text)
 
 
 def _paper(text: str) -> str | tuple[float, ...]:

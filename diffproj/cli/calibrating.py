@@ -9,13 +9,26 @@ from rich.table import Table
 
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.result import Calibration
+from diffproj.calibration.validation import CrossValidation, cross_validate
+from diffproj.cli.calibrate_document import document
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
 from diffproj.cli.inputs import check_writable, writing
 from diffproj.cli.photographs import find_corners, photographs
 from diffproj.cli.reporting import check_report, report_text, write_page
-from diffproj.cli.terminal import RESULTS, aligned, in_options, progress_bars, result, rounded
+from diffproj.cli.terminal import (
+    RESULTS,
+    aligned,
+    as_json,
+    detail,
+    in_options,
+    progress_bars,
+    result,
+    rounded,
+    working,
+)
 from diffproj.cli.which_board import given_board
 from diffproj.files.save import save_camera
+from diffproj.lens.models import model_of
 
 
 def run(options: argparse.Namespace) -> int:
@@ -24,42 +37,80 @@ def run(options: argparse.Namespace) -> int:
     check_drawing(options.draw)
     check_report(options.report)
     board, side, _ = given_board(options)
-    sources = photographs(options.photographs)
+    sources = photographs(options.photographs, options.frames)
     check_no_photograph(options.draw, sources)
+    lens = {"shape": options.shape, "skew": options.skew, "reject_outliers": options.reject_outliers}
     with progress_bars() as bars:
-        views = find_corners(sources, board, bars, orientation=options.orientation)
+        folders = [path for path in options.photographs if path.is_dir()]
+        views = find_corners(sources, board, bars, orientation=options.orientation, in_folders=folders)
+        if options.folds is not None and options.folds > len(views):
+            raise ValueError(f"--folds: want at most the number of views, {len(views)}, got {options.folds}")
         task = bars.add_task("Solving", total=None)
         calibration = calibrate(
             views,
             board,
             options.distortion,
-            shape=options.shape,
-            skew=options.skew,
-            reject_outliers=options.reject_outliers,
             progress=lambda done, total: bars.update(task, completed=done, total=total),
+            **lens,
         )
+    detail(f"Solving: {calibration.message}")
     calibration = replace(calibration, unit=side.unit)
+    folds = None
+    if options.folds is not None:
+        with working("Leaving views out"):
+            model = model_of(calibration.camera.distortion).name
+            folds = cross_validate(views, board, model, options.folds, **lens)
+    page = ""
+    if options.report is not None:
+        with working("Writing the report"):
+            page = report_text(calibration, options, sources, board, folds)
+    try:
+        _write(options, calibration, page)
+    except OSError:
+        if not options.json:  # what took long to find is not lost
+            _say(calibration, folds, options.reject_outliers)
+        raise
+    # Written before it is told: who reads only the first lines has the file.
+    if options.json:
+        as_json(document(options, calibration, folds))
+        return 0
+    _say(calibration, folds, options.reject_outliers)
+    lost = "; the unit, the poses and the error bars are read from a .json file only"
+    result(f"\nWritten to {options.output}{'' if options.output.suffix.lower() == '.json' else lost}")
+    if options.draw is not None:
+        result(f"Drawn to {options.draw}")
+    if options.report is not None:
+        result(f"Report in {options.report}, for any browser")
+    return 0
+
+
+def _write(options: argparse.Namespace, calibration: Calibration, page: str) -> None:
+    """Write the files, with the report where one is asked for.
+
+    Raises:
+        OSError: one cannot be written.
+    """
+    if options.draw is not None:
+        from diffproj import figures  # here, for it loads matplotlib
+
+        write_drawing(options.draw, figures.corners(calibration))
+    with writing("--output", options.output):
+        save_camera(options.output, calibration)
+    if options.report is not None:
+        write_page(options.report, page)
+
+
+def _say(calibration: Calibration, folds: CrossValidation | None, reject_outliers: bool) -> None:
+    """Print what was found."""
     if calibration.comparison is not None:
         result(f"Lenses compared\n{calibration.comparison.summary()}\n")
     RESULTS.print(_views_table(calibration))
     result("")
     RESULTS.print(_parameters_table(calibration))
-    _say_how_it_ended(calibration, options.reject_outliers)
-    if options.draw is not None:
-        from diffproj import figures  # here, for it loads matplotlib
-
-        write_drawing(options.draw, figures.corners(calibration))
-    page = report_text(calibration, options, sources, board)
-    with writing("--output", options.output):
-        save_camera(options.output, calibration)
-    lost = "; the unit, the poses and the error bars are read from a .json file only"
-    result(f"\nWritten to {options.output}{'' if options.output.suffix.lower() == '.json' else lost}")
-    if options.draw is not None:
-        result(f"Drawn to {options.draw}")
-    if page:
-        write_page(options.report, page)
-        result(f"Report in {options.report}, for any browser")
-    return 0
+    if folds is not None:
+        result(f"\nErrors on views left out; world: {calibration.unit or 'the unit of --square'} on the board")
+        result(folds.summary())
+    _say_how_it_ended(calibration, reject_outliers)
 
 
 def _views_table(calibration: Calibration) -> Table:

@@ -3,6 +3,7 @@
 import argparse
 from typing import get_args
 
+from diffproj.cli.common_options import add_said, describe
 from diffproj.cli.inputs import some_path
 from diffproj.files.names import FormatName
 
@@ -26,16 +27,12 @@ examples:
   diffproj convert camchain.yaml left.json --camera cam0
   diffproj convert calibration.npz ost.yaml --to ros --size 1280x720
   diffproj convert camera.json sparse/images.txt
-
-exit codes: 0 done; 1 it failed, one line says why; 2 the command was not
-understood
 """
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
     """Give the command its description and its options."""
-    command.description, command.epilog = DESCRIPTION, EPILOG
-    command.formatter_class = argparse.RawDescriptionHelpFormatter
+    describe(command, DESCRIPTION, EPILOG)
     names = get_args(FormatName)
     command.add_argument("input", type=some_path, metavar="IN", help="the camera file to read")
     command.add_argument("output", type=some_path, metavar="OUT", help="the file to write; its folder must exist")
@@ -54,6 +51,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--without-pose", action="store_true", help="leave the pose out, and put the world in the camera"
     )
+    add_said(command)
     command.set_defaults(work="converting")
 
 

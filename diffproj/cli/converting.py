@@ -1,14 +1,15 @@
 """The work of `diffproj convert`: camera files from one program's format to another's."""
 
 import argparse
-from pathlib import Path
+from typing import Any
 
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.rig_result import RigCalibration
-from diffproj.cli.terminal import result
+from diffproj.cli.inputs import check_not_the_same, check_writable
+from diffproj.cli.terminal import as_json, result
 from diffproj.files.document import Document
-from diffproj.files.load import found_in, load, load_camera
-from diffproj.files.names import FormatName
+from diffproj.files.found import Found
+from diffproj.files.load import content_of, found_in
 from diffproj.files.save import save_camera
 from diffproj.geometry.camera import Camera
 
@@ -25,6 +26,8 @@ REMEDIES = (
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
+    check_writable("OUT", options.output)
+    check_not_the_same("OUT", options.output, [options.input])
     try:
         found = _wanted(options)
         save_camera(options.output, found, options.to)
@@ -33,37 +36,53 @@ def run(options: argparse.Namespace) -> int:
         for python, remedy in REMEDIES:
             said = said.replace(python, remedy)
         raise ValueError(said) from error
-    if isinstance(found, RigCalibration):
-        result(f"{options.output}: a rig of {', '.join(found.names)}")
-        return 0
-    camera = found.camera if isinstance(found, Calibration) else found
-    lens = "no lens" if camera.distortion is None else type(camera.distortion).__name__
-    many = f"{camera.batch_shape.numel()} cameras" if camera.batch_shape else "one camera"
-    size = "of unknown size" if camera.size is None else f"of {camera.size[0]} x {camera.size[1]} px"
-    result(f"{options.output}: {many} {size}, {lens}")
+    told = _told(options, found)
+    if options.json:
+        as_json(told)
+    elif told["rig"] is not None:
+        result(f"{options.output}: a rig of {', '.join(told['rig'])}")
+    else:
+        many = "one camera" if told["cameras"] is None else f"{told['cameras']} cameras"
+        size = "of unknown size" if told["size"] is None else "of {} x {} px".format(*told["size"])
+        result(f"{options.output}: {many} {size}, {told['lens'] or 'no lens'}")
     return 0
+
+
+def _told(options: argparse.Namespace, found: Camera | Calibration | RigCalibration) -> dict[str, Any]:
+    """What was written."""
+    told = {"input": str(options.input), "output": str(options.output), "warnings": options.warned}
+    if isinstance(found, RigCalibration):
+        return {**told, "rig": list(found.names)}
+    camera = found.camera if isinstance(found, Calibration) else found
+    return {
+        **told,
+        "rig": None,
+        "cameras": camera.batch_shape.numel() if camera.batch_shape else None,
+        "size": None if camera.size is None else list(camera.size),
+        "lens": None if camera.distortion is None else type(camera.distortion).__name__,
+    }
 
 
 def _wanted(options: argparse.Namespace) -> Camera | Calibration | RigCalibration:
     """What to write: a whole calibration or rig where nothing of it is to change."""
+    document = Document.read(options.input)
     plain = options.source is None and options.camera is None and options.size is None and not options.without_pose
-    found = load(options.input) if plain else _camera(options)
+    if plain:
+        found = content_of(document)
+    else:
+        among = found_in(document, options.source)
+        try:
+            found = among.chosen(named(among, options.camera))
+        except ValueError as error:
+            raise ValueError(f"{options.input}: {error}") from error
     return found if isinstance(found, Calibration | RigCalibration) else _sized(found, options)
 
 
-def _camera(options: argparse.Namespace) -> Camera:
-    return load_camera(options.input, options.source, named(options.input, options.source, options.camera))
-
-
-def named(path: Path, source: FormatName | None, name: str | None) -> str | int | None:
+def named(found: Found, name: str | None) -> str | int | None:
     """The camera that is asked for: by a name that the file has, or else by its number."""
     if name is None or not name.isdecimal():
         return name
-    try:
-        found = found_in(Document.read(path), source)
-    except ValueError:
-        return name  # and reading it says why
-    return name if name in found.cameras or name in found.aside else int(name)
+    return name if name in found.cameras or name in found.aside else int(name[:9])
 
 
 def _sized(camera: Camera, options: argparse.Namespace) -> Camera:

@@ -1,25 +1,20 @@
 """Pictures that `--draw` asks for: checked before the work, written whole after it."""
 
-import argparse
 from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from diffproj._core.atomic import write_whole
-from diffproj.cli.inputs import check_writable, writing
+from diffproj.cli.inputs import check_not_the_same, check_writable, file_ending, writing
 
 if TYPE_CHECKING:  # it is slow to load
     from matplotlib.figure import Figure
 
-SUFFIXES = (".png", ".svg", ".pdf")
+    from diffproj.targets.images import Photograph
 
-
-def drawing(text: str) -> Path:
-    """Read the name of a picture."""
-    if Path(text).suffix.lower() not in SUFFIXES:
-        raise argparse.ArgumentTypeError(f"want a file ending in {', '.join(SUFFIXES)}, got {text!r}")
-    return Path(text)
+drawing = file_ending(".png", ".svg", ".pdf")
+"""Reads the name of a picture."""
 
 
 def check_drawing(path: Path | None) -> None:
@@ -35,14 +30,13 @@ def check_drawing(path: Path | None) -> None:
         import_module("diffproj.figures")
 
 
-def check_no_photograph(path: Path | None, photographs: Iterable[object]) -> None:
+def check_no_photograph(path: Path | None, photographs: Iterable["Photograph | Path"]) -> None:
     """Check that a picture does not replace a photograph.
 
     Raises:
         ValueError: it would.
     """
-    if path is not None and path.exists() and path.resolve() in (Path(str(p)).resolve() for p in photographs):
-        raise ValueError(f"--draw: want another file than the photographs, got {path}; choose another name")
+    check_not_the_same("--draw", path, (one if isinstance(one, Path) else Path(one.label) for one in photographs))
 
 
 def write_drawing(path: Path, figure: "Figure") -> None:

@@ -4,21 +4,30 @@ import argparse
 from pathlib import Path
 from typing import get_args
 
+from diffproj.cli.common_options import add_said, describe
 from diffproj.cli.inputs import board_size, some_path
 from diffproj.cli.units import Length, square_side
 from diffproj.lens.names import LensModel
 
-DESCRIPTION = (
-    "Calibrates a camera from views of a chessboard, finds the pose of each test view, puts every corner of it back on "
-    "the board's plane and compares it with its known place. Prints Table 1, for the board as it was designed and "
-    "as it was printed, whose corners the fitting views tell, and writes both as CSV, fig7.png and camera.json (the "
-    "whole calibration) to the output folder."
-)
+DESCRIPTION = """\
+Calibrates a camera from views of a chessboard, finds the pose of each test
+view, puts every corner of it back on the board's plane and compares it with its
+known place. Prints Table 1, for the board as it was designed and as it was
+printed, whose corners the fitting views tell, and writes both as CSV, fig7.png
+and camera.json (the whole calibration) to the output folder.
+"""
+
+EPILOG = """\
+examples:
+  diffproj experiment
+  diffproj experiment --data right --strict --output right
+  diffproj experiment --images photos/ --board 9x6 --square 25mm --split 8
+"""
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
     """Give the command its description and its options."""
-    command.description = DESCRIPTION
+    describe(command, DESCRIPTION, EPILOG, "%(prog)s [options]")
     source = command.add_mutually_exclusive_group()
     source.add_argument(
         "--data",
@@ -41,7 +50,11 @@ def add_options(command: argparse.ArgumentParser) -> None:
         help="side of a square, such as 25mm or 1in; its unit is that of all results (default: 25mm)",
     )
     command.add_argument(
-        "--distortion", choices=get_args(LensModel), default="brown5", help="the lens that is fitted (default: brown5)"
+        "--distortion",
+        choices=get_args(LensModel),
+        default="brown5",
+        metavar="LENS",
+        help="the lens that is fitted, as for 'diffproj calibrate' (default: brown5)",
     )
     command.add_argument(
         "--split",
@@ -59,4 +72,5 @@ def add_options(command: argparse.ArgumentParser) -> None:
         metavar="FOLDER",
         help="where the files go (default: diffproj-experiment)",
     )
+    add_said(command)
     command.set_defaults(work="experimenting")

@@ -10,7 +10,7 @@ from diffproj._core.atomic import write_whole
 from diffproj.calibration.result import CalibrationError
 from diffproj.cli.inputs import check_folder, writing
 from diffproj.cli.photographs import find_corners, photographs
-from diffproj.cli.terminal import RESULTS, in_options, progress_bars, result
+from diffproj.cli.terminal import RESULTS, as_json, in_options, progress_bars, result, working
 from diffproj.cli.units import heading
 from diffproj.files.save import save_camera
 from diffproj.paper.experiment import Experiment, choose, default_split, parse_split, run_experiment
@@ -33,25 +33,42 @@ def run(options: argparse.Namespace) -> int:
         except ValueError as error:
             raise ValueError(f"--{error}") from None
     fit, test = choose(views, split)
-    outcome = run_experiment(fit, test, board, options.distortion, options.strict)
+    with working("Calibrating"):
+        outcome = run_experiment(fit, test, board, options.distortion, options.strict)
     outcome = replace(outcome, fit=replace(outcome.fit, unit=options.square.unit))
+    with working("Fitting the board's shape"):
+        measured, why = _on_the_measured_board(fit, test, board, options)
+    files = {"table1.csv": outcome.to_csv().encode()}
+    if measured is not None:
+        files["table1_measured_board.csv"] = measured.to_csv().encode()
+    files["fig7.png"] = figures.png(figures.fig7(outcome))
+    with writing("--output", options.output):
+        options.output.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            write_whole(options.output / name, content)
+        save_camera(options.output / "camera.json", outcome.fit)
+    names = [*files, "camera.json"]
+    if options.json:
+        as_json(
+            {
+                "output": str(options.output),
+                "files": names,
+                "unit": options.square.unit,
+                "table": outcome.to_dict(),
+                "table_measured_board": None if measured is None else measured.to_dict(),
+                "why_no_measured_board": why or None,
+                "camera": outcome.fit.to_dict(),
+                "warnings": options.warned,
+            }
+        )
+        return 0
     RESULTS.print(_table(outcome, "board as designed"))
-    measured, why = _on_the_measured_board(fit, test, board, options)
     if measured is None:
         result(f"\nThe board as it was printed: {why}")
     else:
         RESULTS.print(_table(measured, "board as printed, its corners where the fitting views have them"))
     result(f"\n{outcome.fit.summary()}")
-    picture = figures.png(figures.fig7(outcome))
-    with writing("--output", options.output):
-        options.output.mkdir(parents=True, exist_ok=True)
-        write_whole(options.output / "table1.csv", outcome.to_csv())
-        if measured is not None:
-            write_whole(options.output / "table1_measured_board.csv", measured.to_csv())
-        write_whole(options.output / "fig7.png", picture)
-        save_camera(options.output / "camera.json", outcome.fit)
-    second = "" if measured is None else "table1_measured_board.csv, "
-    result(f"\nWritten to {options.output}: table1.csv, {second}fig7.png, camera.json")
+    result(f"\nWritten to {options.output}: {', '.join(names)}")
     return 0
 
 
@@ -74,7 +91,8 @@ def _corners(options: argparse.Namespace) -> tuple[Views, Chessboard, tuple[list
         raise ValueError(f"--board: want 9x6 for --data, got {columns}x{rows}; --images takes your own photographs")
     if options.images is not None:
         with progress_bars() as bars:
-            views = find_corners(photographs(options.images), board, bars)
+            folders = [path for path in options.images if path.is_dir()]
+            views = find_corners(photographs(options.images), board, bars, in_folders=folders)
         return views, board, default_split(len(views))
     if options.data == "synthetic":
         setup = paper_setup()

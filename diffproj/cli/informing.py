@@ -2,15 +2,16 @@
 
 import argparse
 import math
+from typing import Any, NamedTuple
 
 import torch
 
 from diffproj.calibration.result import Calibration
 from diffproj.cli.converting import named
-from diffproj.cli.terminal import note, result
+from diffproj.cli.terminal import alert, as_json, result
 from diffproj.files.document import Document
 from diffproj.files.formats import CONVENTIONS, format_of, name_of
-from diffproj.files.load import load, load_camera
+from diffproj.files.load import content_of, found_in
 from diffproj.files.writing import has_pose
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import model_of
@@ -29,101 +30,140 @@ STEPS = 400
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    one = named(options.file, options.source, options.camera)
-    if one is not None:
-        cameras = {str(one): load_camera(options.file, options.source, one)}
-        aside: dict[str, Camera] = {}
-    else:
-        load_camera_or_several(options)
-        document = Document.read(options.file)
-        found = format_of(document, options.source).read(document)
-        cameras, aside = found.cameras, found.aside
     document = Document.read(options.file)
+    found = found_in(document, options.source)
+    one = named(found, options.camera)
+    if one is None:
+        cameras, aside = found.cameras, list(found.aside)
+    else:
+        try:
+            cameras, aside = {str(one): found.chosen(one)}, []
+        except ValueError as error:
+            raise ValueError(f"{options.file}: --{error}") from error
     format_ = name_of(format_of(document, options.source))
-    result(f"{options.file}: {format_}")
-    result(f"  {CONVENTIONS[format_]}")
-    for name, camera in cameras.items():
-        _say(name, camera)
-    if aside:
-        result(f"to be asked for by --camera: {', '.join(aside)}")
-    if format_ == "json":
-        whole = load(options.file)
-        if isinstance(whole, Calibration):
-            rms = ", ".join(f"{value:.4f}" for value in whole.rms.flatten()[:4].tolist())
-            result(f"a calibration of {len(whole.views)} views, RMS {rms} px")
+    content = content_of(document) if format_ == "json" else None
+    calibration = content if isinstance(content, Calibration) else None
+    told = {
+        "file": str(options.file),
+        "format": format_,
+        "conventions": CONVENTIONS[format_],
+        "cameras": {name: _described(name, camera) for name, camera in cameras.items()},
+        "aside": aside,
+        "calibration": None if calibration is None else _of_calibration(calibration),
+    }
+    doubts = [doubt for camera in told["cameras"].values() if camera is not None for doubt in camera["doubts"]]
+    if options.json:
+        as_json({**told, "warnings": [*options.warned, *doubts]})
+    else:
+        _say(told)
+    for doubt in doubts:
+        alert(doubt)
     return 0
 
 
-def load_camera_or_several(options: argparse.Namespace) -> None:
-    """Say in one line what is wrong with a file; that its cameras make no batch is no fault here."""
-    try:
-        load_camera(options.file, options.source)
-    except ValueError as error:
-        if "make no batch" not in str(error):
-            raise
+def _of_calibration(calibration: Calibration) -> dict[str, Any]:
+    return {"views": len(calibration.views), "rms": calibration.rms.flatten().tolist()}
 
 
-def _say(name: str, camera: Camera) -> None:
-    """A camera, or the first of a batch."""
-    many = camera.batch_shape.numel() if camera.batch_shape else 1
+def _described(name: str, camera: Camera) -> dict[str, Any] | None:
+    """A camera, or the first of a batch; `None` where it is empty."""
+    many = camera.batch_shape.numel() if camera.batch_shape else None
     if many == 0:
-        result(f"{name}: no camera")
-        return
-    result(f"{name}" + (f": {many} cameras side by side, of which the first is" * (many > 1)))
+        return None
     while camera.batch_shape:
         camera = camera[0]
     camera = camera.to(torch.float64)
     (f_x, skew, c_x), (_, f_y, c_y), _ = camera.K.tolist()
-    size = "unknown" if camera.size is None else f"{camera.size[0]} x {camera.size[1]} px"
-    result(f"  size             {size}")
+    model = model_of(camera.distortion)
+    numbers = [] if camera.distortion is None else camera.distortion.coefficients.tolist()  # type: ignore[attr-defined]
+    view = None if camera.size is None else _view(name, camera)
+    return {
+        "side_by_side": many,
+        "size": None if camera.size is None else list(camera.size),
+        "focal_lengths": [f_x, f_y],
+        "skew": skew,
+        "principal_point": [c_x, c_y],
+        "lens": model.name,
+        "coefficients": dict(zip(model.coefficient_names, numbers, strict=camera.distortion is not None)),
+        "centre": camera.center.tolist() if has_pose(camera) else None,
+        "field_of_view": None if view is None else view.angles,
+        "lens_reaches": None if view is None else view.reach,
+        "doubts": [] if view is None else view.doubts,
+    }
+
+
+def _say(told: dict[str, Any]) -> None:
+    """Print what is in the file."""
+    result(f"{told['file']}: {told['format']}")
+    result(f"  {told['conventions']}")
+    for name, camera in told["cameras"].items():
+        if camera is None:
+            result(f"{name}: no camera")
+        else:
+            _say_camera(name, camera)
+    if told["aside"]:
+        result(f"to be asked for by --camera: {', '.join(told['aside'])}")
+    if told["calibration"] is not None:
+        rms = ", ".join(f"{value:.4f}" for value in told["calibration"]["rms"][:4])
+        result(f"a calibration of {told['calibration']['views']} views, RMS {rms} px")
+
+
+def _say_camera(name: str, camera: dict[str, Any]) -> None:
+    many, skew = camera["side_by_side"] or 1, camera["skew"]
+    (f_x, f_y), (c_x, c_y) = camera["focal_lengths"], camera["principal_point"]
+    result(f"{name}" + (f": {many} cameras side by side, of which the first is" * (many > 1)))
+    result("  size             " + ("unknown" if camera["size"] is None else "{} x {} px".format(*camera["size"])))
     result(f"  focal lengths    {f_x:.6g}, {f_y:.6g} px" + (f", skew {skew:.4g}" * bool(skew)))
     result(f"  principal point  {c_x:.6g}, {c_y:.6g} px")
-    result(f"  lens             {_lens(camera)}")
-    if has_pose(camera):
-        result(f"  centre           {', '.join(f'{x:.6g}' for x in camera.center.tolist())} in the world")
-    if camera.size is not None:
-        _say_view(name, camera)
+    numbers = " ".join(f"{key} {x:.5g}" for key, x in camera["coefficients"].items())
+    result(f"  lens             {camera['lens']}: {numbers}" if numbers else "  lens             none in the file")
+    if camera["centre"] is not None:
+        result(f"  centre           {', '.join(f'{x:.6g}' for x in camera['centre'])} in the world")
+    if camera["size"] is None:
+        return
+    angles = camera["field_of_view"]
+    if angles is None:
+        result("  field of view    unknown, for the lens does not reach the edges of the image")
+    else:
+        result("  field of view    {:.1f} x {:.1f} degrees".format(*angles))
+    if camera["lens_reaches"] >= 1:
+        result("  lens             reaches all corners of the image")
 
 
-def _lens(camera: Camera) -> str:
-    if camera.distortion is None:
-        return "none in the file"
-    model = model_of(camera.distortion)
-    numbers = camera.distortion.coefficients.tolist()  # type: ignore[attr-defined]
-    return f"{model.name}: " + " ".join(
-        f"{key} {x:.5g}" for key, x in zip(model.coefficient_names, numbers, strict=True)
-    )
+class _View(NamedTuple):
+    """What a camera sees: its field of view in degrees, how far the lens reaches, and what looks wrong."""
+
+    angles: list[float] | None
+    reach: float
+    doubts: list[str]
 
 
-def _say_view(name: str, camera: Camera) -> None:
-    """Fields of view, how far the lens reaches, and what looks wrong."""
+def _view(name: str, camera: Camera) -> _View:
     width, height = camera.size or (0, 0)
     (f_x, _, c_x), (_, f_y, c_y), _ = camera.K.tolist()
     ends = [(-0.5, c_y), (width - 0.5, c_y), (c_x, -0.5), (c_x, height - 0.5)]
     angles = _off_axis(camera, ends)
     across, down = sum(angles[:2]), sum(angles[2:])
-    if math.isfinite(across + down):
-        result(f"  field of view    {across:.1f} x {down:.1f} degrees")
-    else:
-        result("  field of view    unknown, for the lens does not reach the edges of the image")
     corners = [(-0.5, -0.5), (width - 0.5, -0.5), (-0.5, height - 0.5), (width - 0.5, height - 0.5)]
     reach = min(_reach(camera, corner) for corner in corners)
-    if reach >= 1:
-        result("  lens             reaches all corners of the image")
-    else:
-        note(
+    doubts = []
+    if reach < 1:
+        doubts.append(
             f"{name}: the lens folds at {100 * reach:.0f} % of the way from the principal point to a corner; pixels "
             "beyond have no direction. Were corners or K of another size?"
         )
     if abs(c_x - (width - 1) / 2) > OFF_CENTER * width or abs(c_y - (height - 1) / 2) > OFF_CENTER * height:
-        note(
+        doubts.append(
             f"{name}: the principal point ({c_x:.1f}, {c_y:.1f}) is far from the middle of {width} x {height} px; the "
             "size may be exchanged, or that of another video mode, or the image a crop"
         )
     if abs(f_x / f_y - 1) > UNEQUAL:
-        note(f"{name}: the focal lengths {f_x:.5g} and {f_y:.5g} px differ; was the image stretched?")
+        doubts.append(f"{name}: the focal lengths {f_x:.5g} and {f_y:.5g} px differ; was the image stretched?")
     if model_of(camera.distortion).perspective and not NARROW < across < WIDE and math.isfinite(across):
-        note(f"{name}: a field of view of {across:.1f} degrees is unusual; is K that of an image of this size?")
+        doubts.append(
+            f"{name}: a field of view of {across:.1f} degrees is unusual; is K that of an image of this size?"
+        )
+    return _View([across, down] if math.isfinite(across + down) else None, reach, doubts)
 
 
 def _off_axis(camera: Camera, pixels: list[tuple[float, float]]) -> list[float]:

@@ -2,11 +2,10 @@
 
 import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-CAMERA_SUFFIXES = (".json", ".yaml", ".yml", ".xml")
 SMALLEST_BOARD, LARGEST_BOARD = 3, 1000
 """Inner corners each way that the corner detector needs, and more than any photograph resolves."""
 
@@ -62,11 +61,19 @@ def add_orientation(group: argparse._ArgumentGroup | argparse.ArgumentParser) ->
     )
 
 
-def camera_file(text: str) -> Path:
-    """Read the name of a camera file."""
-    if Path(text).suffix.lower() not in CAMERA_SUFFIXES:
-        raise argparse.ArgumentTypeError(f"want a file ending in {', '.join(CAMERA_SUFFIXES)}, got {text!r}")
-    return Path(text)
+def file_ending(*suffixes: str) -> Callable[[str], Path]:
+    """What reads the name of a file of one of these kinds."""
+
+    def read(text: str) -> Path:
+        if Path(text).suffix.lower() not in suffixes or "\0" in text:
+            raise argparse.ArgumentTypeError(f"want a file ending in {', '.join(suffixes)}, got {text!r}")
+        return Path(text)
+
+    return read
+
+
+camera_file = file_ending(".json", ".yaml", ".yml", ".xml")
+"""Reads the name of a camera file to write."""
 
 
 def numbers(text: str, count: int) -> tuple[float, ...] | None:
@@ -90,6 +97,16 @@ def check_writable(option: str, path: Path) -> None:
     if not path.parent.is_dir():
         raise ValueError(f"{option}: no such folder: {path.parent}; make it first, or choose another")
     _check_place(option, path.parent)
+
+
+def check_not_the_same(option: str, path: Path | None, read: Iterable[Path]) -> None:
+    """Check that what is written does not replace what is read.
+
+    Raises:
+        ValueError: it would.
+    """
+    if path is not None and path.exists() and path.resolve() in (one.resolve() for one in read):
+        raise ValueError(f"{option}: want another file than those that are read, got {path}; choose another name")
 
 
 def check_folder(option: str, path: Path) -> None:

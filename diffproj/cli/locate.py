@@ -3,8 +3,9 @@
 import argparse
 from pathlib import Path
 
+from diffproj.cli.common_options import add_camera, add_photograph, add_said, describe, pixel_noise
 from diffproj.cli.drawing import drawing
-from diffproj.cli.inputs import add_orientation, numbers, some_path
+from diffproj.cli.inputs import add_orientation, some_path
 from diffproj.cli.units import METRES
 
 DESCRIPTION = """\
@@ -44,33 +45,17 @@ examples:
 
 The file that -o writes is the camera at its place, with its error bars, for
 'diffproj measure' and dp.load_calibration; the last example measures on z = 0.
-
-exit codes: 0 done; 1 it failed, one line says why, nothing is written; 2 the
-command was not understood
 """
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
     """Give the command its description and its options."""
-    command.description, command.epilog = DESCRIPTION, EPILOG
-    command.formatter_class = argparse.RawDescriptionHelpFormatter
-    command.usage = "%(prog)s [PHOTO] --camera FILE --landmarks FILE [options]"
-    photograph = command.add_argument(
-        "photograph",
-        type=some_path,
-        metavar="PHOTO",
-        help="the photograph: its size is compared with the camera's, and --draw draws into it; not needed otherwise",
+    describe(command, DESCRIPTION, EPILOG, "%(prog)s [PHOTO] --camera FILE --landmarks FILE [options]")
+    add_photograph(
+        command,
+        "the photograph: its size is compared with the camera's, and --draw draws into it; not needed otherwise",
     )
-    # Not nargs="?": argparse would fill that with nothing as soon as an option comes before the photograph.
-    photograph.required = False
-    command.add_argument(
-        "--camera",
-        type=some_path,
-        required=True,
-        metavar="FILE",
-        help="the camera file, in any format that 'diffproj info' reads. A .json from 'diffproj calibrate' brings the "
-        "camera's own uncertainty along; other programs' files do not (required)",
-    )
+    add_camera(command)
     command.add_argument(
         "--landmarks",
         type=some_path,
@@ -111,7 +96,6 @@ def add_options(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="write the camera at its place with its error bars: a .json, replaced if there is one",
     )
-    output.add_argument("--json", action="store_true", help="print one JSON document, with null for what is not known")
     output.add_argument(
         "--draw",
         type=drawing,
@@ -119,6 +103,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         help="draw the landmarks, and where the camera sees them, into the photograph: a .png, .svg or .pdf, replaced "
         "if there is one",
     )
+    add_said(command)
     command.set_defaults(work="locating")
 
 
@@ -130,10 +115,10 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _pixel_sigma(text: str) -> float:
-    values = numbers(text, 1)
-    if values is None or not 1e-6 <= values[0] <= 1e6:
+    noise = pixel_noise(text)
+    if noise is None:
         raise argparse.ArgumentTypeError(f"want a positive number of pixels, such as 0.5, got {text!r}")
-    return values[0]
+    return noise
 
 
 def _located_file(text: str) -> Path:

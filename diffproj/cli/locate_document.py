@@ -11,7 +11,7 @@ from rich.table import Table
 from diffproj.calibration.adjustment import mounting_covariance
 from diffproj.calibration.result import Calibration
 from diffproj.cli.landmarks_file import Surveyed
-from diffproj.cli.terminal import RESULTS, aligned, counted, in_options, result, rounded
+from diffproj.cli.terminal import RESULTS, aligned, counted, in_options, known, result, rounded
 from diffproj.cli.units import heading
 
 MOUNTING = ("tilt", "roll", "heading", "x", "y", "z")
@@ -52,11 +52,11 @@ def document(
     values = (mounting.tilt, mounting.roll, mounting.heading, *mounting.position, mounting.height)
     spread = mounting_covariance(found).diagonal().clamp(min=0).sqrt()
     where = {
-        name: {"value": float(value), "deviation": _known(float(deviation))}
+        name: {"value": float(value), "deviation": known(float(deviation))}
         for name, value, deviation in zip(MOUNTING, values, spread, strict=True)
     }
     intrinsics = {
-        name: {"value": float(value), "deviation": _known(float(found.covariance.deviations[name]))}
+        name: {"value": float(value), "deviation": known(float(found.covariance.deviations[name]))}
         for name, value in zip(found.parameters.names, found.shared, strict=True)
         if name in free
     }
@@ -73,8 +73,8 @@ def document(
         "mounting": {name: where[name] for name in ANGLES},
         "intrinsics": intrinsics,
         "rms": float(found.rms),
-        "pixel_sigma": None if found.pixel_sigma is None else _known(float(found.pixel_sigma)),
-        "degrees_of_freedom": None if found.degrees_of_freedom is None else _known(float(found.degrees_of_freedom)),
+        "pixel_sigma": None if found.pixel_sigma is None else known(float(found.pixel_sigma)),
+        "degrees_of_freedom": None if found.degrees_of_freedom is None else known(float(found.degrees_of_freedom)),
         "deviations_include": includes + (["camera"] if calibrated and not free and found.knows_intrinsics else []),
         "landmarks": rows,
         "worst": max(used, key=lambda row: row["off"])["name"],
@@ -113,10 +113,6 @@ def _landmarks(found: Calibration, surveyed: Surveyed) -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def _known(number: float) -> float | None:
-    return number if math.isfinite(number) else None
 
 
 def say(told: dict[str, Any]) -> None:

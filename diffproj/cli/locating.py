@@ -1,14 +1,10 @@
 """`diffproj locate`: where a camera stood, from surveyed landmarks and the pixels that show them."""
 
 import argparse
-import json
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import Shaped
 from torch import Tensor
 
 from diffproj.calibration.locate import locate
@@ -16,15 +12,15 @@ from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.refine import refine
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
-from diffproj.cli.inputs import check_writable, writing
+from diffproj.cli.inputs import check_not_the_same, check_writable, writing
 from diffproj.cli.landmarks_file import Surveyed, read_landmarks
 from diffproj.cli.locate_document import document, say
-from diffproj.cli.photographs import photographs
+from diffproj.cli.photographs import one_photograph
 from diffproj.cli.scene import check_size, loaded
-from diffproj.cli.terminal import failure, result
+from diffproj.cli.terminal import as_json, failure, result
 from diffproj.files.save import save_camera
 from diffproj.geometry.camera import Camera
-from diffproj.targets.images import Orientation, grey, listed
+from diffproj.targets.images import grey
 from diffproj.targets.views import Views
 
 FEWEST = 4
@@ -36,13 +32,14 @@ def run(options: argparse.Namespace) -> int:
     check_drawing(options.draw)
     if options.output is not None:
         check_writable("--output", options.output)
+        check_not_the_same("--output", options.output, [options.camera, options.landmarks])
     if options.photograph is not None:
         check_no_photograph(options.draw, [options.photograph])
     camera, calibration = loaded(options.camera)
     surveyed = read_landmarks(options.landmarks)
     picture, size = None, camera.size
     if options.photograph is not None:
-        picture = _picture(options.photograph, options.orientation)
+        picture = grey(one_photograph(options.photograph, options.orientation))
         size = picture.shape[1], picture.shape[0]
         check_size(camera, size, options.camera, options.photograph)
     if size is None and options.draw is not None:
@@ -59,23 +56,13 @@ def run(options: argparse.Namespace) -> int:
         with writing("--output", options.output):
             save_camera(options.output, found)
     if options.json:
-        result(json.dumps(told, indent=1, allow_nan=False))
+        as_json(told)
         return 0
     say(told)
     for verb, path in (("Written", options.output), ("Drawn", options.draw)):
         if path is not None:
             result(f"{verb} to {path}")
     return 0
-
-
-def _picture(path: Path, orientation: Orientation) -> Shaped[np.ndarray, "h w"]:
-    """The grey values of the photograph."""
-    if path.is_dir():
-        raise ValueError(f"PHOTO: want one photograph, got the folder {path}")
-    sources = photographs([path])
-    if len(sources) > 1:
-        raise ValueError(f"PHOTO: want one photograph, got {len(sources)} of the form {path}")
-    return grey(listed(sources[0])[0], orientation)
 
 
 def _located(

@@ -3,11 +3,19 @@
 import argparse
 import functools
 
+from diffproj.cli.common_options import (
+    add_camera,
+    add_photograph,
+    add_plane,
+    add_pose,
+    add_said,
+    describe,
+    pixel_noise,
+)
 from diffproj.cli.drawing import drawing
-from diffproj.cli.inputs import DETECTOR, HAND, LARGEST_NUMBER, add_orientation, numbers, some_path
+from diffproj.cli.inputs import DETECTOR, HAND, numbers, some_path
 from diffproj.cli.measure_page import page_file
-from diffproj.cli.units import Length, height
-from diffproj.cli.which_board import add_kinds, add_measures, check_board
+from diffproj.cli.which_board import check_board
 
 DESCRIPTION = """\
 Turns pixels of a photograph into points on a plane, and prints them with the
@@ -23,7 +31,8 @@ landmarks.
 EPILOG = """\
 pixels:
   u runs to the right and v down; 0,0 is the middle of the first pixel. They may
-  be negative or lie outside the photograph. Each is taken to be off by 0.5 px,
+  be negative or lie outside the photograph; one without a point on the plane is
+  named, and is no failure. Each is taken to be off by 0.5 px,
   as points picked by hand are: --pixel-sigma tells another noise. A file of
   points has a line name,u,v for each, or u,v; titles and empty lines are
   passed over.
@@ -53,35 +62,20 @@ examples:
       --page measure.html
   diffproj measure photo.jpg --camera camera.yaml --board 9x6 --square 25mm \\
       --points-file points.csv --height 12 --pixel-sigma 0.7 --csv > box.csv
-
-exit codes: 0 done, also where pixels have no point on the plane, which the
-output names; 1 it failed, one line says why; 2 the command was not understood
 """
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
     """Give the command its description and its options."""
-    command.description, command.epilog = DESCRIPTION, EPILOG
-    command.formatter_class = argparse.RawDescriptionHelpFormatter
-    command.usage = (
+    usage = (
         "%(prog)s PHOTO --camera FILE --board CxR --square SIDE\n"
         "                        --points u,v ... [options]\n"
         "       %(prog)s --camera FILE --view NAME --points u,v ... [options]\n"
         "       %(prog)s PHOTO --camera FILE (--view NAME | --board ...) --page F"
     )
-    photograph = command.add_argument(
-        "photograph", type=some_path, metavar="PHOTO", help="the photograph, with --board; --view needs none"
-    )
-    # Not nargs="?": argparse would fill that with nothing as soon as an option comes before the photograph.
-    photograph.required = False
-    command.add_argument(
-        "--camera",
-        type=some_path,
-        required=True,
-        metavar="FILE",
-        help="the camera file, in any format that 'diffproj info' reads. A .json from 'diffproj calibrate' brings the "
-        "camera's own uncertainty along; other programs' files do not (required)",
-    )
+    describe(command, DESCRIPTION, EPILOG, usage)
+    add_photograph(command, "the photograph, with --board; --view needs none")
+    add_camera(command)
     pixels = command.add_mutually_exclusive_group()
     pixels.add_argument(
         "--points",
@@ -97,24 +91,8 @@ def add_options(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="a CSV file with the pixels to measure, a line name,u,v for each",
     )
-    pose = command.add_argument_group("where the camera stood: a board in PHOTO, or a view of the calibration")
-    either = pose.add_mutually_exclusive_group(required=True)
-    add_kinds(either)
-    either.add_argument("--view", metavar="NAME", help="name of the view, such as left01.jpg")
-    add_measures(pose)
-    plane = command.add_argument_group("the plane")
-    which = plane.add_mutually_exclusive_group()
-    which.add_argument(
-        "--height",
-        type=height,
-        default=Length(0.0),
-        metavar="H",
-        help="a plane parallel to the board, H above its face as the camera sees it, such as 12 or 12mm (default: 0, "
-        "the face itself)",
-    )
-    which.add_argument(
-        "--plane", type=_plane, metavar="a,b,c,d", help="the plane a x + b y + c z = d in the board's frame"
-    )
+    add_pose(command)
+    add_plane(command)
     more = command.add_argument_group("more")
     more.add_argument(
         "--pixel-sigma",
@@ -124,10 +102,6 @@ def add_options(command: argparse.ArgumentParser) -> None:
         help=f"standard deviation of u and of v of each point, in px; or '{DETECTOR}', the noise of the board's "
         f"corners, for pixels that a program found as well as these (default: {HAND}, for points picked by hand)",
     )
-    add_orientation(more)
-    output = more.add_mutually_exclusive_group()
-    output.add_argument("--json", action="store_true", help="print one JSON document, with null for what is not known")
-    output.add_argument("--csv", action="store_true", help="print one table for spreadsheets")
     more.add_argument(
         "--draw",
         type=drawing,
@@ -142,6 +116,8 @@ def add_options(command: argparse.ArgumentParser) -> None:
         help="write an .html page in which anyone measures in PHOTO by clicks, offline, with these error bars; with "
         "--view PHOTO is that view's photograph",
     )
+    forms = add_said(command)
+    forms.add_argument("--csv", action="store_true", help="print one table for spreadsheets")
     command.set_defaults(work="measuring", check=functools.partial(_check_which_pose, command))
 
 
@@ -154,23 +130,13 @@ def _pixel(text: str) -> tuple[float, ...]:
     return values
 
 
-def _plane(text: str) -> tuple[float, ...]:
-    values = numbers(text, 4)
-    if values is None or max(map(abs, values[:3])) < 1 / LARGEST_NUMBER:
-        raise argparse.ArgumentTypeError(
-            "want a plane a x + b y + c z = d as a,b,c,d without spaces, a, b and c not all 0, such as 0,0,1,25, "
-            f"got {text.strip()!r}"
-        )
-    return values
-
-
 def _pixel_sigma(text: str) -> float | str:
-    values = numbers(text, 1)
     if text.strip() == DETECTOR:
         return DETECTOR
-    if values is None or values[0] <= 0:
+    noise = pixel_noise(text)
+    if noise is None:
         raise argparse.ArgumentTypeError(f"want a positive number of pixels, such as 0.5, or {DETECTOR}, got {text!r}")
-    return values[0]
+    return noise
 
 
 def _check_which_pose(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@ import torch
 from diffproj.cli.measure_plane import described, height_above_face
 from diffproj.cli.points_file import Pixel
 from diffproj.cli.scene import Scene
+from diffproj.cli.terminal import known
 from diffproj.geometry.back_projection import Reason, explain
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
@@ -74,9 +75,9 @@ def document(
     height = height_above_face(scene, plane)
     return {
         "camera": str(scene.camera_file),
-        "photograph": None if scene.photograph is None else str(scene.photograph),
+        "photograph": None if scene.photograph is None else scene.photograph.label,
         "view": scene.calibration.views.names[scene.view],
-        "view_rms": _known(float(scene.calibration.view_rms[scene.view])),
+        "view_rms": known(float(scene.calibration.view_rms[scene.view])),
         "unit": scene.square.unit,
         "square": None if scene.has_landmarks else scene.square.value,
         "plane": [*normal, float(plane.offset)],
@@ -110,9 +111,9 @@ def _points(
         valid = reason == Reason.VALID
         name = given[number - 1].name
         row = {"number": number, "name": name, "pixel": pixel, "valid": valid, "reason": None if valid else reason.name}
-        row["world"] = [_known(x) for x in point] if valid else None
-        row["deviation"] = [_known(x) for x in deviation] if valid else None
-        row["interval_95"] = [[_known(a), _known(b)] for a, b in zip(low, high, strict=True)] if valid else None
+        row["world"] = [known(x) for x in point] if valid else None
+        row["deviation"] = [known(x) for x in deviation] if valid else None
+        row["interval_95"] = [[known(a), known(b)] for a, b in zip(low, high, strict=True)] if valid else None
         row["extrapolated"] = beyond[number - 1]
         rows.append(row)
         if not valid:
@@ -155,20 +156,14 @@ def between(low: float, high: float, scale: float) -> str:
     return f"from {start}" if start else f"up to {end}" if end else "unknown"
 
 
-def _known(number: float) -> float | None:
-    return number if math.isfinite(number) else None
-
-
 def _quantities(found: Quantity) -> list[dict[str, Any]]:
     low, high = found.interval(0.95)
     columns = (found.value, found.deviation, low, high, found.significant & (found.value > 0))
     return [
         {
-            "value": _known(value),
-            "deviation": _known(deviation),
-            "interval_95": [_known(below), _known(above)]
-            if math.isfinite(value) and math.isfinite(deviation)
-            else None,
+            "value": known(value),
+            "deviation": known(deviation),
+            "interval_95": [known(below), known(above)] if math.isfinite(value) and math.isfinite(deviation) else None,
             "significant": significant if math.isfinite(value) else None,
         }
         for value, deviation, below, above, significant in zip(*(column.tolist() for column in columns), strict=True)

@@ -3,6 +3,8 @@
 Where the camera was found from landmarks, heights count from z = 0 towards z.
 """
 
+import argparse
+
 import torch
 
 from diffproj.calibration.result import Calibration
@@ -12,6 +14,17 @@ from diffproj.geometry.plane import Plane
 
 FLAT = 1e-9
 """Parts of the board's size by which its corners may lie off a plane z = const, and still be flat."""
+
+
+def plane_of(scene: Scene, options: argparse.Namespace) -> Plane:
+    """The plane that the options say.
+
+    Raises:
+        ValueError: as `plane_at_height`.
+    """
+    if options.plane is None:
+        return plane_at_height(scene, options.height)
+    return Plane(torch.tensor(options.plane[:3], dtype=torch.float64, device="cpu"), options.plane[3])
 
 
 def plane_at_height(scene: Scene, height: Length) -> Plane:

@@ -1,7 +1,6 @@
 """`diffproj measure`: points, lengths and an area on a plane, with error bars, from pixels of a photograph."""
 
 import argparse
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -13,15 +12,14 @@ from diffproj.cli.inputs import DETECTOR, HAND
 from diffproj.cli.measure_csv import as_csv
 from diffproj.cli.measure_document import PixelNoise, document
 from diffproj.cli.measure_page import check_page, write_page
-from diffproj.cli.measure_plane import plane_at_height
+from diffproj.cli.measure_plane import plane_of
 from diffproj.cli.measure_tables import say, shown
 from diffproj.cli.points_file import Pixel, read_points
-from diffproj.cli.scene import Scene, new_photograph, stored_view
-from diffproj.cli.terminal import result
-from diffproj.geometry.plane import Plane
+from diffproj.cli.scene import Scene, scene_of
+from diffproj.cli.terminal import as_json, result
 from diffproj.measurement.choices import detector_noise
 from diffproj.measurement.measure import measure
-from diffproj.targets.images import Orientation, grey, listed
+from diffproj.targets.images import grey
 
 
 def run(options: argparse.Namespace) -> int:
@@ -31,17 +29,17 @@ def run(options: argparse.Namespace) -> int:
         check_no_photograph(options.draw, [options.photograph])
     check_page(options.page)
     given = _given_pixels(options)
-    scene = stored_view(options) if options.view is not None else new_photograph(options)
+    scene = scene_of(options)
     noise = _noise(options, scene)
-    if options.plane is None:
-        plane = plane_at_height(scene, options.height)
-    else:
-        plane = Plane(torch.tensor(options.plane[:3], dtype=torch.float64, device="cpu"), options.plane[3])
+    plane = plane_of(scene, options)
     if options.page is not None:
         write_page(options, scene, plane, DETECTOR if noise.source == DETECTOR else noise.sigma)
         if not given:
             page = str(options.page)
-            result(json.dumps({"page": page}) if options.json else f"Written to {page}: open it in a browser")
+            if options.json:
+                as_json({"page": page, "warnings": options.warned})
+            else:
+                result(f"Written to {page}: open it in a browser")
             return 0
     pixels = torch.tensor([[pixel.u, pixel.v] for pixel in given], dtype=torch.float64, device="cpu")
     sigma = DETECTOR if noise.source == DETECTOR else noise.sigma
@@ -49,9 +47,9 @@ def run(options: argparse.Namespace) -> int:
     found = document(scene, plane, noise, given, measured)
     found["warnings"] = options.warned
     if options.draw is not None:
-        _draw(options.draw, scene, found, options.orientation)
+        _draw(options.draw, scene, found)
     if options.json:
-        result(json.dumps(found, indent=1, allow_nan=False))
+        as_json(found)
     elif options.csv:
         result(as_csv(found).rstrip())
     else:
@@ -84,7 +82,7 @@ def _noise(options: argparse.Namespace, scene: Scene) -> PixelNoise:
     return PixelNoise(float(known), DETECTOR)
 
 
-def _draw(path: Path, scene: Scene, found: dict[str, Any], orientation: Orientation) -> None:
+def _draw(path: Path, scene: Scene, found: dict[str, Any]) -> None:
     """Draw what was measured into the photograph."""
     from diffproj import figures  # here, for it loads matplotlib
 
@@ -94,7 +92,7 @@ def _draw(path: Path, scene: Scene, found: dict[str, Any], orientation: Orientat
         [row["pixel"] for row in found["points"]],
         [row["name"] if row["valid"] else f"{row['name']} (not on the plane)" for row in found["points"]],
         [_length_in_words(length, scene.square.unit) for length in found["lengths"]],
-        photograph=None if scene.photograph is None else grey(listed(scene.photograph)[0], orientation),
+        photograph=None if scene.photograph is None else grey(scene.photograph),
         title=f"{found['view']}: {found['plane_in_words']}",
     )
     write_drawing(path, figure)

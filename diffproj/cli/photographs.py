@@ -2,8 +2,9 @@
 
 import hashlib
 import os
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ import cv2
 import numpy as np
 from rich.progress import Progress
 
-from diffproj.cli.terminal import counted, note
+from diffproj.cli.terminal import counted, detail, note, working
+from diffproj.targets import videos
 from diffproj.targets.boards import Board
 from diffproj.targets.detection import detect
-from diffproj.targets.images import SUFFIXES, Source, listed
+from diffproj.targets.images import SUFFIXES, NotAnImageError, Orientation, Photograph, decoded, listed
 from diffproj.targets.views import Views
 
 HEIC = frozenset({".heic", ".heif", ".hif"})
@@ -26,11 +28,17 @@ REMEDIES = {
 }
 """Photographs that have to be converted: by their suffixes, what they are and what to do."""
 
+A_VIDEO = "video{}: name a video by itself, for its frames are of another size"
 
-def photographs(paths: Iterable[Path]) -> list[Source]:
-    """Files as they are, and the photographs in folders, in natural order; each once, however often it is there.
 
-    What is left out of a folder is told on standard error: broken files and copies by name, others by their number.
+def photographs(paths: Iterable[Path], frames: int | None = None) -> list[Photograph]:
+    """Files as they are, the photographs in folders, in natural order, and frames of videos; each once.
+
+    What is left out of a folder is told on standard error: copies by name, others by their number.
+
+    Args:
+        paths: files, patterns, folders.
+        frames: of a video, each so-manieth frame; by default sharp ones.
 
     Raises:
         ValueError: a folder holds no photograph, or a file is of a kind that has to be converted.
@@ -40,27 +48,95 @@ def photographs(paths: Iterable[Path]) -> list[Source]:
     for path in paths:
         for photograph in _in_folder(path) if path.is_dir() else _named(path):
             found.setdefault(photograph.resolve(), photograph)  # a file that is named twice needs no word
-    return list(_without_copies(list(found.values())))
+    files = _without_copies(list(found.values()))
+    if not any(_is_video(file) for file in files):
+        return listed(files)
+    with working("Reading videos"):
+        return listed(files, frames)
+
+
+def one_photograph(path: Path, orientation: Orientation, colour: bool = False) -> Photograph:
+    """A single photograph, read and decoded: whoever needs its pixels finds them in its source.
+
+    Raises:
+        ValueError: there are several, or it is of a kind that has to be converted, or no image.
+        OSError: it cannot be read.
+    """
+    if path.is_dir():
+        raise ValueError(f"PHOTO: want one photograph, got the folder {path}; name one of its files")
+    files = _named(path)
+    if len(files) > 1:
+        raise ValueError(f"PHOTO: want one photograph, got {len(files)} of the form {path}; name one of them")
+    if _is_video(files[0]):
+        raise ValueError(f"PHOTO: want a photograph, got the video {path}; save one of its frames as a .png")
+    with _silent_opencv():
+        return Photograph(files[0].name, str(files[0]), decoded(files[0], orientation, colour))
 
 
 def find_corners(
-    sources: list[Any], board: Board, bars: Progress, title: str = "Finding corners", orientation: str = "sensor"
+    sources: list[Any],
+    board: Board,
+    bars: Progress,
+    title: str = "Finding corners",
+    orientation: str = "sensor",
+    in_folders: Collection[Path] = (),
 ) -> Views:
-    """The board's corners in photographs, on all cores, under a progress bar."""
+    """The board's corners in photographs, on all cores, under a progress bar.
+
+    Args:
+        sources: photographs, of each of which pixels are decoded once.
+        board: to look for.
+        bars: where the progress is shown.
+        title: of the progress bar.
+        orientation: how pixels are counted.
+        in_folders: folders that were named; what cannot be read of these is left out, and told.
+    """
     task = bars.add_task(title, total=None)
-    with ThreadPoolExecutor(max(1, min(len(sources), os.cpu_count() or 1))) as cores:
-        return detect(
-            sources,
-            board,
-            lambda done, total: bars.update(task, completed=done, total=total),
-            orientation=orientation,
-            executor=cores,
+    with ThreadPoolExecutor(max(1, min(len(sources), os.cpu_count() or 1))) as cores, _silent_opencv():
+
+        def found(among: list[Any]) -> Views:
+            return detect(
+                among,
+                board,
+                lambda done, total: bars.update(task, completed=done, total=total),
+                orientation=orientation,
+                executor=cores,
+            )
+
+        try:
+            views = found(sources)
+        except NotAnImageError as error:
+            if error.path.parent not in in_folders:
+                raise
+            views = found(_readable(sources, in_folders))
+    detail(f"{title}: {counted(len(views), 'view')} of {counted(len(sources), 'photograph')}")
+    return views
+
+
+def _readable(sources: list[Photograph], in_folders: Collection[Path]) -> list[Photograph]:
+    """Without what cannot be read of the folders."""
+    left = [one for one in sources if isinstance(one.source, Path) and one.source.parent in in_folders]
+    broken = [one for one in left if isinstance(one.source, Path) and not _is_image(one.source)]
+    kept = [one for one in sources if not any(one is other for other in broken)]
+    if not kept:
+        folder = Path(broken[0].label).parent
+        raise ValueError(
+            f"{folder}: want a folder with photographs ({', '.join(sorted(SUFFIXES))}), its "
+            f"{counted(len(broken), 'image file')} cannot be read; copy them once more"
         )
+    for one in broken:
+        note(f"{one.label}: cannot be read as an image; skipped")
+    return kept
+
+
+def _is_video(path: Path) -> bool:
+    return path.suffix.lower() in videos.SUFFIXES
 
 
 def _named(path: Path) -> list[Path]:
     """A file, or those of a pattern; what is named is not left out."""
-    files = [Path(str(photograph.source)) for photograph in listed(str(path))]
+    # A video is listed by its frames, which takes long: a file that is there stands for itself.
+    files = [path] if path.is_file() else [Path(one.label) for one in listed(str(path))]
     for file in files:
         for suffixes, remedy in REMEDIES.items():
             if file.suffix.lower() in suffixes:
@@ -69,26 +145,22 @@ def _named(path: Path) -> list[Path]:
 
 
 def _in_folder(folder: Path) -> list[Path]:
-    """The photographs in a folder that can be read."""
+    """The photographs in a folder."""
     files = [file for file in folder.iterdir() if not file.is_dir()]
     hidden = [file for file in files if file.name.startswith(".")]
     seen = [file for file in files if file not in hidden]
-    convertible = {
-        remedy: [file for file in seen if file.suffix.lower() in suffixes] for suffixes, remedy in REMEDIES.items()
+    kinds = {
+        remedy: [file for file in seen if file.suffix.lower() in suffixes]
+        for suffixes, remedy in {**REMEDIES, videos.SUFFIXES: A_VIDEO}.items()
     }
-    others = len(seen) - sum(map(len, convertible.values())) - sum(file.suffix.lower() in SUFFIXES for file in seen)
-    told = [f"{len(found)} {remedy.format('s' * (len(found) > 1))}" for remedy, found in convertible.items() if found]
-    readable, broken = [], []
-    if any(file.suffix.lower() in SUFFIXES for file in seen):
-        for photograph in listed(str(folder)):
-            path = Path(str(photograph.source))
-            (readable if _is_image(path) else broken).append(path)
-    if not readable:
-        why = f"its {counted(len(broken), 'image file')} cannot be read" if broken else "found none in it"
-        rest = "".join(f"; it holds {text}" for text in told)
-        raise ValueError(f"{folder}: want a folder with photographs ({', '.join(sorted(SUFFIXES))}), {why}{rest}")
-    for path in broken:
-        note(f"{path}: cannot be read as an image; skipped")
+    there = [file for file in seen if file.suffix.lower() in SUFFIXES]
+    others = len(seen) - sum(map(len, kinds.values())) - len(there)
+    told = [f"{len(found)} {remedy.format('s' * (len(found) > 1))}" for remedy, found in kinds.items() if found]
+    if not there:
+        rest = "".join(f"; it holds {text}" for text in told) or "; name another"
+        raise ValueError(
+            f"{folder}: want a folder with photographs ({', '.join(sorted(SUFFIXES))}), found none in it{rest}"
+        )
     for text in told:
         note(f"{folder}: skipped {text}")
     left = []
@@ -98,17 +170,23 @@ def _in_folder(folder: Path) -> list[Path]:
         left.append(counted(others, "file") + (" that is no photograph" if others == 1 else " that are no photographs"))
     if left:
         note(f"{folder}: skipped {' and '.join(left)}")
-    return readable
+    return [Path(one.label) for one in listed(str(folder))]
 
 
 def _is_image(path: Path) -> bool:
     """Whether OpenCV reads it; at an eighth of its size, which for JPEG takes a fraction of the time."""
     data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    # What is wrong with a broken file is nothing for the terminal. OpenCV 4 and 5 have this in different places.
+    return bool(data.size) and cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_8) is not None
+
+
+@contextmanager
+def _silent_opencv() -> Iterator[None]:
+    """What is wrong with a broken file is nothing for the terminal: one line of ours says it."""
+    # OpenCV 4 and 5 have this in different places.
     set_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
     before = set_level(0)
     try:
-        return bool(data.size) and cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_8) is not None
+        yield
     finally:
         set_level(before)
 

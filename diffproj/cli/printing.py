@@ -3,8 +3,8 @@
 import argparse
 
 from diffproj.cli.inputs import check_writable, writing
-from diffproj.cli.terminal import result
-from diffproj.cli.which_board import given_board
+from diffproj.cli.terminal import as_json, result
+from diffproj.cli.which_board import given_board, kind_of
 from diffproj.targets.printing import UNITS, draw_target
 
 
@@ -21,5 +21,9 @@ def run(options: argparse.Namespace) -> int:
         except ValueError as error:
             text = str(error)
             raise ValueError(f"--{text}" if text.startswith("paper") else text) from None
+    if options.json:
+        told = {"file": str(options.file), "kind": kind_of(options), "board": repr(board), "paper": options.paper}
+        as_json({**told, "unit": unit, "warnings": options.warned})
+        return 0
     result(f"Written to {options.file}: print it at 100 %, and measure its ruler")
     return 0

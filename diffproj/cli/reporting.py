@@ -8,6 +8,7 @@ from typing import Any
 
 from diffproj._core.atomic import write_whole
 from diffproj.calibration.result import Calibration
+from diffproj.calibration.validation import CrossValidation
 from diffproj.cli.inputs import check_writable, writing
 
 SUFFIXES = (".html", ".htm")
@@ -33,14 +34,23 @@ def check_report(path: Path | None) -> None:
         import_module("jinja2")
 
 
-def report_text(calibration: Calibration, options: argparse.Namespace, photographs: Sequence[Any], board: Any) -> str:
-    """The report on a calibration; empty where none is asked for."""
-    if options.report is None:
-        return ""
-    from diffproj.report.write import report  # here, for it takes a while to load
+def report_text(
+    calibration: Calibration,
+    options: argparse.Namespace,
+    photographs: Sequence[Any],
+    board: Any,
+    folds: CrossValidation | None,
+) -> str:
+    """The report on a calibration, with the views held out as they were, or in five folds."""
+    from diffproj.report.write import FOLDS, report  # here, for it takes a while to load
 
     return report(
-        calibration, photographs, target=board, orientation=options.orientation, camera_file=str(options.output)
+        calibration,
+        photographs,
+        FOLDS if folds is None else folds,
+        target=board,
+        orientation=options.orientation,
+        camera_file=str(options.output),
     )
 
 

@@ -10,12 +10,13 @@ import torch
 from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.rig_result import RigCalibration
-from diffproj.cli.photographs import find_corners, photographs
-from diffproj.cli.terminal import progress_bars
+from diffproj.cli.photographs import find_corners, one_photograph
+from diffproj.cli.terminal import detail, progress_bars
 from diffproj.cli.units import Length, agreed, heading
 from diffproj.cli.which_board import given_board
 from diffproj.files.load import load
 from diffproj.geometry.camera import Camera
+from diffproj.targets.images import Photograph
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Scene:
 
     Attributes:
         camera_file: the camera's file.
-        photograph: the photograph, where a new one was given.
+        photograph: the photograph, where a new one was given, with its pixels.
         calibration: whose view it is.
         view: the number of the view.
         includes: whose uncertainty the standard deviations include: pixels, pose, camera.
@@ -34,7 +35,7 @@ class Scene:
     """
 
     camera_file: Path
-    photograph: Path | None
+    photograph: Photograph | None
     calibration: Calibration
     view: int
     includes: tuple[str, ...]
@@ -51,6 +52,18 @@ class Scene:
     def has_landmarks(self) -> bool:
         """Whether the pose was found from landmarks and not from a board."""
         return self.calibration.landmarks is not None
+
+
+def scene_of(options: argparse.Namespace) -> Scene:
+    """Where the camera stood, as the options say.
+
+    Raises:
+        ValueError: as `stored_view` and `new_photograph`.
+        OSError: a file cannot be read.
+    """
+    if options.view is not None:
+        return stored_view(options)
+    return new_photograph(options, one_photograph(options.photograph, options.orientation))
 
 
 def stored_view(options: argparse.Namespace) -> Scene:
@@ -87,11 +100,15 @@ def stored_view(options: argparse.Namespace) -> Scene:
     )
 
 
-def new_photograph(options: argparse.Namespace) -> Scene:
+def new_photograph(options: argparse.Namespace, photograph: Photograph) -> Scene:
     """The pose before the board in a new photograph.
 
+    Args:
+        options: of the command.
+        photograph: with its pixels.
+
     Raises:
-        ValueError: no single photograph, no board in it, another size than the camera's, or no pose that fits.
+        ValueError: no board in it, another size than the camera's, or no pose that fits.
     """
     camera, calibration = loaded(options.camera)
     board, side, option = given_board(options)
@@ -100,13 +117,8 @@ def new_photograph(options: argparse.Namespace) -> Scene:
         square, doubt = agreed(square, _calibrated_square(calibration), options.camera, option)
         if doubt is not None:
             warnings.warn(doubt, stacklevel=2)
-    if options.photograph.is_dir():
-        raise ValueError(f"PHOTO: want one photograph, got the folder {options.photograph}")
-    sources = photographs([options.photograph])
-    if len(sources) > 1:
-        raise ValueError(f"PHOTO: want one photograph, got {len(sources)} of the form {options.photograph}")
     with progress_bars() as bars:
-        views = find_corners(sources, board, bars, orientation=options.orientation)
+        views = find_corners([photograph], board, bars, orientation=options.orientation)
     check_size(camera, views.size, options.camera, options.photograph)
     try:
         found = locate(views, board, camera if calibration is None else calibration)
@@ -120,7 +132,7 @@ def new_photograph(options: argparse.Namespace) -> Scene:
         title += f" ({float(calibration.rms):.4f} px in the calibration)"
         includes += ("camera",) if calibration.knows_intrinsics else ()
     unit = heading(square.unit) or f"the unit of {option}"
-    return Scene(options.camera, Path(str(sources[0])), found, 0, includes, title, square, unit)
+    return Scene(options.camera, photograph, found, 0, includes, title, square, unit)
 
 
 def loaded(path: Path) -> tuple[Camera, Calibration | None]:
@@ -131,6 +143,7 @@ def loaded(path: Path) -> tuple[Camera, Calibration | None]:
         ValueError: it holds no camera, or several.
     """
     found = load(path)
+    detail(f"{path}: read")
     if isinstance(found, RigCalibration):
         raise ValueError(  # noqa: TRY004
             f"--camera: want one camera, got a rig of {', '.join(found.names)} in {path}; diffproj convert "

@@ -1,17 +1,48 @@
 """What commands say and where: results on standard output, progress, warnings and failures on standard error."""
 
+import json
 import math
 import re
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from diffproj.calibration.result import CalibrationError
 from diffproj.calibration.solver import Status
+from diffproj.cli.command_line import leave_output
 
-RESULTS = Console(highlight=False, emoji=False)
+
+class _Results(Console):
+    """Standard output: what it does not take is a failure of the command."""
+
+    def print(self, *arguments: Any, **options: Any) -> None:
+        try:
+            super().print(*arguments, **options)
+        except OSError as error:
+            leave_output()
+            raise OSError(f"standard output: {error.strerror}; send it elsewhere") from error
+
+
+RESULTS = _Results(highlight=False, emoji=False)
 NOTES = Console(stderr=True, highlight=False, emoji=False)
+
+
+@dataclass
+class Voice:
+    """How much is said on standard error, from when on."""
+
+    quiet: bool = False
+    verbose: bool = False
+    began: float = field(default_factory=time.monotonic)
+
+
+VOICE = Voice()
+"""Of the command that runs; see `speak`."""
 
 HUGE = 1e5
 """Standard deviation from which numbers are shown with a power of ten, as for points close to the horizon."""
@@ -25,9 +56,44 @@ REMEDIES = {
 """What to do about errors of the system."""
 
 
-def note(text: str) -> None:
-    """One line on standard error, however long."""
+def speak(quiet: bool = False, verbose: bool = False) -> None:
+    """Say how much is to be said from now on."""
+    VOICE.quiet, VOICE.verbose, VOICE.began = quiet, verbose, time.monotonic()
+
+
+def alert(text: str) -> None:
+    """A warning or a failure: one line on standard error, however long."""
     NOTES.print(f"diffproj: {text}", markup=False, soft_wrap=True)
+
+
+def note(text: str) -> None:
+    """What is good to know: one line on standard error, unless the command is to be quiet."""
+    if not VOICE.quiet:
+        alert(text)
+
+
+def detail(text: str) -> None:
+    """What was done, and when: one line on standard error, where the command is to be verbose."""
+    if VOICE.verbose:
+        alert(f"{time.monotonic() - VOICE.began:.2f} s: {text}")
+
+
+def as_json(told: Mapping[str, Any]) -> None:
+    """One JSON document on standard output; numbers that are not finite are not known, and `null`."""
+    result(json.dumps(_finite(told), indent=1, allow_nan=False))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(part) for part in value]
+    return known(value) if isinstance(value, float) else value
+
+
+def known(number: float) -> float | None:
+    """A number as a JSON document has it: `None` where it is not known."""
+    return number if math.isfinite(number) else None
 
 
 def result(text: str) -> None:
@@ -44,10 +110,9 @@ def in_options(text: str) -> str:
     """What the library says, with the command's options in place of Python's, and without what it has not."""
     text = re.sub(r"^(calibrate|refine|locate|measure): ", "", text)
     text = re.sub(r", or (let fixed or priors hold|fix) the principal point and the lens( \([^)]*\))?", "", text)
+    text = re.sub(r"\b(distortion|shape)=(['\"]?)(\w*)\2", r"--\1 \3", text)
     return (
-        text.replace("distortion=", "--distortion ")
-        .replace("shape=", "--shape ")
-        .replace("skew=True", "--skew")
+        text.replace("skew=True", "--skew")
         .replace("reject_outliers=True", "--reject-outliers")
         .replace("'auto'", "auto")
         .replace("give legacy=True", "give --legacy")
@@ -71,7 +136,7 @@ def failure(error: Exception) -> str:
 
 
 def progress_bars() -> Progress:
-    """Bars that vanish when done; nothing where standard error is no terminal."""
+    """Bars that vanish when done; nothing where standard error is no terminal, or the command is to be quiet."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -79,8 +144,17 @@ def progress_bars() -> Progress:
         TimeRemainingColumn(),
         console=NOTES,
         transient=True,
-        disable=not NOTES.is_terminal,
+        disable=VOICE.quiet or not NOTES.is_terminal,
     )
+
+
+@contextmanager
+def working(title: str) -> Iterator[None]:
+    """A bar under which work is done whose end is not known."""
+    with progress_bars() as bars:
+        bars.add_task(title, total=None)
+        yield
+    detail(f"{title}: done")
 
 
 def rounded(value: float, deviation: float) -> tuple[str, str]:

@@ -8,7 +8,7 @@ or not at all.
 
 | format | files | holds | written |
 |---|---|---|---|
-| `"json"` | `.json` | any batch of cameras; whole calibrations and rigs | yes |
+| `"json"` | `.json`; `.jsonl` of a fleet | any batch of cameras; whole calibrations and rigs | yes |
 | `"opencv"` | YAML, XML, JSON of OpenCV; plain YAML, JSON | K, lens, size; R and T of a pair | a camera, a pair |
 | `"ros"` | `ost.yaml`, `ost.txt`, `.ini`, `camera_info` | raw camera by K and D; rectified one by P | one camera |
 | `"colmap"` | `cameras`, `images`: `.txt`, `.bin` | lens and size; poses in `images` | `.txt`, `.bin` |

@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from diffproj.files.trees import json_tree, xml_tree, yaml_tree
+from diffproj.files.trees import json_lines, json_tree, xml_tree, yaml_tree
 
 MOST_BYTES = 2**31
 """No camera file is larger; a film that was taken for one is."""
@@ -78,7 +78,7 @@ class Document:
 
     @property
     def tree(self) -> Any:
-        """What JSON, YAML or XML says, in Python's own types; see `trees`.
+        """What JSON, YAML or XML says, in Python's own types; of JSON lines, a list of them; see `trees`.
 
         Raises:
             ValueError: it is none of the three.
@@ -100,6 +100,8 @@ class Document:
         if self.text is None:
             return None, "want JSON, YAML or XML, got a binary file"
         start = self.text.lstrip()[:1]
+        if self.path.suffix.lower() == ".jsonl":
+            return json_lines(self.text), ""
         parsers = [xml_tree] if start == "<" else [json_tree] if self.path.suffix.lower() == ".json" else [yaml_tree]
         if start in ("{", "[") and parsers == [yaml_tree]:
             parsers = [json_tree, yaml_tree]  # YAML has lists and mappings in brackets too

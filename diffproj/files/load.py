@@ -1,11 +1,12 @@
 """`load`, `load_camera` and `load_calibration`: cameras and calibrations from files."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
 
-from diffproj._core.arguments import file_path
+from diffproj._core.arguments import called, file_path
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.rig_result import RigCalibration
 from diffproj.files import own_json
@@ -48,7 +49,11 @@ def load_camera(path: PathLike, format: FormatName | None = None, camera: str | 
         ...     dp.load_camera(f"{folder}/camera.yaml")
         Camera(f 1.0, 1.0 px, c 0.0, 0.0 px, pinhole, 640 x 480 px, no pose, torch.float64)
     """
-    document = Document.read(file_path("path", path))
+    return _chosen(Document.read(file_path("path", path)), format, camera)
+
+
+def _chosen(document: Document, format: FormatName | None = None, camera: str | int | None = None) -> Camera:  # noqa: A002
+    """The camera of a file that is asked for."""
     found = found_in(document, format)
     try:
         return found.chosen(camera)
@@ -69,13 +74,18 @@ def found_in(document: Document, format: FormatName | None = None) -> Found:  # 
         raise ValueError(_message(document, error)) from error
 
 
-def load_calibration(path: PathLike) -> Calibration:
+def load_calibration(path: PathLike, camera: str | None = None) -> Calibration:
     """Load a whole calibration from this package's own JSON; see `save_camera`.
 
+    Args:
+        path: the file to read.
+        camera: the name of one camera, of the lines that `diffproj calibrate --fleet` wrote.
+
     Raises:
-        TypeError: the path is none.
+        TypeError: the path is none, or `camera` is no name.
         OSError: there is no such file, or it cannot be read.
-        ValueError: the file is no JSON of this package, is damaged, or holds a camera alone.
+        ValueError: the file is no JSON of this package, is damaged, holds a camera alone, or several cameras of which
+            none is named, or none of that name.
 
     Example:
         >>> import tempfile, diffproj as dp
@@ -87,7 +97,9 @@ def load_calibration(path: PathLike) -> Calibration:
         True
     """
     document = Document.read(file_path("path", path))
-    calibration = _own(document, own_json.read_calibration)
+    if not isinstance(camera, str | None):
+        raise TypeError(f"camera: want the name of a camera, got {called(camera)}")
+    calibration = _own(document, partial(own_json.read_calibration, camera=camera))
     if calibration is None:
         raise ValueError(
             f"{path}: want a calibration as save_camera writes it to .json, got a file with cameras alone or a rig; "
@@ -96,17 +108,30 @@ def load_calibration(path: PathLike) -> Calibration:
     return calibration
 
 
-def load(path: PathLike) -> Camera | Calibration | RigCalibration:
+def load(path: PathLike, camera: str | None = None) -> Camera | Calibration | RigCalibration:
     """Load what a file holds: the whole calibration or rig where there is one, the camera otherwise.
 
+    Args:
+        path: the file to read.
+        camera: the name of one camera where there are several: see `load_calibration` and `load_camera`.
+
     Raises:
-        TypeError: the path is none.
+        TypeError: the path is none, or `camera` is no name.
         OSError: there is no such file, or it cannot be read.
         ValueError: as for `load_camera`.
     """
-    document = Document.read(file_path("path", path))
-    found = _own(document, own_json.read_rig) or _own(document, own_json.read_calibration)
-    return load_camera(path) if found is None else found
+    return content_of(Document.read(file_path("path", path)), camera)
+
+
+def content_of(document: Document, camera: str | None = None) -> Camera | Calibration | RigCalibration:
+    """What a file in hand holds; see `load`."""
+    if not isinstance(camera, str | None):
+        raise TypeError(f"camera: want the name of a camera, got {called(camera)}")
+    found = None
+    if camera is None or own_json.holds_fleet(document):
+        found = _own(document, own_json.read_rig)
+        found = found or _own(document, partial(own_json.read_calibration, camera=camera))
+    return _chosen(document, camera=camera) if found is None else found
 
 
 def _own(document: Document, read: Callable[[Document], T | None]) -> T | None:

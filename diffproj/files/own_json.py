@@ -10,8 +10,10 @@ one that is not finite. Where a list would have thousands of numbers, they stand
 
     {"shape": [1000, 54, 2], "float64": "..."}          or "bool": base64 of little-endian numbers, row by row
 
-which a thousand views load from in a fifth of the time. Version 1, without packed numbers, is read too. What a file
-says is checked: shapes against each other, ranges, and the RMS against the corners.
+which a thousand views load from in a fifth of the time. Version 1, without packed numbers, is read too. JSON lines
+(`.jsonl`), as `diffproj calibrate --fleet` writes them, have such a document a line, with the `name` of its camera;
+lines without a camera say why there is none. What a file says is checked: shapes against each other, ranges, and the
+RMS against the corners.
 """
 
 import base64
@@ -47,8 +49,13 @@ DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 def recognises(document: Document) -> bool:
-    """Whether it calls itself a camera file of diffproj, or a rig's."""
-    return document.mapping.get("format") in (KIND, RIG)
+    """Whether it calls itself a camera file of diffproj, a rig's, or a fleet's."""
+    return document.mapping.get("format") in (KIND, RIG) or holds_fleet(document)
+
+
+def holds_fleet(document: Document) -> bool:
+    """Whether it has a camera a line, by name."""
+    return bool(_fleet(document))
 
 
 def write(path: Path, item: Camera | Calibration | RigCalibration) -> dict[Path, str]:
@@ -61,11 +68,20 @@ def write(path: Path, item: Camera | Calibration | RigCalibration) -> dict[Path,
         cameras = {name: _camera_fields(camera) for name, camera in item.cameras.items()}
         whole = {"format": RIG, "version": VERSION, "cameras": cameras, "rig": item.to_fields()}
         return {path: _readable(json.dumps(_plain(whole), indent=1, allow_nan=False))}
+    return {path: _readable(json.dumps(_plain(_fields(item)), indent=1, allow_nan=False))}
+
+
+def as_line(item: Camera | Calibration, **more: Any) -> str:
+    """A camera or a calibration on one line, with more keys in front; `name` is that of the camera."""
+    return json.dumps(_plain(more | _fields(item)), allow_nan=False) + "\n"
+
+
+def _fields(item: Camera | Calibration) -> dict[str, Any]:
     camera = item.camera if isinstance(item, Calibration) else item
     document = {"format": KIND, "version": VERSION, "camera": _camera_fields(camera)}
     if isinstance(item, Calibration):
         document["calibration"] = item.to_fields()
-    return {path: _readable(json.dumps(_plain(document), indent=1, allow_nan=False))}
+    return document
 
 
 def read(document: Document) -> Found:
@@ -74,6 +90,8 @@ def read(document: Document) -> Found:
     Raises:
         ValueError: it is no camera file of this package, or damaged.
     """
+    if fleet := _fleet(document):
+        return Found({name: _camera(_known(line)["camera"]) for name, line in fleet.items()})
     fields = _checked(document)
     if fields["format"] == RIG:
         return Found({name: _camera(camera) for name, camera in fields["cameras"].items()})
@@ -86,8 +104,8 @@ def read_rig(document: Document) -> RigCalibration | None:
     Raises:
         ValueError: it is no file of this package, or damaged.
     """
-    fields = _checked(document)
-    if fields["format"] != RIG:
+    fields = {} if holds_fleet(document) else _checked(document)
+    if fields.get("format") != RIG:
         return None
     try:
         cameras = {name: _camera(camera) for name, camera in fields["cameras"].items()}
@@ -96,18 +114,22 @@ def read_rig(document: Document) -> RigCalibration | None:
         raise ValueError(f"the rig in this file is damaged ({_said(error)})") from error
 
 
-def read_calibration(document: Document) -> Calibration | None:
+def read_calibration(document: Document, camera: str | None = None) -> Calibration | None:
     """The calibration in a file; `None` where it holds a camera alone.
 
+    Args:
+        document: the file.
+        camera: the name of one camera of a fleet.
+
     Raises:
-        ValueError: it is no camera file of this package, or damaged.
+        ValueError: it is no camera file of this package, is damaged, or holds no such camera, or several.
     """
-    fields = _checked(document)
+    fields = _chosen(document, camera)
     if fields["format"] == RIG or fields.get("calibration") is None:
         return None
-    camera = _camera(fields["camera"])
+    found = _camera(fields["camera"])
     try:
-        return Calibration.from_fields(_unpacked(fields["calibration"]), camera)
+        return Calibration.from_fields(_unpacked(fields["calibration"]), found)
     except DAMAGE as error:
         raise ValueError(f"the calibration in this file is damaged ({_said(error)})") from error
 
@@ -158,9 +180,35 @@ def _tensor(fields: dict[str, Any], name: str, dtype: torch.dtype) -> Tensor:
     return torch.tensor(array, dtype=dtype, device="cpu")
 
 
+def _fleet(document: Document) -> dict[str, dict[str, Any]]:
+    """The lines of a fleet that have a camera, by its name; of two of one name, the later counts."""
+    if document.path.suffix.lower() != ".jsonl":
+        return {}
+    lines = [line for line in document.tree if isinstance(line, dict) and line.get("format") == KIND]
+    return {str(line["name"]): line for line in lines if "name" in line}
+
+
+def _chosen(document: Document, camera: str | None) -> dict[str, Any]:
+    """What is in a file, or of a fleet in the line of one camera."""
+    fleet = _fleet(document)
+    if not fleet:
+        if camera is not None:
+            raise ValueError(f"camera: want it left out, for the file holds one, got {camera!r}")
+        return _checked(document)
+    if camera is None and len(fleet) > 1:
+        raise ValueError(f"camera: want the name of one of {len(fleet)}, such as {next(iter(fleet))!r}, got None")
+    name = next(iter(fleet)) if camera is None else camera
+    if name not in fleet:
+        raise ValueError(f"camera: want the name of one of {len(fleet)}, such as {next(iter(fleet))!r}, got {name!r}")
+    return _known(fleet[name])
+
+
 def _checked(document: Document) -> dict[str, Any]:
     """What is in a file, known to be one of this package and of a version that is read."""
-    fields = document.mapping
+    return _known(document.mapping)
+
+
+def _known(fields: dict[str, Any]) -> dict[str, Any]:
     holds = {KIND: "camera", RIG: "cameras"}.get(str(fields.get("format")))
     if holds is None or holds not in fields or (holds == "cameras" and not isinstance(fields[holds], dict)):
         raise ValueError("want a camera file of diffproj, got another file")

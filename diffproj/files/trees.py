@@ -10,6 +10,7 @@ A number in quotes is a string. Two equal keys, references, entities and deep ne
 import json
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 from xml.etree import ElementTree
 
@@ -41,6 +42,20 @@ def json_tree(text: str) -> Any:
         raise ValueError(f"want JSON, got something else ({error})") from None
     check_depth(tree)
     return tree
+
+
+def json_lines(text: str) -> list[Any]:
+    """The trees of JSON texts, one a line; the last is left out where it was not written to its end.
+
+    Raises:
+        ValueError: a line is not JSON.
+    """
+    *whole, rest = text.split("\n")
+    trees = [json_tree(line) for line in whole if line.strip()]
+    if rest.strip():
+        with suppress(ValueError):
+            trees.append(json_tree(rest))
+    return trees
 
 
 def yaml_tree(text: str) -> Any:

@@ -7,9 +7,11 @@ estimate and its covariance are
 
 where a camera that did not see a point adds nothing about it, and what it knows of the others still counts. The errors
 of different cameras are taken to be independent, as they are where each was calibrated and located by itself. Several
-photographs of one calibrated camera share the errors of its intrinsics, in ways that are not known here: each of n
-counts by an nth of its information, which no correlation makes too much (covariance intersection, Julier and Uhlmann
-1997). So does a measurement that is given twice.
+photographs of one calibrated camera share the errors of its intrinsics, and those by the cameras of a rig the errors of
+all that was calibrated with it, in ways that are not known here: each of n counts by an nth of its information, which
+no correlation makes too much (covariance intersection, Julier and Uhlmann 1997). So does a measurement that is given
+twice. Of a rig's own moments, and of points in space, `RigCalibration.triangulate` knows the joint covariance, and is
+surer.
 
 Whether the cameras agree is tested: each camera against the estimate of all others, by the chi-square of the difference
 (by F's distribution where deviations were estimated from few residuals). The camera that disagrees most is named, then
@@ -224,14 +226,16 @@ def _same(a: Plane, b: Plane) -> bool:
 
 
 def _sharing(found: Sequence[Measurement]) -> list[int]:
-    """For each measurement how many of them have its errors in common: those of one calibration, and copies."""
+    """For each measurement how many of them have its errors in common: those of one calibration or rig, and copies."""
     return [sum(one is other or _one_calibration(one, other) for other in found) for one in found]
 
 
 def _one_calibration(one: Measurement, other: Measurement) -> bool:
-    """Whether the intrinsics' errors of both are those of one calibration: its numbers are nobody else's."""
+    """Whether the intrinsics' errors of both are those of one calibration: its numbers, or its rig's, are its own."""
     if not (one.includes_intrinsics and other.includes_intrinsics):
         return False
+    if one._sight.rig is not None and one._sight.rig == other._sight.rig:
+        return True
     a, b = ((camera.K, *tree_leaves(camera.distortion)) for camera in (one._sight.camera, other._sight.camera))
     return len(a) == len(b) and all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 

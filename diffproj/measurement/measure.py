@@ -151,7 +151,8 @@ def measure(
         covariances.append(D.new_full((1, 1), torch.inf))
     beside = torch.cat(away, dim=-1)
     common = torch.where(valid[..., None, None], torch.cat([*blocks, beside], dim=-1), 0.0)
-    sight = Sight(pixels.expand(*batch, *pixels.shape[-2:]), sigma, camera, plane, by_theta, beside)
+    rig = calibration.rig if isinstance(calibration, Calibration) else None
+    sight = Sight(pixels.expand(*batch, *pixels.shape[-2:]), sigma, camera, plane, by_theta, beside, rig)
     errors = Noise(
         sight,
         common,

@@ -25,6 +25,7 @@ class Sight:
         plane: what they lie on.
         by_theta: the derivative of the points' pixels by camera and pose `(*B, N, 2, q)`.
         away: where else the points may lie, linear in d more unknowns `(*B, N, 3, d)`.
+        rig: which rig the camera is of, if it is of one.
     """
 
     pixels: Tensor
@@ -33,6 +34,7 @@ class Sight:
     plane: Plane
     by_theta: Tensor
     away: Tensor
+    rig: str | None = None
 
     def points(self, index: Tensor, theta: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """The points after a step of camera, pose and plane, and of the pixels.

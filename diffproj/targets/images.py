@@ -14,9 +14,6 @@ from torch import Tensor
 from diffproj.targets import videos
 from diffproj.targets.videos import Frame
 
-Source = str | os.PathLike[str] | np.ndarray | Tensor
-"""A photograph, or several: a file, folder or pattern; an array or tensor."""
-
 SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".jp2", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
 """Suffixes of the files in a folder that count as photographs."""
 
@@ -40,6 +37,10 @@ class Photograph(NamedTuple):
     source: Path | np.ndarray | Tensor | Frame
 
 
+Source = str | os.PathLike[str] | np.ndarray | Tensor | Photograph
+"""A photograph, or several: a file, folder or pattern; an array or tensor; one that was listed before."""
+
+
 def listed(photographs: Source | Iterable[Source], frames: int | None = None) -> list[Photograph]:
     """List the input photographs one by one.
 
@@ -61,6 +62,8 @@ def listed(photographs: Source | Iterable[Source], frames: int | None = None) ->
 
 
 def _named(number: int, entry: Any, frames: int | None) -> list[Photograph]:
+    if isinstance(entry, Photograph):
+        return [entry]
     if isinstance(entry, np.ndarray | Tensor):
         return [Photograph(f"image {number}", f"image {number}", entry)]
     if isinstance(entry, str | os.PathLike):
@@ -121,7 +124,7 @@ def grey(photograph: Photograph, orientation: Orientation = "sensor") -> Shaped[
     """
     label, source = photograph.label, photograph.source
     if isinstance(source, Path):
-        return _scaled(label, _read(source, orientation))
+        return _scaled(label, decoded(source, orientation))
     if isinstance(source, Frame):
         return source.image
     image = _channels_last(label, source) if isinstance(source, Tensor) else source
@@ -138,15 +141,36 @@ def as_8_bit(image: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     return image if image.dtype == np.uint8 else np.rint(image).astype(np.uint8)
 
 
-def _read(path: Path, orientation: Orientation) -> np.ndarray:
+class NotAnImageError(ValueError):
+    """A file that is no image, or a damaged one.
+
+    Attributes:
+        path: the file.
+    """
+
+    def __init__(self, path: Path, size: int) -> None:
+        super().__init__(path, size)  # so that it can travel from process to process
+        self.path = path
+
+    def __str__(self) -> str:
+        return f"{self.path}: want an image, got {self.args[1]} bytes that OpenCV cannot read as one"
+
+
+def decoded(path: Path, orientation: Orientation, colour: bool = False) -> np.ndarray:
+    """The pixels of a file, of 8 or 16 bits: grey `(H, W)`, or in colour `(H, W, 3)` BGR.
+
+    Raises:
+        NotAnImageError: the file is no image.
+        OSError: it cannot be read.
+    """
     # cv2.imread does not distinguish a missing file from a broken one, and fails on some file names.
     data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+    flags = (cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE) | cv2.IMREAD_ANYDEPTH
     if orientation == "sensor":
         flags |= cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(data, flags) if data.size else None
     if image is None:
-        raise ValueError(f"{path}: want an image, got {data.size} bytes that OpenCV cannot read as one")
+        raise NotAnImageError(path, data.size)
     return image
 
 

@@ -20,6 +20,9 @@ SMALLEST, LARGEST = 4.0, 12.0
 STEPS = 15
 """Most steps of the fit."""
 
+BEYOND = 8.0
+"""Distance in px from the disc up to which lines of the print matter: of large tags most do not."""
+
 BLOCK = 40
 """Corners fitted at a time."""
 
@@ -50,6 +53,24 @@ class Patches(NamedTuple):
     def only(self, which: slice | Tensor) -> "Patches":
         """Some of them."""
         return Patches(self.x[which], self.y[which], self.dark[which])
+
+    def within(self, reach: Float[Tensor, "n 2"]) -> "Patches":
+        """The same with lines along x and y only up to those distances; beyond, the nearest cells go on for ever."""
+        x, dark = _without_far(self.x, self.dark.mT, reach[:, :1])
+        y, dark = _without_far(self.y, dark.mT, reach[:, 1:])
+        return Patches(x, y, dark)
+
+
+def _without_far(lines: Tensor, steps: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+    """Lines `(N, k)` up to a distance `(N, 1)`, and the steps `(N, k + 1, *)` at them; far ones are always passed."""
+    near = lines.abs() < reach
+    most = max(1, int(near.sum(-1).max()))
+    passed = (~near & (lines < 0)).to(steps).unsqueeze(-1)
+    first = steps[:, :1] + (passed * steps[:, 1:]).sum(1, keepdim=True)
+    order = (~near).to(torch.uint8).argsort(dim=-1, stable=True)[:, :most]
+    kept, there = lines.gather(1, order), near.gather(1, order)
+    steps = steps[:, 1:].gather(1, order.unsqueeze(-1).expand(-1, -1, steps.shape[-1])) * there.unsqueeze(-1)
+    return torch.where(there, kept, _FAR), torch.cat([first, steps], dim=1)
 
 
 def patches_of(art: Artwork, corners: Float[np.ndarray, "n 2"], reach: float) -> Patches:
@@ -130,6 +151,8 @@ def _fit_block(
     base = np.rint(corners).astype(int)
     grey, weight, place = _pixels(image, base, corners - base, radius)
     inverse = np.linalg.inv(jacobians)
+    per_px = torch.from_numpy(np.linalg.norm(inverse, axis=-1)).float()
+    patches = patches.within(per_px * torch.from_numpy(radius + BEYOND).float().unsqueeze(-1))
     start = np.concatenate([corners - base, inverse.reshape(-1, 4), np.full((len(corners), 1), 0.8)], axis=1)
     shape = torch.from_numpy(start).float()
     light = _first_light(shape, patches, grey, weight, place)

@@ -1,6 +1,6 @@
-"""One piece of work for each photograph, here or on the workers of an executor, with results in order."""
+"""One piece of work for each photograph or camera, here or on the workers of an executor: in order, or as they come."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from typing import Any, TypeVar
 
@@ -34,17 +34,33 @@ def results_of(
         ...     results_of(abs, [-3, 1, -2], pool)
         [3, 1, 2]
     """
-    total = len(items)
-    if executor is None:
-        results = []
-        for done, item in enumerate(items, start=1):
-            results.append(work(item))
-            if progress is not None:
-                progress(done, total)
-        return results
     found: dict[int, Any] = {}
+    for place, result in as_done(work, items, executor):
+        found[place] = result
+        if progress is not None:
+            progress(len(found), len(items))
+    return [found[place] for place in range(len(items))]
+
+
+def as_done(
+    work: Callable[[Item], Result], items: Sequence[Item], executor: Executor | None = None
+) -> Iterator[tuple[int, Result]]:
+    """The results one by one as they come, each with its item's number from 0; see `results_of`.
+
+    Raises:
+        Exception: the first that the work raised; what has not begun by then is cancelled, as it is when nobody asks
+            for more.
+
+    Example:
+        >>> list(as_done(abs, [-3, 1]))
+        [(0, 3), (1, 1)]
+    """
+    if executor is None:
+        for place, item in enumerate(items):
+            yield place, work(item)
+        return
     places: dict[Future[Any], int] = {}
-    waiting = list(reversed(range(total)))
+    waiting = list(reversed(range(len(items))))
     try:
         while waiting or places:
             while waiting and len(places) < AHEAD:
@@ -52,10 +68,7 @@ def results_of(
                 places[executor.submit(work, items[place])] = place
             done, _ = wait(places, return_when=FIRST_COMPLETED)
             for future in sorted(done, key=places.__getitem__):
-                found[places.pop(future)] = future.result()
-                if progress is not None:
-                    progress(len(found), total)
+                yield places.pop(future), future.result()
     finally:
         for future in places:
             future.cancel()
-    return [found[place] for place in range(total)]

@@ -299,3 +299,36 @@ def test_wrong_arguments_are_named(three: Scene, pair: dict[str, dp.Views]) -> N
     for kind, message, call in cases:
         with pytest.raises(kind, match=message):
             call()
+
+
+def test_landmarks_in_space_are_a_target() -> None:
+    """A cage of points far from the world's origin, turned before two cameras."""
+    draw = torch.Generator().manual_seed(1)
+    cage = torch.rand(20, 3, generator=draw, dtype=D) * torch.tensor([4.0, 3, 2], dtype=D)
+    cage = cage + torch.tensor([100.0, 200, 5], dtype=D)
+    K = torch.tensor([[900.0, 0, 640], [0, 900, 480], [0, 0, 1]], dtype=D)
+    place = dp.Camera(
+        K, dp.rotation_from_euler(*torch.tensor([0.02, 0.25, 0.01], dtype=D)), torch.tensor([-1.5, 0.1, 0.2], dtype=D)
+    )
+    for noise, moments in ((0.0, 4), (0.3, 8)):
+        R = dp.rotation_from_euler(*(torch.rand(3, moments, generator=draw, dtype=D) - 0.5) * 1.2)
+        t = torch.randn(moments, 3, generator=draw, dtype=D) * 0.3 + torch.tensor([0.0, 0, 8], dtype=D)
+        left = dp.Camera(K, R, t - R @ cage.mean(0))
+        right = dp.Camera(K, place.R @ left.R, left.t @ place.R.mT + place.t)
+        views = {}
+        for name, camera in (("left", left), ("right", right)):
+            pixels = camera.project(cage)[0]
+            pixels = pixels + noise * torch.randn(pixels.shape, generator=draw, dtype=D)
+            views[name] = dp.Views(pixels, size=(1280, 960))
+        rig = dp.calibrate_rig(views, dp.Landmarks(cage), "none")
+        off = rig.cameras["right"].t - place.t
+        if noise == 0:
+            assert off.abs().max() < 1e-9
+            continue
+        assert bool((off.abs() < 4 * rig.place_covariance("right").diagonal().sqrt()[3:]).all())
+        assert rig.rms == pytest.approx(noise * 2**0.5, rel=0.15)
+        errors = dp.cross_validate_rig(views, dp.Landmarks(cage), "none", folds=2)
+        assert errors.held_out_px.amax() < 0.7
+        assert errors.held_out_world.amax() < 0.7 * 8 / 900
+    with pytest.raises(ValueError, match="shape: want 'flat' for points that are not all on z = 0, got 'free'"):
+        dp.calibrate_rig(views, dp.Landmarks(cage), "none", shape="free")

@@ -1,4 +1,4 @@
-"""Photographs that tests of several commands take."""
+"""Photographs that tests of several commands take, and where these run."""
 
 from pathlib import Path
 
@@ -21,3 +21,9 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cv2.imwrite(str(folder / "5.png"), empty.numpy() * 0 + 90)
     (folder / "notes.txt").write_text("not a photograph")
     return folder
+
+
+@pytest.fixture
+def there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs a test in the folder that its module makes."""
+    monkeypatch.chdir(folder)

@@ -9,7 +9,7 @@ import pytest
 
 import diffproj as dp
 from diffproj import __main__, cli
-from diffproj.cli.terminal import failure, rounded
+from diffproj.cli.terminal import failure, in_options, rounded
 
 
 def test_failures_name_options_of_the_command_line() -> None:
@@ -19,6 +19,11 @@ def test_failures_name_options_of_the_command_line() -> None:
     assert failure(PermissionError(13, "Permission denied", "camera.json")) == (
         "camera.json: Permission denied; choose another place, or change who may use it"
     )
+
+
+def test_remedies_name_options_of_the_command_line() -> None:
+    said = "refine: take shape='free', distortion='auto' or distortion=brown8, or skew=True"
+    assert in_options(said) == "take --shape free, --distortion auto or --distortion brown8, or --skew"
 
 
 def test_help_and_module(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,7 +86,7 @@ def test_missing_matplotlib_is_found_before_the_work(
     ("arguments", "code", "text"),
     [
         (["help"], 0, "find a camera from photographs of a board"),
-        (["--help"], 0, "'diffproj help COMMAND' tells more about a command."),
+        (["--help"], 0, "'diffproj help COMMAND' tells more about a command, with examples."),
         (["--version"], 0, f"diffproj {dp.__version__}\n"),
         (["calibrat"], 2, "invalid choice: 'calibrat' (choose from"),
         (["help", "nothing"], 2, "invalid choice: 'nothing'"),

@@ -18,6 +18,7 @@ from diffproj import cli, synthetic
 BOARD = ("--board", "8x5", "--square", "25mm")
 POINTS = ("--points", "210,133", "402,140")
 VIEW = ("measure", "--camera", "camera.json", "--view", "1.png")
+TOP = ("rectify", "photo.png", *BOARD)
 PHOTO = ("measure", "photo.png", *BOARD, *POINTS, "--camera")
 
 
@@ -50,7 +51,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "other.yaml").write_text("%YAML:1.0\n---\nhello: 5\n")
     for name in ("noise.json", "noise.yaml", "noise.xml", "noise.csv", "noise.png"):
         (folder / name).write_bytes(bytes([200, 13, 7, 255, 0, 60]) * 40)
-    for name in ("empty.json", "empty.yaml", "empty.xml", "empty.csv", "empty.png", "phone.heic", "raw.cr2"):
+    for name in (
+        "empty.json",
+        "empty.yaml",
+        "empty.xml",
+        "empty.csv",
+        "empty.png",
+        "phone.heic",
+        "raw.cr2",
+        "film.mp4",
+    ):
         (folder / name).touch()
     (folder / "short.csv").write_text("a,1\nb,2\n")
     (folder / "twice.csv").write_text("a,1,2\na,3,4\n")
@@ -107,8 +117,12 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
     (("calibrate", "photo.png", *BOARD, "--draw", "a.gif"), 2, r"--draw: want a file ending in \.png, \.svg, \.pdf"),
     (("calibrate", "photo.png", *BOARD, "--draw", "gone/a.png"), 1, "--draw: no such folder: gone; make it"),
     (("calibrate", "photo.png", *BOARD, "--draw", "folder.png"), 1, "--draw: want a file, got a folder"),
-    (("calibrate", "photo.png", *BOARD, "--draw", "photo.png"), 1, "--draw: want another file than the photographs"),
-    ((*PHOTO, "camera.json", "--draw", "./photo.png"), 1, "--draw: want another file than the photographs"),
+    (
+        ("calibrate", "photo.png", *BOARD, "--draw", "photo.png"),
+        1,
+        "--draw: want another file than those that are read",
+    ),
+    ((*PHOTO, "camera.json", "--draw", "./photo.png"), 1, "--draw: want another file than those that are read"),
     ((*VIEW, *POINTS, "--draw", "gone/a.pdf"), 1, "--draw: no such folder: gone; make it"),
     (("experiment", "--output", "list.json"), 1, "--output: want a folder, got the file .*list.json"),
     (("experiment", "--output", "list.json/results"), 1, "--output: want a folder, got the file .*list.json"),
@@ -192,6 +206,96 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
     ),
     (("measure", "phone.heic", *BOARD, *POINTS, "--camera", "camera.json"), 1, "convert to JPEG in full size"),
     (("measure", "grey.png", *BOARD, *POINTS, "--camera", "camera.json"), 1, r"found none in grey\.png\. Check"),
+    # Rectify.
+    (("rectify", "--camera", "camera.json", *BOARD), 2, "PHOTO: want the photograph, got none"),
+    ((*TOP, "--camera", "gone.json"), 1, "gone.json: No such file or directory; check its name"),
+    ((*TOP, "--camera", "empty.json"), 1, "empty.json: want a camera file, got an empty one"),
+    (("rectify", "gone.png", "--camera", "camera.json", *BOARD), 1, "no such file: gone.png"),
+    (
+        ("rectify", "nothing", "--camera", "camera.json", *BOARD),
+        1,
+        "PHOTO: want one photograph, got the folder nothing",
+    ),
+    (("rectify", "empty.png", "--camera", "camera.json", *BOARD), 1, r"empty\.png: want an image, got 0 bytes"),
+    (("rectify", "noise.png", "--camera", "camera.json", *BOARD), 1, r"noise\.png: want an image"),
+    (
+        ("rectify", "[pg][hr]*.png", "--camera", "camera.json", *BOARD),
+        1,
+        r"PHOTO: want one photograph, got \d of the form",
+    ),
+    (("rectify", "film.mp4", "--camera", "camera.json", *BOARD), 1, "want a photograph, got the video film.mp4; save"),
+    (("rectify", "grey.png", "--camera", "camera.json", *BOARD), 1, r"found none in grey\.png\. Check"),
+    ((*TOP, "--camera", "camera.json", "--resolution", "nan"), 2, "--resolution: want a positive number"),
+    ((*TOP, "--camera", "camera.json", "--resolution", "-1"), 2, "--resolution: want a positive number"),
+    ((*TOP, "--camera", "camera.json", "--resolution", "1e-12"), 1, "--resolution: want a top view of at most"),
+    ((*TOP, "--camera", "camera.json", "--extent", "0,0,0,1"), 2, "--extent: want x0,y0,x1,y1 without spaces"),
+    ((*TOP, "--camera", "camera.json", "--extent", "nan,0,1,1"), 2, "--extent: want x0,y0,x1,y1 without spaces"),
+    ((*TOP, "--camera", "camera.json", "-o", "top.gif"), 2, r"--output: want a file ending in \.png, \.tif, \.tiff"),
+    ((*TOP, "--camera", "camera.json", "-o", "folder.png"), 1, "--output: want a file, got a folder"),
+    ((*TOP, "--camera", "camera.json", "-o", "photo.png"), 1, "--output: want another file than those that are read"),
+    # What is read is not written over, and no number is taken that cannot be.
+    (("convert", "camera.json", "./camera.json"), 1, "OUT: want another file than those that are read"),
+    (
+        ("locate", "--camera", "camera.json", "--landmarks", "short.csv", "-o", "camera.json"),
+        1,
+        "--output: want another file than those that are read",
+    ),
+    (("locate", "--camera", "camera.json", "--landmarks", "gone.csv"), 1, "gone.csv: No such file or directory"),
+    (("locate", "--camera", "camera.json", "--landmarks", "nothing"), 1, "nothing: Is a directory"),
+    (("locate", "--camera", "camera.json", "--landmarks", "empty.csv"), 1, "--landmarks: want lines with columns"),
+    (
+        ("locate", "film.mp4", "--camera", "camera.json", "--landmarks", "short.csv"),
+        1,
+        "--landmarks|the video film.mp4",
+    ),
+    (("calibrate", "film.mp4", *BOARD), 1, "film.mp4: want a video, got a file of which OpenCV reads no frame"),
+    (("calibrate", "photo.png", *BOARD, "--folds", "1"), 2, "--folds: want a whole number from 2 to 1000"),
+    (("calibrate", "photo.png", *BOARD, "--folds", "-3"), 2, "--folds: want a whole number|expected one argument"),
+    (("calibrate", "photo.png", *BOARD, "--folds", "nan"), 2, "--folds: want a whole number from 2 to 1000"),
+    (("calibrate", "photo.png", *BOARD, "--folds", "7"), 1, "--folds: want at most the number of views, 1, got 7"),
+    (("calibrate", "photo.png", *BOARD, "--frames", "0"), 2, "--frames: want a whole number from 1 to 1000000"),
+    (("measure", "film.mp4", *BOARD, *POINTS, "--camera", "camera.json"), 1, "want a photograph, got the video"),
+    # The board to print.
+    (("board", *BOARD), 2, "the following arguments are required: FILE"),
+    (("board", "board.txt", *BOARD), 2, r"FILE: want a file ending in \.pdf, \.svg, \.png"),
+    (("board", "gone/board.pdf", *BOARD), 1, "FILE: no such folder: gone; make it first"),
+    (("board", "folder.png", *BOARD), 1, "FILE: want a file, got a folder"),
+    (("board", "board.pdf", "--board", "8x5", "--square", "-25mm"), 2, "--square: want the side|expected one argument"),
+    (("board", "board.pdf", "--board", "8x5", "--square", "nan"), 2, "--square: want the side of a square"),
+    (("board", "board.pdf", "--board", "8x5", "--square", "9m"), 1, "--paper|paper"),
+    (("board", "board.pdf", *BOARD, "--paper", "A99"), 1, "--paper: want"),
+    (("board", "board.pdf", *BOARD, "--paper", "-1,nan"), 1, "--paper: want"),
+    (("board", "board.pdf", *BOARD, "--dpi", "nan"), 2, "--dpi: want pixels per inch from 50 to 5000"),
+    (("board", "board.pdf", "--charuco", "6x5", "--square", "20"), 2, "--marker: want it along with --charuco"),
+    (
+        ("board", "a.pdf", "--charuco", "6x5", "--square", "20", "--marker", "15", "--dictionary", "none"),
+        1,
+        "--dictionary: want",
+    ),
+    (("board", "board.pdf", "--target", "gone.yaml"), 1, "gone.yaml"),
+    (("board", "board.pdf", "--target", "other.yaml"), 1, "other.yaml: want"),
+    # Each command knows its options.
+    *(
+        (
+            (command, *more, "--nonsense"),
+            2,
+            f"{command}: unrecognized arguments: --nonsense; 'diffproj {command}",
+        )
+        for command, more in {
+            "board": ("a.pdf", *BOARD),
+            "calibrate": ("photo.png", *BOARD),
+            "measure": ("photo.png", *BOARD, *POINTS, "--camera", "camera.json"),
+            "rectify": ("photo.png", *BOARD, "--camera", "camera.json"),
+            "locate": ("--camera", "camera.json", "--landmarks", "short.csv"),
+            "convert": ("camera.json", "new.yaml"),
+            "info": ("camera.json",),
+            "experiment": (),
+        }.items()
+    ),
+    (("info", "nothing"), 1, "nothing: want a file, got a folder"),
+    (("info", "camera.json", "--camera", "7"), 1, "camera.json: --camera: want a number from 0 to 0, got 7"),
+    (("info", "camera.json", "--from", "nonsense"), 2, "--from: invalid choice: 'nonsense'"),
+    (("convert", "camera.json", "new.yaml", "--camera", "left"), 1, "--camera: want one of"),
     # The experiment.
     (("experiment", "--split", "x"), 1, "--split: want a number such as 8"),
     (("experiment", "--split", "1-99999999999/2"), 1, "--split: want views from 1 to 13, got 14"),
@@ -240,7 +344,7 @@ def test_what_nobody_thought_of_is_one_line_too(
     def fail(*_: object) -> None:
         raise AssertionError("two\nlines")
 
-    monkeypatch.setattr("diffproj.cli.measuring.stored_view", fail)
+    monkeypatch.setattr("diffproj.cli.measuring.scene_of", fail)
     assert cli.main([*VIEW, *POINTS]) == 1
     out, err = capsys.readouterr()
     (line,) = err.splitlines()

@@ -9,18 +9,12 @@ import pytest
 import torch
 
 import diffproj as dp
-from diffproj.cli import main
+from tests.cli.commands import runner
 
 GIVEN = ("--charuco", "6x5", "--square", "20mm", "--marker", "15", "--dictionary", "4X4_50")
 
 
-def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    try:
-        code = main(arguments)
-    except SystemExit as stop:
-        code = int(stop.code or 0)
-    out, err = capsys.readouterr()
-    return code, out, err
+run = runner()
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 import diffproj as dp
-from diffproj import cli
 from diffproj.cli import calibrating
+from tests.cli.commands import runner
 
 PHOTOGRAPHS = Path(os.environ.get("DIFFPROJ_PHOTOS", "/usr/share/doc/opencv-doc/examples/data"))
 needs_photographs = pytest.mark.skipif(
@@ -22,13 +22,7 @@ needs_photographs = pytest.mark.skipif(
 )
 
 
-def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    try:
-        code = cli.main(["calibrate", *arguments])
-    except SystemExit as error:
-        code = int(error.code or 0)
-    out, err = capsys.readouterr()
-    return code, out, err
+run = runner("calibrate")
 
 
 def calibrate(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -259,16 +253,17 @@ def test_what_is_no_photograph_in_a_folder_is_left_out_and_told(
         line.removeprefix("diffproj: ").replace(f"{folder}/", "").replace(str(folder), "folder")
         for line in err.splitlines()
     ]
-    assert told[:2] == [
+    assert told[0].startswith("folder: skipped 2 HEIC photographs, which OpenCV does not read: convert to JPEG in full")
+    assert told[1].startswith("folder: skipped 1 raw photograph, which OpenCV does not read: convert to TIFF or PNG")
+    assert told[2] == "folder: skipped 1 video: name a video by itself, for its frames are of another size"
+    assert told[3] == "folder: skipped 2 hidden files and 1 file that is no photograph"
+    assert told[4] == "copy of 2.png: the same photograph as 2.png; counted once"
+    assert told[5:7] == [
         "empty.jpg: cannot be read as an image; skipped",
         "half.png: cannot be read as an image; skipped",
     ]
-    assert told[2].startswith("folder: skipped 2 HEIC photographs, which OpenCV does not read: convert to JPEG in full")
-    assert told[3].startswith("folder: skipped 1 raw photograph, which OpenCV does not read: convert to TIFF or PNG")
-    assert told[4] == "folder: skipped 2 hidden files and 2 files that are no photographs"
-    assert told[5] == "copy of 2.png: the same photograph as 2.png; counted once"
-    assert "5.png: found no board" in told[6]
-    assert len(told) == 7
+    assert "5.png: found no board" in told[7]
+    assert len(told) == 8
 
 
 def test_the_unit_is_kept(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

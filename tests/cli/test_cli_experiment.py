@@ -6,16 +6,9 @@ import cv2
 import pytest
 
 import diffproj as dp
-from diffproj import cli
+from tests.cli.commands import runner
 
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    try:
-        code = cli.main(["experiment", *arguments])
-    except SystemExit as error:
-        code = int(error.code or 0)
-    out, err = capsys.readouterr()
-    return code, out, err
+run = runner("experiment")
 
 
 def test_experiment_prints_the_table_and_writes_three_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

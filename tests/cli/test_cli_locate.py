@@ -3,7 +3,6 @@
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +12,7 @@ import torch
 import diffproj as dp
 from diffproj import cli, figures
 from diffproj.cli.landmarks_file import read_landmarks
+from tests.cli.commands import parser, runner
 
 BEACH = """name,u,v,x,y,z
 mast,2521.9588508,483.68938913,902062.638,274683.639,7.432
@@ -35,6 +35,9 @@ RIVER = """x;y;z;u;v
 
 LANDMARKS = ("--landmarks", "beach.csv")
 DRONE = ("--camera", "drone.yaml")
+
+run, parsed = runner("locate"), parser("locate")
+pytestmark = pytest.mark.usefixtures("there")
 
 
 @pytest.fixture(scope="module")
@@ -97,26 +100,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "noise.csv").write_bytes(bytes([200, 13, 7, 255, 0, 60]) * 40)
     (folder / "folder.json").mkdir()
     return folder
-
-
-@pytest.fixture(autouse=True)
-def there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    try:
-        code = cli.main(["locate", *arguments])
-    except SystemExit as error:
-        code = int(error.code or 0)
-    out, err = capsys.readouterr()
-    return code, out, err
-
-
-def parsed(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
-    code, out, err = run(capsys, *arguments, "--json")
-    assert (code, err) == (0, "")
-    return json.loads(out)
 
 
 def test_a_drone_over_a_beach(capsys: pytest.CaptureFixture[str]) -> None:
@@ -309,7 +292,7 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
     ((*DRONE, *LANDMARKS, "-o", "folder.json"), 1, "--output: want a file, got a folder"),
     ((*DRONE, *LANDMARKS, "--draw", "a.gif"), 2, r"--draw: want a file ending in \.png"),
     (("beach.jpg", *DRONE, *LANDMARKS, "--draw", "beach.jpg"), 2, r"--draw: want a file ending in \.png"),
-    (("small.png", *DRONE, *LANDMARKS, "--draw", "small.png"), 1, "--draw: want another file than the photographs"),
+    (("small.png", *DRONE, *LANDMARKS, "--draw", "small.png"), 1, "--draw: want another file than those that are read"),
     (
         ("small.png", *DRONE, *LANDMARKS),
         1,

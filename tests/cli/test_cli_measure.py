@@ -16,18 +16,22 @@ import pytest
 import torch
 
 import diffproj as dp
-from diffproj import cli, synthetic
+from diffproj import synthetic
 from diffproj.cli import shielded
 from diffproj.cli.inputs import HAND
 from diffproj.cli.measure_document import REASONS, between, crosses, listed
 from diffproj.cli.measure_plane import equation
 from diffproj.cli.measure_tables import coordinate, shown
 from diffproj.measurement.choices import HAND_PX
+from tests.cli.commands import parser, runner
 
 D = torch.float64
 BOARD = ("--board", "8x5", "--square", "25")
 CORNERS = ("210.5,133", "402,140.5", "395,300")
 NAMES = [f"{i}.png" for i in range(1, 11)]
+
+run, parsed = runner("measure"), parser("measure")
+pytestmark = pytest.mark.usefixtures("there")
 
 
 @pytest.fixture(scope="module")
@@ -57,30 +61,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     many = dp.Camera(torch.stack([calibration.camera.K] * 2), size=(640, 480))
     dp.save_camera(folder / "many.json", many)
     return folder
-
-
-@pytest.fixture(autouse=True)
-def there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    try:
-        code = cli.main(["measure", *arguments])
-    except SystemExit as error:
-        code = int(error.code or 0)
-    out, err = capsys.readouterr()
-    return code, out, err
-
-
-def parsed(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
-    code, out, err = run(capsys, *arguments, "--json")
-    assert (code, err) == (0, "")
-
-    def refuse(constant: str) -> None:
-        raise AssertionError(constant)
-
-    return json.loads(out, parse_constant=refuse)
 
 
 def pixels(*texts: str) -> torch.Tensor:
@@ -293,7 +273,7 @@ def test_corners_that_no_pose_explains(capsys: pytest.CaptureFixture[str], monke
             ["--points", "1,2"],
             "one of the arguments --board --charuco --aprilgrid --circles --target --view is required",
         ),
-        (["--view", "1.png", *BOARD, "--points", "1,2"], "argument --board: not allowed with argument --view"),
+        (["--view", "1.png", *BOARD, "--points", "1,2"], "--board: not allowed with argument --view"),
         (["photo.png", "--view", "1.png", "--points", "1,2"], "PHOTO: not with --view"),
         (["--view", "1.png", "--square", "25", "--points", "1,2"], "--square: goes with --board"),
         ([*BOARD, "--points", "1,2"], "PHOTO: want a photograph that shows the board, got none"),
@@ -321,7 +301,7 @@ def test_a_page_to_measure_in(capsys: pytest.CaptureFixture[str], tmp_path: Path
     code, out, err = run(capsys, *arguments)
     assert (code, out, err) == (0, f"Written to {stored}: open it in a browser\n", "")
     code, out, _ = run(capsys, *arguments, "--json")
-    assert json.loads(out) == {"page": str(stored)}
+    assert json.loads(out) == {"page": str(stored), "warnings": []}
     models = []
     for path in (new, stored):
         found = re.search(r'id="measuring-data">(.*?)</script>', path.read_text(encoding="utf-8"))

@@ -608,9 +608,9 @@ def _uses(t: Things) -> dict[str, Call]:
             0.1,
         ),
         "save_camera": Call(dp.save_camera, {"path": folder / "saved.json", "camera": c, "format": "json"}, 3),
-        "load": Call(dp.load, {"path": path}, 3),
+        "load": Call(dp.load, {"path": path, "camera": None}, 3),
         "load_camera": Call(dp.load_camera, {"path": path, "format": "json"}, 3),
-        "load_calibration": Call(dp.load_calibration, {"path": path}, 3),
+        "load_calibration": Call(dp.load_calibration, {"path": path, "camera": None}, 3),
     }
 
 

@@ -201,3 +201,36 @@ def test_photographs_of_one_calibration_share_its_errors() -> None:
     both = dp.fuse([one, other])
     least = torch.minimum(one.deviations, other.deviations)[:, :2]
     assert bool((both.deviations[:, :2] > 0.9 * least).all())
+
+
+def test_cameras_of_one_rig_share_its_errors(tmp_path) -> None:
+    """They tell at least what the best of them tells, and no more than if they were independent; from a file as well."""
+    pair = {name: dp.example_views(name)[:6] for name in ("left", "right")}
+    rig = dp.calibrate_rig(pair, dp.Chessboard())
+    dp.save_camera(tmp_path / "rig.json", rig)
+    again = dp.load(tmp_path / "rig.json")
+    assert isinstance(again, dp.RigCalibration)
+    new = {name: dp.example_views(name)[6:7] for name in pair}
+    for source in (rig, again):
+        located = {name: dp.locate(new[name], dp.Chessboard(), source[name]) for name in pair}
+        for cameras in ({name: source[name] for name in pair}, located):
+            seen = {
+                name: dp.measure(one.views.pixels[0, ::9], one, GROUND, view=0, pixel_sigma="detector")
+                for name, one in cameras.items()
+            }
+            fused = dp.fuse(seen)
+            alone = torch.stack([one.covariance[:, :2, :2] for one in seen.values()])
+            information = torch.linalg.inv(alone).mean(0)
+            bound = torch.linalg.inv(information).diagonal(dim1=-2, dim2=-1).sqrt()
+            assert bool((fused.deviations[:, :2] > 0.8 * bound).all())
+            independent = torch.linalg.inv(torch.linalg.inv(alone).sum(0)).diagonal(dim1=-2, dim2=-1).sqrt()
+            assert bool((fused.deviations[:, :2] > 1.1 * independent).all())
+    apart = {name: dp.calibrate(views, dp.Chessboard()) for name, views in pair.items()}
+    seen = {
+        name: dp.measure(one.views.pixels[0, ::9], one, GROUND, view=0, pixel_sigma="detector")
+        for name, one in apart.items()
+    }
+    alone = torch.stack([one.covariance[:, :2, :2] for one in seen.values()])
+    independent = torch.linalg.inv(torch.linalg.inv(alone).sum(0)).diagonal(dim1=-2, dim2=-1).sqrt()
+    fused = dp.fuse(seen)
+    assert bool((fused.deviations[:, :2] / fused.scale < 1.05 * independent).all())

@@ -1,0 +1,187 @@
+"""`diffproj calibrate --fleet`: every camera of a folder of folders, a line of JSON each.
+
+Workers search the photographs, a camera a task; the cameras that come are calibrated here in batches of like ones while
+the others are searched.
+"""
+
+import argparse
+import os
+import re
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from diffproj.calibration.calibrate import calibrate
+from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.cli.fleet_file import append, done_before, line_of
+from diffproj.cli.fleet_folder import Folder, Searched, on_one_core, searched
+from diffproj.cli.inputs import check_writable, writing
+from diffproj.cli.terminal import RESULTS, as_json, counted, failure, note, progress_bars, result
+from diffproj.cli.which_board import KINDS, NEEDS, TAKES, given_board
+from diffproj.targets.boards import Board
+from diffproj.targets.tasks import as_done
+
+TOGETHER = 32
+"""Cameras that are calibrated at once, and lost if the run is killed before."""
+WORST = 10
+"""Cameras in the table."""
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command."""
+    begin = time.perf_counter()
+    check_writable("--output", options.output)
+    board, side, _ = given_board(options)
+    folders = _folders(options.fleet)
+    asked = _asked(options)
+    done = done_before(options.output, asked)
+    lines = [done[folder.name] for folder in folders if folder.name in done]
+    left = [folder for folder in folders if folder.name not in done]
+    if lines:
+        note(f"{counted(len(lines), 'camera')} of {len(folders)} done before, by {options.output}")
+    with progress_bars() as bars, _workers(options, len(left)) as executor:
+        task = bars.add_task("Calibrating", total=len(folders), completed=len(lines))
+        waiting: list[tuple[str, Searched]] = []
+        work = [Folder(folder, board, options.orientation) for folder in left]
+        for number, (place, one) in enumerate(as_done(searched, work, executor), start=1):
+            waiting.append((left[place].name, one))
+            if len(waiting) < TOGETHER and number < len(left):
+                continue
+            new = _calibrated(waiting, board, options, asked, side.unit)
+            with writing("--output", options.output):
+                append(options.output, new)
+            lines += new
+            waiting = []
+            bars.update(task, completed=len(lines))
+    _tell(options, lines, len(left), time.perf_counter() - begin)
+    return 0 if any("camera" in line for line in lines) else 1
+
+
+def _folders(fleet: Path) -> list[Path]:
+    """The folders in a folder, in natural order.
+
+    Raises:
+        ValueError: there is no such folder, or none in it.
+    """
+    if not fleet.is_dir():
+        raise ValueError(f"--fleet: want a folder with a folder of photographs for each camera, got {fleet}")
+    found = [folder for folder in fleet.iterdir() if folder.is_dir() and not folder.name.startswith(".")]
+    if not found:
+        raise ValueError(f"--fleet: want a folder of photographs for each camera in {fleet}, found no folder in it")
+    parts = {folder: re.split(r"(\d+)", folder.name) for folder in found}
+    return sorted(found, key=lambda folder: [int(p) if p.isdecimal() else p for p in parts[folder]])
+
+
+def _asked(options: argparse.Namespace) -> dict[str, Any]:
+    """The options that a camera depends on, as plain values."""
+    about_board = dict.fromkeys(name for names in (KINDS, *NEEDS.values(), *TAKES.values()) for name in names)
+    names = (*about_board, "shape", "distortion", "skew", "reject_outliers", "orientation")
+    values = {name: getattr(options, name) for name in names}
+    return {
+        name: value
+        if isinstance(value, bool)
+        else "x".join(map(str, value))
+        if isinstance(value, tuple)
+        else str(value)
+        for name, value in values.items()
+        if value is not None and value is not False
+    }
+
+
+@contextmanager
+def _workers(options: argparse.Namespace, cameras: int) -> Iterator[Executor | None]:
+    """What searches the photographs: a cluster, or processes; nothing where there is one to be, for this one does."""
+    if options.dask is not None:
+        try:
+            from distributed import Client
+        except ImportError:
+            raise ValueError("--dask: want the package distributed; pip install 'diffproj[dask]'") from None
+        with Client(options.dask) as client:
+            yield client.get_executor()
+        return
+    count = min(options.workers or os.cpu_count() or 1, cameras)
+    if count <= 1:
+        yield None
+        return
+    pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=on_one_core)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _calibrated(
+    cameras: list[tuple[str, Searched]],
+    board: Board,
+    options: argparse.Namespace,
+    asked: dict[str, Any],
+    unit: str | None,
+) -> list[dict[str, Any]]:
+    """The lines of cameras that were searched."""
+    from dataclasses import replace
+
+    begin = time.perf_counter()
+    views = {name: one.views for name, one in cameras if one.views is not None}
+    choices: dict[str, Any] = {name: getattr(options, name) for name in ("shape", "skew", "reject_outliers")}
+    try:
+        found = calibrate(list(views.values()), board, options.distortion, **choices) if views else []
+        ends: dict[str, Calibration | CalibrationError | ValueError] = dict(zip(views, found, strict=True))
+    except ValueError as error:  # what speaks against every one of them
+        ends = dict.fromkeys(views, error)
+    each = (time.perf_counter() - begin) / max(1, len(views))
+    lines = []
+    for name, one in cameras:
+        begin = time.perf_counter()
+        end = ends.get(name, ValueError(one.error))
+        said = replace(end, unit=unit) if isinstance(end, Calibration) else failure(end)
+        line = line_of(name, asked, one, said, each)
+        line["seconds"]["report"] = round(time.perf_counter() - begin, 4)
+        lines.append(line)
+    return lines
+
+
+def _tell(options: argparse.Namespace, lines: list[dict[str, Any]], new: int, seconds: float) -> None:
+    """What came of it: how many, the worst, and the time by stage."""
+    good = [line for line in lines if "camera" in line]
+    failed = [line for line in lines if "camera" not in line]
+    stages = {
+        stage: sum(line["seconds"].get(stage, 0.0) for line in lines[len(lines) - new :])
+        for stage in ("search", "calibration", "report")
+    }
+    worst = sorted(good, key=lambda line: (line["verdict"].startswith("Good"), -line["summary"]["rms"]))[:WORST]
+    if options.json:
+        document = {
+            "cameras": len(lines),
+            "calibrated": len(good),
+            "failed": {line["name"]: line["error"] for line in failed},
+            "worst": [{"name": w["name"], "verdict": w["verdict"], **w["summary"]} for w in worst],
+            "seconds": {"elapsed": round(seconds, 3), **{name: round(value, 3) for name, value in stages.items()}},
+            "output": str(options.output),
+        }
+        as_json(document)
+        return
+    if worst:
+        table = Table(title="The worst", title_justify="left")
+        for title in ("camera", "views", "RMS in px", "f_x in px", "verdict"):
+            table.add_column(title, overflow="fold", justify="left" if title in ("camera", "verdict") else "right")
+        for line in worst:
+            found = line["summary"]
+            sure = f"{found['f_x']:.1f} ± {found['f_x_deviation']:.1f}"
+            views = f"{found['views']} of {line['photographs']}"
+            verdict = line["verdict"].partition(".")[0]
+            table.add_row(escape(line["name"]), views, f"{found['rms']:.4f}", sure, escape(verdict))
+        RESULTS.print(table)
+    for line in failed:
+        result(f"{line['name']}: {line['error']}")
+    result(
+        f"\n{counted(len(good), 'camera')} calibrated, {len(failed)} failed, in {seconds:.1f} s; seconds of work: "
+        f"{stages['search']:.1f} to search, {stages['calibration']:.1f} to calibrate, {stages['report']:.1f} to report"
+    )
+    result(f"Written to {options.output}; dp.load_calibration({str(options.output)!r}, camera=...) reads one")

@@ -1,0 +1,81 @@
+"""The file of a fleet: one line of JSON a camera, appended whole as cameras are done, and picked up where it ends."""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from diffproj._core.atomic import write_whole
+from diffproj.calibration.result import Calibration
+from diffproj.cli.fleet_folder import Searched
+from diffproj.files import own_json
+from diffproj.files.trees import json_lines
+
+BEGINNING = '{"name": '
+"""How each line starts."""
+DONE = "camera"
+"""The key that only lines of cameras have, and not those of failures."""
+
+
+def done_before(path: Path, asked: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The lines of cameras that are done, by name; others are taken out of the file, and what was not written whole.
+
+    Args:
+        path: the file, which need not exist.
+        asked: the options, which have to be those of its lines.
+
+    Raises:
+        ValueError: it is no file of a fleet, or one with other options.
+        OSError: it cannot be read, or be written.
+    """
+    if not path.exists():
+        return {}
+    text = path.read_text(encoding="utf-8")
+    remedy = "choose another file, or remove it"
+    try:
+        lines = json_lines(text)
+        if text and not text.startswith(BEGINNING):
+            raise ValueError("no line of a fleet")  # noqa: TRY301
+        found = {line["name"]: line for line in lines}
+        other = next((line["asked"] for line in lines if line["asked"] != json.loads(json.dumps(asked))), None)
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(f"--output: want a file of a fleet, got {path}, which is another; {remedy}") from None
+    if other is not None:
+        differ = next(key for key in (*asked, *other) if json.dumps(asked.get(key)) != json.dumps(other.get(key)))
+        raise ValueError(
+            f"--output: {path} holds cameras with {differ} {other.get(differ)}, not {asked.get(differ)}; {remedy}"
+        )
+    done = {name: line for name, line in found.items() if DONE in line}
+    if len(done) < len(lines) or not text.endswith("\n"):
+        write_whole(path, "".join(json.dumps(line) + "\n" for line in done.values()))
+    return done
+
+
+def line_of(
+    name: str, asked: Mapping[str, Any], searched: Searched, found: Calibration | str, seconds: float
+) -> dict[str, Any]:
+    """What is said of a camera; of one that failed, why."""
+    line: dict[str, Any] = {
+        "name": name,
+        "asked": dict(asked),
+        "photographs": searched.photographs,
+        "seconds": {"search": round(searched.seconds, 4), "calibration": round(seconds, 4)},
+        "notes": list(searched.notes),
+    }
+    if isinstance(found, str):
+        return line | {"error": found}
+    more = {"verdict": found.verdict, "remarks": found.remarks[0], "summary": found.to_dict()}
+    return json.loads(own_json.as_line(found, **line, **more))
+
+
+def append(path: Path, lines: list[dict[str, Any]]) -> None:
+    """Put lines at the end of the file; they are on the disk when this returns.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with path.open("ab") as file:
+        file.write("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines).encode())
+        file.flush()
+        os.fsync(file.fileno())

@@ -1,0 +1,100 @@
+"""The command line of `diffproj rectify`; `rectifying.py` does the work."""
+
+import argparse
+import functools
+from pathlib import Path
+
+from diffproj.cli.common_options import add_camera, add_photograph, add_plane, add_pose, add_said, describe
+from diffproj.cli.inputs import file_ending, numbers
+from diffproj.cli.units import length
+from diffproj.cli.which_board import check_board
+
+DESCRIPTION = """\
+Makes the metric top view of a plane in a photograph: an image in which all
+pixels are squares of one size on the plane, the lens and the slant taken out.
+What the photograph does not show is transparent.
+
+Where the camera stood is taken from a board in the photograph (--board and
+--square, or another board), or from a view that the camera file knows (--view):
+one that it was calibrated with, or the one that 'diffproj locate' found from
+landmarks.
+"""
+
+EPILOG = """\
+the top view:
+  It is seen from the camera's side of the plane, never mirrored. --extent is in
+  the frame and the unit of the board, or of the landmarks. --height and --plane
+  say which plane, as for 'diffproj measure'; what stands above it leans away.
+
+on a map:
+  --world-file writes where the pixels are: six lines, in a .pgw for a .png and
+  a .tfw for a .tif, which GIS programs read along with the image. Coordinates
+  are x and y of the world: of landmarks on a map, the map's.
+
+examples:
+  diffproj rectify photo.jpg --camera camera.json --board 9x6 --square 25mm
+  diffproj rectify photo.jpg --camera camera.json --board 9x6 --square 25mm \\
+      --extent -50,-50,250,175 --resolution 0.25mm -o board.png
+  diffproj rectify mast.jpg --camera located.json --view mast.jpg \\
+      --resolution 0.05 --world-file -o ground.tif
+"""
+
+
+def add_options(command: argparse.ArgumentParser) -> None:
+    """Give the command its description and its options."""
+    usage = (
+        "%(prog)s PHOTO --camera FILE --board CxR --square SIDE [options]\n"
+        "       %(prog)s PHOTO --camera FILE --view NAME [options]"
+    )
+    describe(command, DESCRIPTION, EPILOG, usage)
+    add_photograph(command, "the photograph, with --view the one that the view was found in")
+    add_camera(command)
+    add_pose(command)
+    plane = add_plane(command)
+    plane.add_argument(
+        "--extent",
+        type=_extent,
+        metavar="x0,y0,x1,y1",
+        help="what of the plane is shown (default: the board or the landmarks, and half as much around them)",
+    )
+    plane.add_argument(
+        "--resolution",
+        type=length,
+        metavar="R",
+        help="the side of a pixel on the plane, such as 0.5mm; sides of --extent that are no multiples of it grow "
+        "(default: about what a pixel of the photograph covers in its middle)",
+    )
+    output = command.add_argument_group("the files")
+    output.add_argument(
+        "-o",
+        "--output",
+        type=file_ending(".png", ".tif", ".tiff"),
+        default=Path("top.png"),
+        metavar="FILE",
+        help="the top view: a .png, .tif or .tiff, replaced if there is one (default: top.png)",
+    )
+    output.add_argument("--world-file", action="store_true", help="write where it is on the map, too, for GIS")
+    output.add_argument(
+        "--north-up",
+        action="store_true",
+        help="y grows upwards, as on maps, from whichever side the camera looks",
+    )
+    add_said(command)
+    command.set_defaults(work="rectifying", check=functools.partial(_check_pose, command))
+
+
+def _extent(text: str) -> tuple[float, ...]:
+    values = numbers(text, 4)
+    if values is None or not (values[2] > values[0] and values[3] > values[1]):
+        raise argparse.ArgumentTypeError(
+            "want x0,y0,x1,y1 without spaces, x1 above x0 and y1 above y0, such as -50,-50,250,175, "
+            f"got {text.strip()!r}"
+        )
+    return values
+
+
+def _check_pose(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Check that there is a photograph, and that a board is measured."""
+    if options.photograph is None:
+        command.error("PHOTO: want the photograph, got none")
+    check_board(command, options)

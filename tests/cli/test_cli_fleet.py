@@ -1,0 +1,169 @@
+"""`diffproj calibrate --fleet`: every camera in its line, whatever happens to others, and no work done twice."""
+
+import importlib.util
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import diffproj as dp
+from diffproj.cli import calibrating_fleet, main
+
+ROOT = Path(__file__).parents[2]
+_spec = importlib.util.spec_from_file_location("fleet_benchmark", ROOT / "tests" / "benchmarks" / "fleet.py")
+assert _spec is not None
+assert _spec.loader is not None
+benchmark = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(benchmark)
+
+GIVEN = (*benchmark.GIVEN, "--workers", "1")
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    try:
+        code = main(["calibrate", *map(str, arguments)])
+    except SystemExit as error:
+        code = int(error.code or 0)
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def lines_of(file: Path) -> dict[str, dict]:
+    return {line["name"]: line for line in map(json.loads, file.read_text().splitlines())}
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, float]]:
+    """Two cameras, one with too few photographs, and one of a wall."""
+    fleet = tmp_path_factory.mktemp("fleet") / "cameras"
+    focal = {f"cam{n}": benchmark.render(fleet / f"cam{n}", n, 5, (320, 240)) for n in (2, 10)}
+    (fleet / "cam3").mkdir()
+    shutil.copy(fleet / "cam2" / "0.png", fleet / "cam3")
+    (fleet / "wall").mkdir()
+    benchmark.cv2.imwrite(str(fleet / "wall" / "0.png"), np.full((240, 320), 90, np.uint8))
+    (fleet / "empty").mkdir()
+    (fleet / "readme.txt").write_text("no camera")
+    return fleet, focal
+
+
+@pytest.fixture
+def fleet(truth: tuple[Path, dict[str, float]], tmp_path: Path) -> Path:
+    shutil.copytree(truth[0], tmp_path / "cameras")
+    return tmp_path / "cameras"
+
+
+def test_each_camera_gets_its_line(fleet, truth, tmp_path, capsys):
+    file = tmp_path / "out.jsonl"
+    code, out, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    assert (code, err) == (0, "")
+    lines = lines_of(file)
+    assert set(lines) == {"cam2", "cam3", "cam10", "wall", "empty"}
+    for name, f in truth[1].items():
+        found = dp.load_calibration(file, name)
+        alone = dp.calibrate(dp.detect(fleet / name, benchmark.BOARD), benchmark.BOARD, "brown4")
+        assert found.summary() == alone.summary()
+        assert found.unit == "mm"
+        assert abs(found.camera.K[0, 0] - f) < 0.01 * f
+        assert lines[name]["summary"]["rms"] == pytest.approx(float(alone.rms), rel=1e-9)
+        assert lines[name]["verdict"] == alone.verdict
+        assert dp.load(file, name).summary() == found.summary()
+        assert bool((dp.load_camera(file, camera=name).K == found.camera.K).all())
+    assert dp.load_camera(file).batch_shape == (2,)
+    assert lines["wall"]["error"].startswith("photographs: want a board with 8 x 5 inner corners, found none in")
+    assert "want a folder with photographs" in lines["empty"]["error"]
+    assert "cam3" not in truth[1]
+    assert "error" in lines["cam3"]
+    assert "2 cameras calibrated, 3 failed" in out
+    assert out.index("cam10") < out.index("wall: ")
+    assert "The worst" in out
+
+
+def test_what_is_done_is_not_done_again(fleet, tmp_path, capsys, monkeypatch):
+    file = tmp_path / "out.jsonl"
+    run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    before = lines_of(file)
+    whole = file.read_text().splitlines()
+    cam2 = next(line for line in whole if '"cam2"' in line)
+    cam10 = next(line for line in whole if '"cam10"' in line)
+    file.write_text(cam2 + "\n" + cam10[: len(cam10) // 2])  # as a run leaves it that was killed while it wrote
+    assert dp.load_camera(file).batch_shape == ()
+    searched, seen = calibrating_fleet.searched, []
+    monkeypatch.setattr(calibrating_fleet, "searched", lambda folder: seen.append(folder.path.name) or searched(folder))
+    code, out, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file, "--json")
+    assert (code, seen) == (0, ["cam3", "cam10", "empty", "wall"])
+    assert "1 camera of 5 done before" in err
+    told = json.loads(out)
+    assert (told["cameras"], told["calibrated"], set(told["failed"])) == (5, 2, {"cam3", "wall", "empty"})
+    assert {worst["name"] for worst in told["worst"]} == {"cam2", "cam10"}
+    after = lines_of(file)
+    assert after["cam2"] == before["cam2"]
+    assert after["cam10"]["camera"] == before["cam10"]["camera"]
+    seen.clear()
+    shutil.copytree(fleet / "cam10", fleet / "cam3", dirs_exist_ok=True)  # a failed camera gets its photographs
+    code, _, _ = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    assert (code, seen) == (0, ["cam3", "empty", "wall"])
+    assert "camera" in lines_of(file)["cam3"]
+    assert len(file.read_text().splitlines()) == 5
+
+
+def test_other_options_are_not_mixed(fleet, tmp_path, capsys):
+    file = tmp_path / "out.jsonl"
+    run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    text = file.read_text()
+    code, _, err = run(capsys, "--fleet", fleet, *GIVEN, "--distortion", "none", "-o", file)
+    assert code == 1
+    assert "holds cameras with distortion brown4, not none; choose another file, or remove it" in err
+    assert file.read_text() == text
+    file.write_text("something else")
+    code, _, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    assert code == 1
+    assert "want a file of a fleet" in err
+    assert file.read_text() == "something else"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("photos", "--fleet", "cameras"), "--fleet: want it without other photographs"),
+        ((), "PHOTO (or --fleet DIR)"),
+        (("photos", "--workers", "2"), "--workers: goes with --fleet"),
+        (("photos", "--json"), "--json: goes with --fleet"),
+        (("--fleet", "cameras", "--draw", "a.png"), "--draw: goes with one camera"),
+        (("--fleet", "cameras", "-o", "a.json"), "--output: want a .jsonl with --fleet"),
+        (("photos", "-o", "a.jsonl"), "--output: want a .json, .yaml"),
+        (("--fleet", "cameras", "--workers", "0"), "want a number of processes"),
+        (("--fleet", "cameras", "--workers", "2", "--dask", "tcp://a"), "--dask: want it without --workers"),
+    ],
+)
+def test_options_that_do_not_go_together(arguments, said, capsys):
+    code, _, err = run(capsys, *arguments, *benchmark.GIVEN)
+    assert code == 2
+    assert said in " ".join(err.split())
+
+
+def test_no_folder(tmp_path, capsys):
+    code, _, err = run(capsys, "--fleet", tmp_path / "nowhere", *GIVEN, "-o", tmp_path / "a.jsonl")
+    assert code == 1
+    assert "--fleet: want a folder with a folder of photographs" in err
+    code, _, err = run(capsys, "--fleet", tmp_path, *GIVEN, "-o", tmp_path / "a.jsonl")
+    assert code == 1
+    assert "found no folder in it" in err
+
+
+@pytest.mark.slow
+def test_processes_and_a_dask_cluster_give_the_same(fleet, tmp_path, capsys):
+    distributed = pytest.importorskip("distributed")
+    alone, files = tmp_path / "alone.jsonl", [tmp_path / "processes.jsonl", tmp_path / "dask.jsonl"]
+    run(capsys, "--fleet", fleet, *GIVEN, "-o", alone)
+    run(capsys, "--fleet", fleet, *benchmark.GIVEN, "--workers", "2", "-o", files[0])
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        code, _, _ = run(
+            capsys, "--fleet", fleet, *benchmark.GIVEN, "--dask", cluster.scheduler_address, "-o", files[1]
+        )
+    assert code == 0
+    for file in files:
+        for name, line in lines_of(file).items():
+            for key in ("camera", "calibration", "error", "notes"):
+                assert line.get(key) == lines_of(alone)[name].get(key)
