@@ -45,6 +45,7 @@ class PlaneProjector(nn.Module):
             `LearnableCamera` refuses.
 
     Example:
+        >>> import torch
         >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
         >>> projector = PlaneProjector(Camera(K, t=torch.tensor([0.0, 0, 1000])), Plane.z(0.0), learn="focal")
         >>> points, valid = projector(torch.tensor([[370.0, 240.0]]))
