@@ -18,6 +18,9 @@ BEST_CONTRACTION = 0.02
 """Least ratio of successive predicted reductions assumed in extrapolation; convergence near the minimum is linear."""
 ROUNDING = 1e-12
 """Rounding error of the cost, a sum of many squares, relative to it."""
+RESIDUAL_ROUNDING = 0.1
+"""Rounding error of a residual, relative to one that is negligible: small residuals are differences of large numbers, so
+that theirs do not shrink with them. Exact corners with coordinates of a national grid end above what is negligible."""
 MIN_DAMPING = 1e-15
 MAX_DAMPING = 1e14
 """Beyond this damping, a problem without an acceptable step has diverged."""
@@ -56,7 +59,8 @@ class DampingControl:
         self.previous = np.where(self.active, expected, self.previous)
         converged = (after <= tolerance * self.cost) & (expected <= FINAL_STEP_REDUCTION * self.cost)
         # Where the reduction is below the cost's rounding error, acceptance is random: the first failure ends it.
-        exhausted = (self.failed & (expected <= ROUNDING * self.cost)) | (expected <= 1e-3 * ROUNDING * self.cost)
+        rounding = ROUNDING * self.cost + RESIDUAL_ROUNDING * np.sqrt(negligible * self.cost)
+        exhausted = (self.failed & (expected <= rounding)) | (expected <= 1e-3 * ROUNDING * self.cost)
         done = self.active & (converged | exhausted | (self.cost <= negligible))
         stuck = self.active & ~done & (self.damping > MAX_DAMPING)
         self.status[done], self.status[stuck] = Status.CONVERGED, Status.DIVERGED

@@ -139,3 +139,17 @@ def test_prior_of_a_pose() -> None:
         values.append(dp.CalibrationPrior(found, view=2)(start.at(R, place - R @ middle)))
     assert values[0] > 10
     torch.testing.assert_close(values[1], values[0], rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("count", [4, 6, 9])
+def test_exact_corners_are_located(count: int) -> None:
+    """What is left of their residuals is the rounding of coordinates; no step lowers that, and none needs to."""
+    generator = torch.Generator().manual_seed(count)
+    drone = dp.Camera.mounted(80.0, 50.0, heading_deg=30.0, focal=2300.0, size=(4000, 3000)).shifted(-ORIGIN)
+    clicked = 500 + torch.rand(4, count, 2, dtype=D, generator=generator) * torch.tensor([3000.0, 2000.0], dtype=D)
+    ground, _ = dp.back_project(clicked, drone, dp.Plane.z(0.0))
+    for points in ground + torch.rand(4, count, 3, dtype=D, generator=generator) * torch.tensor([0, 0, 5.0], dtype=D):
+        pixels, _ = drone.project(points)
+        found = dp.locate(dp.Views([pixels], size=(4000, 3000)), dp.Landmarks(points), drone, pixel_sigma=1.0)
+        assert found.rms < 1e-6
+        torch.testing.assert_close(found.cameras.center[0], drone.center, rtol=0, atol=1e-5)
