@@ -19,8 +19,8 @@ BEST_CONTRACTION = 0.02
 ROUNDING = 1e-12
 """Rounding error of the cost, a sum of many squares, relative to it."""
 RESIDUAL_ROUNDING = 0.1
-"""Rounding error of a residual, relative to one that is negligible: small residuals are differences of large numbers, so
-that theirs do not shrink with them. Exact corners with coordinates of a national grid end above what is negligible."""
+"""Rounding error of a residual, relative to one that is negligible: small residuals are differences of large numbers,
+so that theirs do not shrink with them. Exact corners in a national grid end above what is negligible."""
 MIN_DAMPING = 1e-15
 MAX_DAMPING = 1e14
 """Beyond this damping, a problem without an acceptable step has diverged."""
