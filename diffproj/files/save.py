@@ -3,7 +3,7 @@
 from kornia.geometry.camera import PinholeCamera
 
 from diffproj._core.arguments import file_path
-from diffproj._core.atomic import write_whole
+from diffproj._core.atomic import write_all_whole
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.rig_result import RigCalibration
 from diffproj.files import rigs
@@ -61,5 +61,4 @@ def save_camera(
     except ValueError as error:
         said = str(error)
         raise ValueError(said if said.startswith("format:") else f"{path}: {said}") from error
-    for file, content in contents.items():
-        write_whole(file, content)
+    write_all_whole(contents)

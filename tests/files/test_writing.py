@@ -243,3 +243,22 @@ def test_places_that_are_no_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="NUL"):
         dp.save_camera(f"{tmp_path}/a\0b.json", cameras("none"))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["folder.json", "loop.json", "pipe.json"]
+
+
+@pytest.mark.parametrize("stuck", ["cameras.txt", "images.txt", "points3D.txt"])
+def test_files_that_belong_together_are_all_written_or_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stuck: str
+) -> None:
+    dp.save_camera(tmp_path / "images.txt", cameras("none"))
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    opened = os.open
+
+    def full(path: str, *rest: int) -> int:
+        if stuck in os.fspath(path):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+        return opened(path, *rest)
+
+    monkeypatch.setattr(atomic.os, "open", full)
+    with pytest.raises(OSError, match=f"No space left on device.*{stuck}"):
+        dp.save_camera(tmp_path / "images.txt", cameras("brown4"))
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
