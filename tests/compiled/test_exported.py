@@ -11,6 +11,8 @@ import torch
 
 import diffproj as dp
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")  # PyTorch's own
+
 K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
 R = dp.rotation_from_euler(*torch.tensor([0.3, 0.2, 0.1]))
 T = torch.tensor([0.0, 0, 1000])
@@ -105,6 +107,7 @@ IN_ONNX = [  # each takes half a minute
 ]
 
 
+@pytest.mark.filterwarnings("ignore:overflow encountered in cast")  # its exporter's, of the largest float64
 @pytest.mark.slow
 @pytest.mark.parametrize(("what", "lens"), IN_ONNX)
 def test_onnx(what: str, lens: str, tmp_path: Path) -> None:
@@ -136,7 +139,6 @@ torch.save((points, valid), results)
 """
 
 
-@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")  # PyTorch's own
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["export", "inductor"])
 @pytest.mark.parametrize("lens", ["none", "brown5"])
