@@ -4,12 +4,14 @@ import argparse
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from diffproj._core.atomic import write_whole
-from diffproj.calibration.result import Calibration
-from diffproj.calibration.validation import CrossValidation
 from diffproj.cli.inputs import check_writable, writing
+
+if TYPE_CHECKING:  # the help needs neither
+    from diffproj.calibration.result import Calibration
+    from diffproj.calibration.validation import CrossValidation
 
 SUFFIXES = (".html", ".htm")
 
@@ -35,11 +37,11 @@ def check_report(path: Path | None) -> None:
 
 
 def report_text(
-    calibration: Calibration,
+    calibration: "Calibration",
     options: argparse.Namespace,
     photographs: Sequence[Any],
     board: Any,
-    folds: CrossValidation | None,
+    folds: "CrossValidation | None",
 ) -> str:
     """The report on a calibration, with the views held out as they were, or in five folds."""
     from diffproj.report.write import FOLDS, report  # here, for it takes a while to load

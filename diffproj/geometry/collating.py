@@ -68,9 +68,9 @@ def collate(samples: Sequence[Any]) -> Any:
 
 def _joined(samples: list[Any]) -> Any:
     first = samples[0]
-    if isinstance(first, Batched):
-        return stack(samples)
     kind = type(first)
+    if isinstance(first, Batched) and all(isinstance(sample, kind) for sample in samples):
+        return stack(samples)
     if kind is dict and all(isinstance(sample, dict) and sample.keys() == first.keys() for sample in samples):
         return {key: _joined([sample[key] for sample in samples]) for key in first}
     if isinstance(first, tuple | list):
@@ -78,4 +78,7 @@ def _joined(samples: list[Any]) -> Any:
             raise TypeError(f"samples: want ones that are built alike, got {kind.__name__}s of different lengths")
         columns = [_joined(list(column)) for column in zip(*samples, strict=True)]
         return kind(*columns) if hasattr(first, "_fields") else kind(columns)
+    alike = all(isinstance(sample, kind) for sample in samples)
+    if not alike or (isinstance(first, dict) and any(sample.keys() != first.keys() for sample in samples)):
+        raise TypeError(f"samples: want ones that are built alike, got {', '.join(map(called, samples[:3]))}")
     return default_collate(samples)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.arguments import Array
+from diffproj._core.arguments import Array, listing
 from diffproj._core.batched import check_index, index_batch
 from diffproj._core.numerics import (
     broadcast_batches,
@@ -108,8 +108,9 @@ class MapViews:
                 world's x and y if left out, for a plane of constant z.
 
         Raises:
-            ValueError: a camera behind a lens, whose map is no matrix; one plane for each point; or no axes for a plane
-                that is not level.
+            TypeError: axes that are no three vectors.
+            ValueError: a camera behind a lens, whose map is no matrix; one plane for each point; axes of other shapes;
+                or none for a plane that is not level.
 
         Example:
             >>> import diffproj as dp
@@ -138,7 +139,10 @@ class MapViews:
                     raise ValueError("axes: want those of plane_axes(plane) for a plane that is not level, got None")
             rows = torch.stack([A[..., 0, :], A[..., 1, :], b], dim=-2)
         else:
-            origin, *along = (in_float64(check_tensor("axes", axis, 3, like=self.matrix)) for axis in axes)
+            three = listing("axes", axes, "(origin, axis_s, axis_t), as plane_axes gives them")
+            if len(three) != 3:
+                raise ValueError(f"axes: want (origin, axis_s, axis_t), as plane_axes gives them, got {len(three)}")
+            origin, *along = (in_float64(check_tensor("axes", axis, 3, like=self.matrix)) for axis in three)
             rows = torch.stack(
                 [(axis.unsqueeze(-1) * (A - origin.unsqueeze(-1) * b.unsqueeze(-2))).sum(-2) for axis in along]
                 + [b.expand(*torch.broadcast_shapes(b.shape[:-1], origin.shape[:-1]), 3)],

@@ -180,7 +180,7 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         """The plane ready to meet `tensor`: one made of Python numbers takes on its dtype and device."""
         if not (isinstance(tensor, Tensor) and tensor.is_floating_point()):
             raise TypeError(f"tensor: want one of floating-point type, got {getattr(tensor, 'dtype', called(tensor))}")
-        if not self.adopts:
+        if not self.adopts or (self.normal.is_meta and not tensor.is_meta):  # one without values has none to give
             return self
         return self.unchecked(self.normal.to(tensor), self.offset.to(tensor), self.is_per_point)
 

@@ -163,7 +163,7 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
     (("convert", "camera.json"), 2, "the following arguments are required: OUT"),
     (("convert", "camera.json", "new.yaml", "--size", "1x"), 2, "--size: want the size of the image as WIDTHxHEIGHT"),
     # Points.
-    (VIEW, 2, "one of the arguments --points --points-file is required"),
+    (VIEW, 2, "one of the arguments --points --points-file --page is required"),
     ((*VIEW, "--points"), 2, "--points: expected at least one argument"),
     ((*VIEW, "--points", "1;2"), 2, "--points: want pixels as u,v without a space"),
     ((*VIEW, "--points", "inf,2"), 2, "--points: want pixels as u,v"),

@@ -221,6 +221,10 @@ def _about(error: Exception, call: Any, spoilt_ones: dict[str, Any]) -> str | No
     return None
 
 
+ENDLESS = ("domain", "reach")
+"""Buffers of a lens's plan that may be infinite."""
+
+
 def unsound(answer: Any) -> str | None:
     """What is wrong with an answer: values that are not finite where `valid` says that they hold, or shapes."""
     if (
@@ -252,7 +256,8 @@ def unsound(answer: Any) -> str | None:
         sound = answer.converged
         return _unsound_where(answer.camera.K, sound) or _unsound_where(answer.cameras.t, sound)
     if isinstance(answer, nn.Module):
-        return _not_finite(**dict(answer.named_parameters()), **dict(answer.named_buffers()))
+        held = {**dict(answer.named_parameters()), **dict(answer.named_buffers())}
+        return _not_finite(**{name: held[name] for name in held if not name.endswith(ENDLESS)})
     return None
 
 
