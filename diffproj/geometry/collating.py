@@ -69,16 +69,18 @@ def collate(samples: Sequence[Any]) -> Any:
 def _joined(samples: list[Any]) -> Any:
     first = samples[0]
     kind = type(first)
-    if isinstance(first, Batched) and all(isinstance(sample, kind) for sample in samples):
+    alike = all(isinstance(sample, kind) for sample in samples)
+    if alike and isinstance(first, dict):
+        alike = all(sample.keys() == first.keys() for sample in samples)
+    if not alike:
+        raise TypeError(f"samples: want ones that are built alike, got {', '.join(map(called, samples[:3]))}")
+    if isinstance(first, Batched):
         return stack(samples)
-    if kind is dict and all(isinstance(sample, dict) and sample.keys() == first.keys() for sample in samples):
+    if kind is dict:
         return {key: _joined([sample[key] for sample in samples]) for key in first}
     if isinstance(first, tuple | list):
-        if any(type(sample) is not kind or len(sample) != len(first) for sample in samples):
+        if any(len(sample) != len(first) for sample in samples):
             raise TypeError(f"samples: want ones that are built alike, got {kind.__name__}s of different lengths")
         columns = [_joined(list(column)) for column in zip(*samples, strict=True)]
         return kind(*columns) if hasattr(first, "_fields") else kind(columns)
-    alike = all(isinstance(sample, kind) for sample in samples)
-    if not alike or (isinstance(first, dict) and any(sample.keys() != first.keys() for sample in samples)):
-        raise TypeError(f"samples: want ones that are built alike, got {', '.join(map(called, samples[:3]))}")
     return default_collate(samples)
