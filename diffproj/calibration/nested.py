@@ -102,5 +102,7 @@ class Nested:
         found, _ = minimised(self.data, options, self.parameters, *start, self.reference)
         steps: dict[str, Any] = {"max_iterations": options.max_iterations, "tolerance": options.tolerance}
         limit = options.outlier_limit
-        found = second_look(found, self.straight, reject=limit, long_valley=bool(inside), **steps)
+        # The valleys of a prism alone and of a denominator are long; many steps to a tilt may lead to a side one.
+        long_valley = inside == (PRISM,) or DENOMINATOR in inside
+        found = second_look(found, self.straight, reject=limit, long_valley=long_valley, **steps)
         return restrained(found, *start, self.size, reject=limit, **steps) if DENOMINATOR in inside else found

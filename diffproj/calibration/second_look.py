@@ -92,8 +92,7 @@ def second_look(
         reject: robust standard deviations beyond which a corner is an outlier.
         max_iterations: of the solver. Who allows it fewer steps than a start is judged by gets the first minimum.
         tolerance: of the solver.
-        long_valley: whether the last steps to any minimum are many, as with a rational lens, a prism or a tilted
-            sensor.
+        long_valley: whether the last steps to any minimum are many, as with a rational lens or a prism.
     """
     if max_iterations < SHORT_FIT or found.task.solid:  # points in space have had other starts
         return found

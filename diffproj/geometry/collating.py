@@ -75,7 +75,10 @@ def _joined(samples: list[Any]) -> Any:
     if not alike:
         raise TypeError(f"samples: want ones that are built alike, got {', '.join(map(called, samples[:3]))}")
     if isinstance(first, Batched):
-        return stack(samples)
+        try:
+            return stack(samples)
+        except (TypeError, ValueError) as error:
+            raise type(error)(str(error).replace("items:", "samples:")) from None
     if kind is dict:
         return {key: _joined([sample[key] for sample in samples]) for key in first}
     if isinstance(first, tuple | list):
@@ -83,4 +86,7 @@ def _joined(samples: list[Any]) -> Any:
             raise TypeError(f"samples: want ones that are built alike, got {kind.__name__}s of different lengths")
         columns = [_joined(list(column)) for column in zip(*samples, strict=True)]
         return kind(*columns) if hasattr(first, "_fields") else kind(columns)
-    return default_collate(samples)
+    try:
+        return default_collate(samples)
+    except TypeError:
+        raise TypeError(f"samples: want what PyTorch's default_collate joins, got {called(first)}") from None

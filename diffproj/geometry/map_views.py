@@ -11,6 +11,7 @@ from diffproj._core.arguments import Array, listing
 from diffproj._core.batched import check_index, index_batch
 from diffproj._core.numerics import (
     broadcast_batches,
+    check_same_kind,
     check_tensor,
     has_values,
     in_blocks,
@@ -142,10 +143,16 @@ class MapViews:
             three = listing("axes", axes, "(origin, axis_s, axis_t), as plane_axes gives them")
             if len(three) != 3:
                 raise ValueError(f"axes: want (origin, axis_s, axis_t), as plane_axes gives them, got {len(three)}")
-            origin, *along = (in_float64(check_tensor("axes", axis, 3, like=self.matrix)) for axis in three)
+            given = [check_tensor("axes", axis, 3, like=self.matrix) for axis in three]
+            for axis in given:
+                check_same_kind(map=self.matrix, axes=axis)
+            batch = broadcast_batches(
+                map=self.matrix.shape[:-2], **{f"axes[{i}]": x.shape[:-1] for i, x in enumerate(given)}
+            )
+            origin, *along = (in_float64(axis).expand(*batch, 3) for axis in given)
             rows = torch.stack(
                 [(axis.unsqueeze(-1) * (A - origin.unsqueeze(-1) * b.unsqueeze(-2))).sum(-2) for axis in along]
-                + [b.expand(*torch.broadcast_shapes(b.shape[:-1], origin.shape[:-1]), 3)],
+                + [b.expand(*batch, 3)],
                 dim=-2,
             )
         center = in_float64(self.camera.K[..., None, :2, 2])

@@ -141,7 +141,8 @@ class Mounted(CameraParts):
         parts = {"height": height, "tilt_deg": tilt, "roll_deg": roll, "heading_deg": heading, "focal": f_x}
         check_same_kind(**parts, principal_point=center, position=place)
         shapes = {name: part.shape for name, part in parts.items()}
-        batch = broadcast_batches(**shapes, principal_point=center.shape[:-1], position=place.shape[:-1])
+        shapes |= {"focal_y": f_y.shape, "principal_point": center.shape[:-1], "position": place.shape[:-1]}
+        batch = broadcast_batches(**shapes)
         focals = torch.stack(torch.broadcast_tensors(f_x, f_y), dim=-1)
         K = intrinsic_matrix(focals.expand(*batch, 2), center.expand(*batch, 2))
         R = rotation_from_mounting(tilt, roll, heading).expand(*batch, 3, 3)

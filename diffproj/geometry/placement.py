@@ -70,8 +70,8 @@ class Placed(Mounted):
         if has_values(P):
             if not bool(P.isfinite().all()):
                 raise ValueError("projection: want finite values, got NaN or infinity")
-            scale = P[..., :3].abs().amax((-2, -1))
-            if not bool((torch.linalg.det(P[..., :3] / scale.clamp_min(1e-30)[..., None, None]).abs() > 1e-12).all()):
+            P = P / P[..., :3].detach().abs().amax((-2, -1)).clamp_min(torch.finfo(P.dtype).tiny)[..., None, None]
+            if not bool((torch.linalg.det(P[..., :3]).abs() > 1e-12).all() and P.isfinite().all()):
                 raise ValueError("projection: want K [R | t] of a perspective camera, got a matrix without inverse")
         third = P[..., 2, :3].norm(dim=-1)
         sign = torch.where(torch.linalg.det(P[..., :3] / third[..., None, None].detach()) < 0, -1.0, 1.0)
@@ -146,7 +146,10 @@ class Placed(Mounted):
         if to == "world":
             R, t = R.mT, -dot(R.mT, t.unsqueeze(-2))
         signs = R.new_tensor(_SIGNS[convention])
-        return cls(K, signs.unsqueeze(-1) * R, signs * t, distortion, size)  # type: ignore[call-arg]
+        try:
+            return cls(K, signs.unsqueeze(-1) * R, signs * t, distortion, size)  # type: ignore[call-arg]
+        except ValueError as error:
+            raise ValueError(str(error).replace("R:", "extrinsics:", 1)) from None
 
     def world_to_cam(self, convention: Convention = "opencv") -> Float[Tensor, "*batch 4 4"]:
         """The matrix from the world to the camera, as `from_extrinsics(..., to="camera")` takes it.
@@ -233,6 +236,8 @@ class Placed(Mounted):
         )
         middle = [(side - 1) / 2 for side in sides] if principal_point is None else principal_point
         center = check_tensor("principal_point", middle, 2, like=kind)
+        if has_values(center) and not bool(center.isfinite().all()):
+            raise ValueError("principal_point: want finite numbers, got NaN or infinity")
         f_x, f_y = focal_lengths(sides, kind, focal, fov_deg, None, None)
         check_same_kind(position=position, target=target, up=up, principal_point=center, focal=f_x)
         batch = broadcast_batches(

@@ -182,7 +182,7 @@ def _footprint(look_up: LookUp, corners: Tensor, places: Tensor, shown: Tensor, 
 
 def _percentile(values: Tensor, counts: Tensor) -> Tensor:
     """The 90th percentile of those values `(*B, n)` that count; NaN where none does."""
-    if values.shape[-1] == 0:
+    if values.numel() == 0:
         return values.new_full(values.shape[:-1], torch.nan)
     every = 1 + values.shape[-1] // MOST_STEPS
     return torch.where(counts, values, torch.nan)[..., ::every].nanquantile(0.9, dim=-1)

@@ -168,7 +168,8 @@ def camera_numbers(chosen: Tensor | Sequence[int] | int, count: int, device: tor
         ValueError: one of no camera; looked at on a CPU, for a GPU would have to be waited for.
     """
     if isinstance(chosen, int):
-        found = torch.tensor(whole_number("camera", chosen), dtype=torch.long, device=device)
+        number = whole_number("camera", chosen, f"a number from 0 to {count - 1}", least=0, most=count - 1)
+        found = torch.tensor(number, dtype=torch.long, device=device)
     else:
         found = whole_numbers("camera", chosen, "which camera took each sample").to(device)
     if found.device.type == "cpu" and has_values(found) and found.numel():
