@@ -7,6 +7,7 @@ The axes of a camera frame, and how a 4 x 4 matrix acts:
     pytorch3d    x left, y up, z forward         X_cam = X_world M, rows: M as `Transform3d.get_matrix()` gives it
 """
 
+import re
 from typing import Literal, TypeVar, get_args
 
 import torch
@@ -149,7 +150,7 @@ class Placed(Mounted):
         try:
             return cls(K, signs.unsqueeze(-1) * R, signs * t, distortion, size)  # type: ignore[call-arg]
         except ValueError as error:
-            raise ValueError(str(error).replace("R:", "extrinsics:", 1)) from None
+            raise ValueError(re.sub("^[Rt]:", "extrinsics:", str(error))) from None
 
     def world_to_cam(self, convention: Convention = "opencv") -> Float[Tensor, "*batch 4 4"]:
         """The matrix from the world to the camera, as `from_extrinsics(..., to="camera")` takes it.

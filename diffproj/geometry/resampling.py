@@ -56,7 +56,7 @@ def resampled(
         return (total, share > 0) if samples == (1, 1) else _finished(total, share)
     with torch.no_grad():
         places, valid = look_up_of(None)((corners + 0.5).reshape(-1, 2))
-        if 0 in (*source.shape[:-3], *valid.shape[:-1]):  # of no images
+        if 0 in (*source.shape[:-3], *valid.shape[:-1], *places.shape[:-2]):  # of no images
             return _finished(*_mean(source, look_up_of(None), corners, (1, 1)))
         shown = (valid & inside(places, _size(source))).unflatten(-1, shape)
         footprints = _footprints(look_up_of(None), corners, places.unflatten(-2, shape), shown)

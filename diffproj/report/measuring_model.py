@@ -143,7 +143,10 @@ def _planes(calibration: Calibration | Camera, camera: Camera, plane: Plane | No
     """The planes to choose from, the first one first."""
     found = []
     if plane is not None:
-        plane = as_plane(plane).like(camera.K).to(torch.float64)
+        plane = as_plane(plane).like(camera.K)
+        if plane.normal.is_meta:
+            raise ValueError("plane: want values, got tensors on the device meta")
+        plane = plane.to(torch.float64)
         if plane.batch_shape:
             raise ValueError(f"plane: want one plane, got batch shape {tuple(plane.batch_shape)}")
         found.append({"name": "given", "normal": plane.normal.tolist(), "offset": plane.offset.item()})

@@ -154,7 +154,7 @@ def strangers(t: Things) -> list[Any]:
         int,
         len,
         decimal.Decimal("0.5"),
-        Path("nowhere"),
+        Path("no/such/folder"),
         slice(1),
         ...,
         iter([1, 2]),
