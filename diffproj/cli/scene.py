@@ -63,7 +63,9 @@ def scene_of(options: argparse.Namespace) -> Scene:
     """
     if options.view is not None:
         return stored_view(options)
-    return new_photograph(options, one_photograph(options.photograph, options.orientation))
+    # A page shows it in colour: decoded so once, in which the detector's grey is at most one level off the file's own.
+    in_colour = options.page is not None
+    return new_photograph(options, one_photograph(options.photograph, options.orientation, in_colour))
 
 
 def stored_view(options: argparse.Namespace) -> Scene:
