@@ -1,5 +1,5 @@
 # pyright: strict
-"""What a user writes, for type checkers in their strict mode: `test_typing.py` runs them, nobody runs this."""
+"""What a user writes, for type checkers in their strict mode (`test_style.py`, `test_typing.py`): nobody runs this."""
 
 from collections.abc import Sequence
 
