@@ -17,7 +17,7 @@ from diffproj.calibration.rig_options import RigOptions, held, held_places, held
 from diffproj.calibration.rig_outcome import rig_outcome
 from diffproj.calibration.rig_problem import RigParameters
 from diffproj.calibration.rig_result import RigCalibration
-from diffproj.calibration.rig_shape import with_shape
+from diffproj.calibration.rig_shape import with_bow, with_known_points, with_points
 from diffproj.calibration.rig_start import rig_start
 from diffproj.calibration.rig_views import Moments, rig_views
 from diffproj.calibration.solver import Status
@@ -49,8 +49,8 @@ def calibrate_rig(
             the camera's own name taken out where they would share none: `left03.jpg` and `right03.jpg` are `03.jpg`.
         cameras: known beforehand, by name: cameras, calibrations, or a rig that was calibrated before. Their intrinsics
             are what is started from, or held; their poses count where the rig is held, `fixed=("rig",)`.
-        options: `fixed`, `shape`, `weights`, `loss`, `reject_outliers`, `max_iterations`, `tolerance`, `progress` and
-            `throw`: see `RigOptions`.
+        options: `fixed`, `shape`, `priors`, `weights`, `loss`, `reject_outliers`, `max_iterations`, `tolerance`,
+            `progress` and `throw`: see `RigOptions`.
 
     Returns:
         The rig, in float64.
@@ -92,9 +92,9 @@ def rig_calibrated(
     # What is held has to be known by camera before each is calibrated on its own; a known camera brings its lens.
     kinds = {name: Parametrisation.of(known[name]) if name in known else Parametrisation(lens[name]) for name in lens}
     parameters = RigParameters(views.names, tuple(kinds.values()))
-    freed = chosen.shape == "free" or moved is not None
-    if freed and bool((views.data[views.names[0]].given_points.detach()[:, 2] != 0).any()):
-        raise ValueError("shape: want 'flat' for points that are not all on z = 0, got 'free'")
+    shaped = chosen.shape != "flat" or moved is not None
+    if shaped and bool((views.data[views.names[0]].given_points.detach()[:, 2] != 0).any()):
+        raise ValueError(f"shape: want 'flat' for points that are not all on z = 0, got {chosen.shape!r}")
     fixed, points = held_points(chosen.fixed, len(views.points))
     names, positions = held(parameters, fixed)
     own = alone(views, target, lens, known, names, chosen, who)
@@ -109,8 +109,12 @@ def rig_calibrated(
         positions,
         chosen,
     )
-    if freed:
-        found = with_shape(found, points, chosen, moved)
+    if moved is not None:
+        found = with_known_points(found, moved, chosen)
+    elif chosen.shape == "bow":
+        found = with_bow(found, chosen)
+    elif chosen.shape == "free":
+        found = with_points(found, points, chosen)
     rig = rig_outcome(found, own)
     if chosen.throw and rig.status != Status.CONVERGED:
         raise CalibrationError(f"{who}: {rig.message}", rig)
