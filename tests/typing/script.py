@@ -60,6 +60,11 @@ def trained(camera: dp.Camera, calibration: dp.Calibration, features: Tensor, ta
     moved: dp.Camera = learnable()
     plane: dp.Plane = dp.LearnablePlane(dp.Plane.z(0.0))()
     print(moved.size, plane.offset)
+    moving = dp.LearnableRig(
+        {"left": camera, "right": camera}, ("focal", "right.pose", "moments"), (camera.R, camera.t)
+    )
+    placed: dict[str, dp.Camera] = moving()
+    print(placed["left"].center, moving["right"].rotation, moving.names)
     total = loss(points, target) + prior(learnable())
     (slope,) = torch.autograd.grad(total, [network.heads.weight])
     return slope
