@@ -11,8 +11,8 @@ from torch import Tensor
 from diffproj._core.arguments import whole_number
 from diffproj._core.shown import Shown
 from diffproj.calibration.locate import located
+from diffproj.calibration.one_rig import rig_calibrated
 from diffproj.calibration.result import Calibration
-from diffproj.calibration.rig import rig_calibrated
 from diffproj.calibration.rig_options import RigOptions, rig_options
 from diffproj.calibration.rig_result import RigCalibration
 from diffproj.calibration.rig_views import Moments, rig_views
