@@ -42,6 +42,10 @@ FEWEST = 6
 ENOUGH = 8
 """Markers that agree from which no other copy of the image is searched: corners lead to the rest of the board."""
 
+BEYOND = 2.6
+"""How far around a corner the print is known to its fit, relative to what is looked at: at a slant and blurred, lines
+from farther away reach into it."""
+
 WIDEST = 2400
 """Longer side in px from which markers are sought in a smaller copy first."""
 
@@ -100,7 +104,7 @@ class _Search:
     def __init__(self, image: Shaped[np.ndarray, "h w"], board: MarkedBoard, border: int) -> None:
         self.image, self.board = image, board
         self.places = board.corners
-        self.patches = patches_of(board._artwork_with(border), self.places, 1.3 * board.reach)
+        self.patches = patches_of(board._artwork_with(border), self.places, BEYOND * board.reach)
 
     def corners(self, markers: list[Marker]) -> Float[np.ndarray, "n 2"] | None:
         """All corners that can be told, from markers that agree."""
