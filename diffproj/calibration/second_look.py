@@ -22,12 +22,20 @@ from torch import Tensor
 from diffproj._core.numerics import spread_evenly
 from diffproj.calibration import closed_form
 from diffproj.calibration.fit import Fit, fit
+from diffproj.calibration.focal_ladder import (
+    LADDER,
+    climbed,
+    far_out,
+    moves_focal_length,
+    moves_principal_point,
+)
 from diffproj.calibration.parametrisation import INTRINSICS, Parametrisation, Pose
 from diffproj.calibration.solver import Status
 from diffproj.calibration.start import Straightened
 from diffproj.calibration.task import Task
 from diffproj.calibration.turned_views import choices
 from diffproj.calibration.two_poses import predicted_costs, replaced
+from diffproj.lens.models import MODELS
 
 FOCAL_GRID = tuple(0.3 * 1.5**i for i in range(14))
 """Focal lengths to look at, in units of the image's longer side: from a field of view of 118 degrees to one of 1."""
@@ -134,9 +142,31 @@ def second_look(
         best = lower_fit(best, others.part(number[rank, rows]), rows, reject)
     last = fit(task, best.solution.shared, best.solution.local, reject=reject, **steps)
     found = lower_fit(found, last, which, reject)
-    if straight.lens == "none" and (task.basis is None or bool(task.basis[:, 2:4].any())):
+    if straight.lens == "none" and moves_principal_point(task):
         found = _with_other_sides(found, straight.middle[which], which, short, steps, reject)
+    if straight.lens == "none" and MODELS[straight.model].count:
+        found = _along_focal_lengths(found, straight, which, reject, steps)
     return found if reject is not None else _with_views_turned_over(found, which, short, steps)
+
+
+def _along_focal_lengths(
+    found: Fit, straight: Straightened, which: Tensor, reject: float | None, steps: dict[str, Any]
+) -> Fit:
+    """The fit of those of some cameras `(n,)` that are lost with their principal point far out, by focal lengths."""
+    part = found.part(which)
+    part = Fit(replace(part.task, used=part.task.used | part.rejected), part.solution, part.rejected)
+    if not moves_focal_length(part.task) or not moves_principal_point(part.task):
+        return found
+    lost = (part.solution.status != Status.CONVERGED) | ~(correlation(part) <= CORRELATED)
+    rows = (lost & far_out(part, straight.part(which))).nonzero().flatten()
+    if len(rows) == 0:
+        return found
+    which, task = which[rows], part.task.part(rows)
+    lens = straight.part(which).elsewhere(task)
+    starts = [_start_at(task, part.solution.shared[rows], lens, lens.longer * rung) for rung in LADDER]
+    shared = torch.stack([shared for shared, _ in starts])
+    poses = tuple(torch.stack(parts) for parts in zip(*(poses for _, poses in starts), strict=True))
+    return lower_fit(found, climbed(task, shared, poses, reject=reject, **steps), which, reject)
 
 
 def _with_views_turned_over(found: Fit, which: Tensor, short: dict[str, Any], steps: dict[str, Any]) -> Fit:
@@ -178,7 +208,9 @@ def _with_other_sides(
     rows = torch.cat([every, every[both], every[both]])
     sides = middle.new_tensor([(1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])
     sides = sides.repeat_interleave(torch.tensor([len(every), *[int(both.sum())] * 2], device=rows.device), dim=0)
-    start = _other_side(part.task.parameters, solution.shared[rows], part.part(rows).solution.local, middle[rows], sides)
+    start = _other_side(
+        part.task.parameters, solution.shared[rows], part.part(rows).solution.local, middle[rows], sides
+    )
     if not bool(both.any()):
         return lower_fit(found, fit(part.task, *start, reject=reject, **steps), which, reject)
     tried = fit(part.task.part(rows), *start, reject=reject, **short)
@@ -230,18 +262,21 @@ def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Ten
     sample = order[:, spread_evenly(V, count, order.device)]
     costs = torch.stack([_profile(task, straight, grid[i].expand(P), sample) for i in range(len(grid))])
     best = lowest(costs)
-    starts = []
-    for rank in range(best.shape[0]):
-        f = grid[best[rank]]
-        every = torch.arange(V, device=f.device).expand(P, V)
-        _, (R, t) = _both_poses(task, straight, f, every)
-        shared = straight.shared(f, first.shape[-1])
-        if task.basis is not None:  # what is held, or tied, stays as the first start had it
-            T = task.basis
-            step = (T.mT @ (shared - first).unsqueeze(-1)) / T.square().sum(1).unsqueeze(-1)
-            shared = first + (T @ step).squeeze(-1)
-        starts.append((shared, (R, t)))
-    return starts
+    return [_start_at(task, first, straight, grid[best[rank]]) for rank in range(best.shape[0])]
+
+
+def _start_at(task: Task, first: Tensor, straight: Straightened, f: Tensor | float) -> tuple[Tensor, Pose]:
+    """Shared parameters `(P, s)` and poses at focal lengths `(P,)`; what is held, or tied, stays as first `(P, s)`."""
+    P, V = task.used.shape[:2]
+    f = first.new_tensor(f).expand(P) if isinstance(f, float) else f
+    every = torch.arange(V, device=f.device).expand(P, V)
+    _, poses = _both_poses(task, straight, f, every)
+    shared = straight.shared(f, first.shape[-1])
+    if task.basis is not None:
+        T = task.basis
+        step = (T.mT @ (shared - first).unsqueeze(-1)) / T.square().sum(1).unsqueeze(-1)
+        shared = first + (T @ step).squeeze(-1)
+    return shared, poses
 
 
 def _profile(task: Task, straight: Straightened, f: Tensor, views: Tensor) -> Tensor:

@@ -1,11 +1,12 @@
 """Which views to turn over together, where perspective hardly tells their two poses apart.
 
-Through a long lens nearly every view fits about as well in its other pose, and better once the focal length has moved to
-suit it; and several views turned over at once may end lower where none does alone. With the pose of a view eliminated
-its cost is nearly quadratic in the shared parameters: a bowl for each of its poses. The lowest place of a sum of bowls
-has a closed form, so that many choices of poses are compared without running the solver: each view turned over alone,
-and those that are lower in their other pose a little way along the directions in which the parameters are known least.
-From each choice, parameters and poses are improved in turn, by the bowls; the few that promise most are handed on.
+Through a long lens nearly every view fits about as well in its other pose, and better once the focal length has moved
+to suit it; and several views turned over at once may end lower where none does alone. With the pose of a view
+eliminated its cost is nearly quadratic in the shared parameters: a bowl for each of its poses. The lowest place of a
+sum of bowls has a closed form, so that many choices of poses are compared without running the solver: each view turned
+over alone, and those that are lower in their other pose a little way along the directions in which the parameters are
+known least. From each choice, parameters and poses are improved in turn, by the bowls; the few that promise most are
+handed on.
 """
 
 from typing import NamedTuple
@@ -48,7 +49,12 @@ def choices(task: Task, solution: Solution) -> tuple[Tensor, Pose]:
     turned = tuple(z.index_put((p, v), new) for z, new in zip(solution.local, other, strict=True))
     here, there = (_bowls(task, solution.shared, poses) for poses in (solution.local, turned))
     rival &= there.c.isfinite() & here.c.isfinite()
-    there = Bowls(*(torch.where(rival.reshape(*rival.shape, *(1,) * (a.ndim - 2)), a, b) for a, b in zip(there, here)))
+    there = Bowls(
+        *(
+            torch.where(rival.reshape(*rival.shape, *(1,) * (a.ndim - 2)), a, b)
+            for a, b in zip(there, here, strict=True)
+        )
+    )
     pulled = _prior(task, solution.shared)
 
     used = task.used.any(-1)
