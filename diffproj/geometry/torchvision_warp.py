@@ -4,9 +4,10 @@ torchvision keeps no matrix of what it drew; it lets tensors of other kinds trav
 as boxes do. `torchvision_warp` makes such a tensor, which each geometric transform multiplies by its own matrix.
 
 torchvision counts coordinates from the image's corner, (0.5, 0.5) in the middle of the first pixel; a resize scales
-them. Here pixels are whole at their middles, which shifts every matrix by half a pixel: resized by a factor s, the pixel
-u goes to `s u + (s - 1) / 2`, as in `Camera.resized`. Kornia's `Resize` scales the distance from the middle of the first
-pixel to that of the last instead, and lies up to half a pixel beside it: each library's matrix goes with its own images.
+them. Here pixels are whole at their middles, which shifts every matrix by half a pixel: resized by a factor s, the
+pixel u goes to `s u + (s - 1) / 2`, as in `Camera.resized`. Kornia's `Resize` scales the distance from the middle of
+the first pixel to that of the last instead, and lies up to half a pixel beside it: each library's matrix goes with its
+own images.
 """
 
 import math
