@@ -4,12 +4,14 @@
 invertible 2x2 matrix, and the camera model stays exact.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.numerics import arrays_of, in_float64, rounding
+from diffproj._core.numerics import arrays_of, in_float64, least_depth, rounding
 
 
 def intrinsic_matrix(
@@ -32,6 +34,20 @@ def pixel_to_normalized(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch
     a, b, c, d = K[..., :2, :2].flatten(-2).unbind(-1)
     determinant = torch.addcmul(a * d, b, c, value=-1)
     return (torch.stack([d, -b, -c, a], dim=-1) / determinant.unsqueeze(-1)).unflatten(-1, (2, 2))
+
+
+def through_pinhole(direction: Sequence[Tensor], derivative: bool) -> tuple[list[Tensor], Tensor]:
+    """Perspective division by components `(*B, N)`, and where the direction is finite and leads forward.
+
+    Elsewhere it gives 0 where a derivative is asked, and anything where none is.
+    """
+    x, y, z = direction
+    reach, limits = x.abs() + y.abs(), torch.finfo(z.dtype)
+    # Derivatives hold 1 / z, which must not overflow; and x / z, not x times 1 / z, whose derivative would sooner.
+    valid = (z > limits.eps * reach + least_depth(z.dtype)) & (reach + z <= limits.max)
+    if derivative:
+        x, y, z = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0), torch.where(valid, z, 1.0)
+    return [x / z, y / z], valid
 
 
 def upright(
