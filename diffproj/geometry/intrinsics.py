@@ -5,13 +5,14 @@ invertible 2x2 matrix, and the camera model stays exact.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.numerics import arrays_of, in_float64, least_depth, rounding
+from diffproj._core.numerics import arrays_of, has_values, in_float64, least_depth, rounding, wants_derivative
 
 
 def intrinsic_matrix(
@@ -92,20 +93,29 @@ def warped(
     Returns:
         `K'` and `Q`, both `(*B, 3, 3)` in the dtype of K.
     """
-    G = (in_float64(matrix).unsqueeze(-1) * in_float64(K).unsqueeze(-3)).sum(-2)
+    given = K, matrix, ahead
+    if wants_derivative(*given) or not has_values(*given):
+        return tuple(part.to(K.dtype) for part in _warped(torch, *map(in_float64, given)))  # type: ignore[return-value]
+    library, arrays = arrays_of(*given, double=True)
+    upper, Q = _warped(library, *arrays)
+    return torch.as_tensor(upper).to(K), torch.as_tensor(Q).to(K)
+
+
+def _warped(library: Any, K: Any, matrix: Any, ahead: Any) -> tuple[Any, Any]:
+    """The same of arrays, or of tensors."""
+    G = (matrix[..., None] * K[..., None, :, :]).sum(-2)
     w = (matrix[..., 2, :2] * ahead).sum(-1) + matrix[..., 2, 2]
-    G = torch.where((w < 0)[..., None, None], -G, G)
-    length = G[..., 2, :].norm(dim=-1)[..., None, None]
-    x, y, z = (G[..., 2, :] / length.squeeze(-1)).unbind(-1)
-    rows = [
-        [1 - x * x / (1 + z), -x * y / (1 + z), -x],
-        [-x * y / (1 + z), 1 - y * y / (1 + z), -y],
-        [x, y, z],
-    ]
-    Q = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-    upper = (G[..., :2, :].unsqueeze(-2) * Q.unsqueeze(-3)).sum(-1) / length  # G Q^T
-    last = torch.tensor([0.0, 0, 1], dtype=G.dtype, device=G.device).expand(*G.shape[:-2], 1, 3)
-    return torch.cat([upper, last], dim=-2).to(K.dtype), Q.to(K.dtype)
+    G = library.where((w < 0)[..., None, None], -G, G)
+    length = (G[..., 2, :] * G[..., 2, :]).sum(-1)[..., None] ** 0.5
+    last = G[..., 2, :] / length
+    # Rows x and y of Q: the identity's, less last (x, y) / (1 + z), less (x, y) in the third place.
+    x, y, z = (last[..., axis] for axis in range(3))
+    far, both = 1 + z, -x * y / (1 + z)
+    first, second = library.stack((1 - x * x / far, both, -x), -1), library.stack((both, 1 - y * y / far, -y), -1)
+    Q = library.stack((first, second, last), -2)
+    upper = (G[..., :2, None, :] * Q[..., None, :, :]).sum(-1) / length[..., None]  # G Q^T
+    below = library.zeros_like(upper[..., :1, :]) + (upper.new_tensor if library is torch else np.array)([0.0, 0, 1])
+    return library.concatenate((upper, below), -2), Q
 
 
 def check_intrinsics(K: Tensor) -> None:
@@ -134,12 +144,16 @@ def check_warp(name: str, matrix: Tensor, K: Tensor, behind_lens: bool) -> None:
     Raises:
         ValueError: not finite, singular, or a projective warp for a camera with a lens.
     """
-    if not bool(matrix.isfinite().all()):
+    least = rounding(matrix.dtype)
+    library, (matrix, K) = arrays_of(matrix, K, double=True)
+    if not bool(library.isfinite(matrix).all()):
         raise ValueError(f"{name}: want finite values, got NaN or infinity")
     # Multiplied by K, the entries of a row have similar magnitudes, whatever the warp's shift and scale.
-    rows = (in_float64(matrix).unsqueeze(-1) * in_float64(K).unsqueeze(-3)).sum(-2)
-    rows = rows / rows.norm(dim=-1, keepdim=True)
-    if not bool((torch.linalg.det(rows).abs() > 8 * torch.finfo(matrix.dtype).eps).all()):
+    with np.errstate(all="ignore"):
+        rows = (matrix[..., None] * K[..., None, :, :]).sum(-2)
+        rows = rows / (rows * rows).sum(-1)[..., None] ** 0.5
+        singular = ~(abs(library.linalg.det(rows)) > least)
+    if bool(singular.any()):
         raise ValueError(f"{name}: want an invertible one, got a singular one")
     if behind_lens and bool((matrix[..., 2, :2] != 0).any()):
         raise ValueError(
