@@ -218,7 +218,7 @@ class PlaneMap(MapViews, Copied, Shown):
         """The p of a pinhole or behind a lens, and where the lens has an inverse (`None`: everywhere)."""
         lens = self.camera.distortion
         if lens is None:
-            return pixels - self.camera.K[..., None, :2, 2], None
+            return pixels - self.camera.K.select(-1, 2).narrow(-1, 0, 2).unsqueeze(-2), None
         if not isinstance(lens, BrownConrady):
             return self.camera.directions(pixels)
         xy, finite = self.camera._normalised(pixels)
