@@ -348,7 +348,9 @@ def warn_if_rounded(camera: Camera, plane: Plane) -> None:
 def _lacks_pose(to_plane: PlaneMap) -> bool:
     """Whether all cameras are where the world's origin is, in the plane, and look along its axes; false if not told."""
     R, t = to_plane.camera.R, to_plane.camera.t
-    if t.device.type != "cpu" or not has_values(t, to_plane.matrix) or bool(t.any()) or t.numel() == 0:
+    if t.device.type != "cpu" or not has_values(t, to_plane.matrix) or t.numel() == 0:
+        return False
+    if t.numpy(force=True).any():  # in NumPy, for this is asked in each call
         return False
     return not bool(to_plane.matrix[..., 3, :].any()) and description.without_pose(R, t)
 

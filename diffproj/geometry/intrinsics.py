@@ -128,12 +128,11 @@ def check_intrinsics(K: Tensor) -> None:
     library, (K,) = arrays_of(K)
     if not bool(library.isfinite(K).all()):
         raise ValueError("K: want finite values, got NaN or infinity")
-    if bool((abs(K[..., 2, :2]) > 1e-5).any() or (abs(K[..., 2, 2] - 1) > 1e-5).any()):
+    if bool(((abs(K[..., 2, 0]) > 1e-5) | (abs(K[..., 2, 1]) > 1e-5) | (abs(K[..., 2, 2] - 1) > 1e-5)).any()):
         raise ValueError("K: want the last row (0, 0, 1), got another; divide by K[..., 2, 2]")
     with np.errstate(over="ignore", invalid="ignore"):
-        F = K[..., :2, :2]
-        determinant = F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0]
-        singular = abs(determinant) <= 8 * eps * (F * F).sum((-2, -1))
+        a, b, c, d = (K[..., row, column] for row in (0, 1) for column in (0, 1))
+        singular = abs(a * d - b * c) <= 8 * eps * (a * a + b * b + c * c + d * d)
     if bool(singular.any()):
         raise ValueError("K: want an invertible matrix, got a singular one; are both focal lengths set?")
 
