@@ -61,6 +61,7 @@ from diffproj.geometry.rectification import geotransform as geotransform
 from diffproj.geometry.rectification import plane_axes as plane_axes
 from diffproj.geometry.rectification import rectify as rectify
 from diffproj.geometry.rectification import render as render
+from diffproj.geometry.torchvision_warp import torchvision_warp as torchvision_warp
 from diffproj.lens.brown_conrady import BrownConrady as BrownConrady
 from diffproj.lens.kannala_brandt import KannalaBrandt as KannalaBrandt
 from diffproj.lens.models import register_lens as register_lens
