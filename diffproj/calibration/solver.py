@@ -220,9 +220,9 @@ def solve(
     for iteration in range(1, max_iterations + 1):
         along = equations.along(basis)
         q, dz, reduction = damped_step(along, torch.from_numpy(control.damping).to(cost))
+        predicted = _array(reduction)
         dx = q if basis is None else _times(basis, q)
         trial = shared + dx, problem.retract(local, dz)
-        predicted = _array(reduction)
         # Heavy damping makes every predicted reduction small: convergence is then judged by the gradient.
         heavy = control.damping > HEAVY_DAMPING
         expected = np.where(heavy, _array(_decoupled_reduction(along)), predicted) if heavy.any() else predicted
@@ -256,21 +256,21 @@ def damped_step(equations: Equations, damping: Float[Tensor, " p"]) -> tuple[Ten
         model, `(P,)`. Zero, zero and infinite where the matrices are not positive definite.
     """
     U, E, W, g, h, _ = equations
-    D, D_local = (_damping_scale(M.diagonal(dim1=-2, dim2=-1)) for M in (U, W))
     lam = damping.unsqueeze(-1)
-    L, local_failed = torch.linalg.cholesky_ex(_with_diagonal(W, lam.unsqueeze(-1) * D_local))
-    Y = torch.linalg.solve_triangular(L, torch.cat([E.mT, h.unsqueeze(-1)], dim=-1), upper=False)
-    Y, y = Y[..., :-1], Y[..., -1:]
-    flat = Y.flatten(1, 2)
-    S = torch.baddbmm(_with_diagonal(U, lam * D), flat.mT, flat, alpha=-1)
-    reduced = g - _times(flat.mT, y.flatten(1))
-    L_shared, failed = torch.linalg.cholesky_ex(S)
-    dx = -torch.cholesky_solve(reduced.unsqueeze(-1), L_shared)
-    dz = -torch.linalg.solve_triangular(L.mT, Y @ dx.unsqueeze(1) + y, upper=True).squeeze(-1)
-    dx = dx.squeeze(-1)
-    descent = -(g * dx).sum(-1) - (h * dz).sum((-2, -1))
-    reduction = (descent + damping * ((D * dx.square()).sum(-1) + (D_local * dz.square()).sum((-2, -1)))) / 2
+    D = lam * _damping_scale(U.diagonal(dim1=-2, dim2=-1))
+    D_local = lam.unsqueeze(-1) * _damping_scale(W.diagonal(dim1=-2, dim2=-1))
+    L, local_failed = torch.linalg.cholesky_ex(_with_diagonal(W, D_local))
+    Y = torch.linalg.solve_triangular(L, torch.cat([E.mT, h.unsqueeze(-1)], dim=-1), upper=False).flatten(1, 2)
+    eliminated = Y.mT @ Y
+    L_shared, failed = torch.linalg.cholesky_ex(_with_diagonal(U - eliminated[:, :-1, :-1], D))
+    dx = torch.cholesky_solve((eliminated[:, :-1, -1] - g).unsqueeze(-1), L_shared)
+    y = (Y @ torch.nn.functional.pad(dx, (0, 0, 0, 1), value=1.0)).unflatten(1, h.shape[1:])
+    dx, dz = dx.squeeze(-1), -torch.linalg.solve_triangular(L.mT, y, upper=True).squeeze(-1)
+    slope, local_slope = torch.addcmul(g, D, dx, value=-1), torch.addcmul(h, D_local, dz, value=-1)
+    reduction = ((slope * dx).sum(-1) + (local_slope * dz).sum((-2, -1))) / -2
     sound = (failed == 0) & (local_failed == 0).all(-1) & reduction.isfinite()
+    if bool(sound.all()):
+        return dx, dz, reduction
     return (
         torch.where(sound.unsqueeze(-1), dx, 0.0),
         torch.where(sound[:, None, None], dz, 0.0),
