@@ -38,7 +38,7 @@ def homographies(points: Tensor, xy: Tensor, used: Tensor) -> Tensor:
     the points, so that the first six are eliminated by a matrix of 3 x 3, and what is left has its null vector in
     closed form. Not finite or arbitrary where the used corners do not determine a homography.
     """
-    P, V, N, _ = xy.shape
+    N = xy.shape[2]
     board = points[:, :2] - points[:, :2].mean(0)
     if N > MAX_CORNERS:  # an initial estimate needs no more
         step = torch.arange(1, MAX_CORNERS + 1, device=xy.device)

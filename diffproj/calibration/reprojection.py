@@ -15,7 +15,7 @@ Free points have no rows, for the residuals of one point depend on its own displ
 The order of the parameters is that of `parametrisation.py`; `bow.py` says what xi and eta are.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -84,6 +84,11 @@ class Reprojection:
     def _by_focal(self) -> Tensor:
         """Of the panel, u by f_x and v by f_y `(P, V, 2, N)`."""
         return self._panel[:, :, :2].diagonal(dim1=2, dim2=3).movedim(-1, 2)
+
+    def part(self, which: Tensor) -> "Reprojection":
+        """The problems of some of the cameras `(n,)`."""
+        whitening = None if self.whitening is None else self.whitening[which]
+        return replace(self, pixels=self.pixels[which], used=self.used[which], whitening=whitening)
 
     def linearise(self, shared: Tensor, local: LocalState) -> Tensor:
         """The panel; what it holds is overwritten by the next call."""
