@@ -72,7 +72,8 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     known = found.plain_covariance()
     no_pose = used & known.undetermined_views
     mirrored = ~no_pose & _mirrored(R, t, task.points, used, board)
-    misfits = ~no_pose & used & (_relative_error(found) > MAX_RELATIVE_RESIDUAL)
+    error = _relative_error(found)
+    misfits = ~no_pose & used & (error > MAX_RELATIVE_RESIDUAL)
     unknown = known.undetermined.clone()
     if task.restraint is not None:  # points that hardly any view shows stay where they are, and say nothing of others
         unknown[:, task.parameters.few :] &= ~task.restraint.unknown
@@ -94,7 +95,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     status = solution.status
     wrong_lens = finite & ~folded & gravely_inadequate(found)
     at_fault = (mirrored | misfits | no_pose).any(-1)
-    handed = finite & ~no_pose.any(-1) & left_handed(task, solution, _relative_error(found))
+    handed = finite & ~no_pose.any(-1) & left_handed(task, solution, error)
     degenerate = none | handed | at_fault | unknown.any(-1) | ~redundant | alone | folded | wrong_lens
     status = torch.where(degenerate & finite & (status != Status.DIVERGED), Status.DEGENERATE, status)
     causes = [""] * len(status)
