@@ -170,9 +170,9 @@ def prior_of(restraint: Restraint | None, parameters: RigParameters) -> Prior | 
     if restraint is None:
         return None
     few = parameters.few
-    held = torch.nn.functional.pad(restraint.alone + restraint.printed, (few, 0))
+    held = torch.nn.functional.pad(torch.diag_embed(restraint.alone) + restraint.measured, (few, 0, few, 0))
     root = torch.nn.functional.pad(restraint.root, (0, 0, few, 0))
-    return Prior(torch.zeros_like(held), torch.diag_embed(held), root=root)
+    return Prior(torch.zeros_like(held[..., 0]), held, root=root)
 
 
 class Rounds:

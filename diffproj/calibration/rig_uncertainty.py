@@ -125,7 +125,7 @@ def plain_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
         wide = (few, 0, few, 0)
         frame = {
             "frame": torch.nn.functional.pad(restraint.frame, wide),
-            "printed": torch.nn.functional.pad(torch.diag_embed(restraint.printed), wide),
+            "printed": torch.nn.functional.pad(restraint.measured, wide),
         }
     return covariance(
         found.equations, found.parameters.names, pooled.unsqueeze(0), basis=found.basis, unseen=unseen(found), **frame
