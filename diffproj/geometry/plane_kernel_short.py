@@ -1,7 +1,6 @@
 """The plane map's steps for few points on a CPU, in NumPy: there a step costs about half of what it does in PyTorch.
 
-The same products and sums in the same order as in `plane_kernel.py`, so that a point is the same however many others it
-comes with.
+The products and sums are those of `plane_kernel.py`, and results agree with its to rounding.
 """
 
 import numpy as np

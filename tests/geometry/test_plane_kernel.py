@@ -79,7 +79,7 @@ def test_points_may_be_changed_in_place_before_the_gradient() -> None:
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
 @pytest.mark.parametrize("components", [2, 3])
-def test_a_point_is_the_same_however_many_there_are(
+def test_a_point_is_the_same_to_rounding_however_many_there_are(
     components: int, kind: torch.dtype, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     p, matrix, seen = (part.detach() for part in example(components, (3,), (3,)))
@@ -87,4 +87,5 @@ def test_a_point_is_the_same_however_many_there_are(
     few = direct(p, matrix, seen)
     monkeypatch.setattr(plane_kernel_short, "SHORT", 0)
     many = direct(p, matrix, seen)
-    assert all(map(torch.equal, few, many))
+    torch.testing.assert_close(few[0], many[0])
+    assert torch.equal(few[1], many[1])
