@@ -144,12 +144,20 @@ def loaded(path: Path) -> tuple[Camera, Calibration | None]:
         OSError: the file cannot be read.
         ValueError: it holds no camera, or several.
     """
-    found = load(path)
+    try:
+        found = load(path)
+    except ValueError as error:
+        if "camera: want the name of one of" not in str(error):
+            raise
+        raise ValueError(
+            f"--camera: want one camera, got a fleet in {path}; 'diffproj convert {path} one.json --camera NAME' "
+            "takes one of them out, error bars and all"
+        ) from error
     detail(f"{path}: read")
     if isinstance(found, RigCalibration):
         raise ValueError(  # noqa: TRY004
             f"--camera: want one camera, got a rig of {', '.join(found.names)} in {path}; diffproj convert "
-            "--camera NAME takes one of them out"
+            "--camera NAME takes one of them out, without error bars"
         )
     camera, calibration = (found.camera, found) if isinstance(found, Calibration) else (found, None)
     if camera.batch_shape:
