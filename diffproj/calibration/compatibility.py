@@ -130,7 +130,7 @@ def _pulls(
     """The pull of each view on the intrinsics, in independent directions.
 
     Returns:
-        It `(P, V, s)` in units of the noise's deviation; how many times the noise's variance the calibration leaves open
+        It `(P, V, s)` in units of the noise's deviation; how many times its variance the calibration leaves open
         there `(P, V, s)`; how many directions the view tells anything of `(P, V)`; and the covariance that another
         camera would add `(P, V, s, s)`.
     """
