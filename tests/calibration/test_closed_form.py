@@ -1,5 +1,6 @@
 """The closed-form starts against the cameras that made the views: exact where the views are, and one by one alike."""
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -114,3 +115,15 @@ def test_few_views_bring_their_homographies_along() -> None:
         mapped = torch.nn.functional.pad(BOARD.points[:, :2] - BOARD.points[:, :2].mean(0), (0, 1), value=1.0) @ H.mT
         off = (mapped[..., :2] / mapped[..., 2:] - back).norm(dim=-1)
         assert float(off.amax()) < 0.1  # px; measured: .027, .065 and .018
+
+
+def test_a_board_that_would_reach_behind_the_camera_is_moved_before_it() -> None:
+    middle, tilt = BOARD.points.mean(0), torch.tensor(1.4, dtype=D)
+    R = dp.rotation_from_euler(tilt, torch.zeros_like(tilt), torch.zeros_like(tilt))
+    t = torch.tensor([5.0, -3, 20], dtype=D)
+    H = torch.cat([R[:, :2], t.unsqueeze(-1)], dim=-1).expand(1, 1, 3, 3)  # the board's centre is at t
+    found_R, found_t = closed_form.poses(H, BOARD.points)
+    torch.testing.assert_close(found_R[0, 0], R)
+    placed = BOARD.points @ R.mT + found_t[0, 0]
+    torch.testing.assert_close(placed.mean(0)[:2], t[:2])
+    assert float(placed[:, 2].amin()) == pytest.approx(0.2 * float((BOARD.points - middle).abs().amax()))
