@@ -1,4 +1,4 @@
-"""Find a circle grid in a photograph: dark ellipses that lie on a lattice, counted as the grid's circles."""
+"""Find a circle grid in a photograph: dark ellipses, or light ones, that lie on a lattice, counted as its circles."""
 
 import itertools
 from collections import Counter
