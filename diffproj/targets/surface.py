@@ -21,13 +21,9 @@ class Limits(NamedTuple):
         least: in px.
     """
 
-    deviations: float = 8.0
-    loose: float = 0.03
-    least: float = 0.3
-
-
-LIMITS = Limits()
-"""What no lens and no tilt exceeds, and wrong corners of boards do."""
+    deviations: float
+    loose: float
+    least: float
 
 
 def off_surface(
@@ -35,7 +31,7 @@ def off_surface(
     seen: Float[np.ndarray, "n 2"],
     known: Bool[np.ndarray, " n"],
     pitch: float,
-    limits: Limits = LIMITS,
+    limits: Limits,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """How far each known point lies from a smooth surface through its neighbours, and how far it may, in px.
 
