@@ -47,7 +47,7 @@ def disturbed(image: np.ndarray, place: np.ndarray, what: int, draw: np.random.G
     if what == 2:
         y, x = np.indices(image.shape)
         image = image + 300 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * draw.uniform(10, 40) ** 2))
-    return np.uint8(np.clip(image, 0, 255))
+    return np.clip(image, 0, 255).astype(np.uint8)
 
 
 @pytest.mark.slow
