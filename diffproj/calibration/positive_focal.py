@@ -2,7 +2,8 @@
 
 On its way the solver may lead a focal length through zero, where pixels are far from square or the noise is large. With
 the camera's axis x or y mirrored in all poses a flat target gives the same image, so that it stays there, and boards
-count as mirrored. The lens follows: p1, s3, s4, tau_x and the skew change their sign with y, p2, s1, s2 and tau_y with x.
+count as mirrored. The lens follows: p1, s3, s4, tau_x and the skew change their sign with y; p2, s1, s2 and tau_y with
+x.
 """
 
 from dataclasses import replace

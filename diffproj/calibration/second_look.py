@@ -8,9 +8,9 @@ lens that stands for what the poses should explain. A camera is looked at again 
 
 Then starts compete. For focal lengths on a grid each view takes the better of its two poses, as a Gauss-Newton step
 predicts their costs; the grid's best focal lengths, with and without the lens's first estimate, are solved side
-by side, and what ends lowest is kept, or what is reached from it with the principal point on another side of the image's
-middle, or with views turned over (`turned_views`). Who is still lost then, with the principal point far outside the
-image, climbs a ladder of focal lengths (`focal_ladder`). A minimum is only ever replaced by a lower one.
+by side, and what ends lowest is kept, or what is reached from it with the principal point on another side of the
+image's middle, or with views turned over (`turned_views`). Who is still lost then, with the principal point far outside
+the image, climbs a ladder of focal lengths (`focal_ladder`). A minimum is only ever replaced by a lower one.
 """
 
 import math

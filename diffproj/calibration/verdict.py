@@ -19,8 +19,8 @@ from diffproj.targets.boards import Board, faces_away
 from diffproj.targets.landmarks import Landmarks
 
 MAX_RELATIVE_STD = 0.1
-"""Standard deviation of a focal length or principal point, relative to the focal length along the same axis, above which
-it counts as undetermined."""
+"""Standard deviation of a focal length or principal point, relative to the focal length along its axis, above which it
+counts as undetermined."""
 MAX_OF_ONE_VIEW = 0.3
 """The same where all views show the target alike: then it is told with its deviation, for points near the target are
 put back no worse for it, and further off the error bars hold it."""
