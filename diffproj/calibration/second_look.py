@@ -264,7 +264,7 @@ def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Ten
 def _start_at(task: Task, first: Tensor, straight: Straightened, f: Tensor | float) -> tuple[Tensor, Pose]:
     """Shared parameters `(P, s)` and poses at focal lengths `(P,)`; what is held, or tied, stays as first `(P, s)`."""
     P, V = task.used.shape[:2]
-    f = first.new_tensor(f).expand(P) if isinstance(f, float) else f
+    f = f if isinstance(f, Tensor) else first.new_tensor(f).expand(P)
     every = torch.arange(V, device=f.device).expand(P, V)
     _, poses = _both_poses(task, straight, f, every)
     shared = straight.shared(f, first.shape[-1])
