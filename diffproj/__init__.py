@@ -89,6 +89,7 @@ __all__ = [
     "Landmarks",
     "LearnableCamera",
     "LearnablePlane",
+    "LearnableRig",
     "Lengths",
     "Lens",
     "LensComparison",

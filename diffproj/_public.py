@@ -81,6 +81,7 @@ from diffproj.nn.loss import PlaneLoss as PlaneLoss
 from diffproj.nn.plane import LearnablePlane as LearnablePlane
 from diffproj.nn.prior import CalibrationPrior as CalibrationPrior
 from diffproj.nn.projector import PlaneProjector as PlaneProjector
+from diffproj.nn.rig import LearnableRig as LearnableRig
 from diffproj.paper.experiment import Experiment as Experiment
 from diffproj.paper.experiment import run_experiment as run_experiment
 from diffproj.paper.route import paper_route as paper_route
