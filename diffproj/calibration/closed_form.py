@@ -209,6 +209,31 @@ def intrinsics(H: Tensor, middle: Tensor, size: float, enough: Tensor) -> tuple[
     return f * size, middle + torch.where(plausible.unsqueeze(-1), c, 0.0) * size, plausible
 
 
+def principal_point(H: Tensor, middle: Tensor, size: float, enough: Tensor) -> Tensor:
+    """Principal points `(P, 2)` of cameras with square pixels and no lens, whatever the focal length.
+
+    With `q = c_x^2 + c_y^2 + f^2` as an unknown of its own Zhang's equations are linear and have a solution, even where
+    no focal length goes with it. Arguments are those of `intrinsics`; the middle where the solution is none.
+    """
+    h1, h2 = _centred_columns(H, middle, size)
+
+    def row(a: Tensor, b: Tensor) -> Tensor:
+        """What multiplies (c_x, c_y, q) in `a^T B b`, and what is left."""
+        mixed = [-(a[..., i] * b[..., 2] + a[..., 2] * b[..., i]) for i in (0, 1)]
+        return torch.stack([*mixed, a[..., 2] * b[..., 2], a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]], dim=-1)
+
+    rows = torch.stack([row(h1, h2), row(h1 + h2, h1 - h2) / 2], dim=2)
+    sound = (enough & rows.isfinite().all(-1).all(-1))[..., None, None]
+    A = torch.where(sound, rows, 0.0).flatten(1, 2)
+    gram = A.mT @ A
+    scale = gram.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+    gram = gram * scale.unsqueeze(-1) * scale.unsqueeze(-2)
+    solved = torch.linalg.solve_ex(gram[:, :3, :3], -gram[:, :3, 3:])[0].squeeze(-1)
+    c = (solved * scale[:, :3] / scale[:, 3:])[:, :2]
+    plausible = c.isfinite().all(-1) & (c.abs() < 20).all(-1)
+    return middle + torch.where(plausible.unsqueeze(-1), c, 0.0) * size
+
+
 def poses(H: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """Poses `(R, t)`, `(P, V, 3, 3)` and `(P, V, 3)`, from homographies to the normalised plane.
 
