@@ -85,10 +85,22 @@ def make_prior(
             raise ValueError(f"priors: want a positive standard deviation for {name!r}, got {pair[1]}")
         if not bool(mean.detach()[:, where].isfinite().all()):
             raise ValueError(f"priors: want (mean, deviation) with a finite mean for {name!r}, got {value!r}")
+        if pair[0] is not None:
+            check_focal(name, mean[:, where], pair[0])
         chosen = torch.zeros_like(mean)
         chosen[:, where[:1] if name == "focal" and tied_focal else where] = 1.0
         precision = precision * (1 - chosen) + chosen / deviation.square()
     return Prior(torch.where(precision > 0, mean, 0.0), torch.diag_embed(precision))
+
+
+def check_focal(name: str, mean: Tensor, said: Any) -> None:
+    """Check what is said of a focal length.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if name in ("focal", "f_x", "f_y") and not bool((mean.detach() > 0).all()):
+        raise ValueError(f"priors: want a focal length in px, more than 0, for {name!r}, got {called(said)}")
 
 
 def of_points(name: str) -> tuple[int, ...]:

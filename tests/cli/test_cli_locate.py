@@ -85,6 +85,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             f"{line[:-1]},{s}\n" for line, s in zip(lines, ["sigma_z", *"1"] + ["-1"] * 4, strict=True)
         ),
         "both.csv": "u,v,x,y,sigma,sigma_x\n1,2,3,4,5,6\n",
+        "thousands.csv": RIVER.replace("192111,36369", "192.111"),
+        "noted.csv": "# a; note\n" + BEACH.replace("mast", "mast; old"),
         "alike.csv": BEACH + "again" + lines[1][4:],
         "mixed.csv": BEACH.replace("2521.9588508,483.68938913", "@")
         .replace("3770.57121219,1802.68876725", "2521.9588508,483.68938913")
@@ -433,6 +435,7 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
             ),
             ("both.csv", "--landmarks: want either a column 'sigma' or sigma_x, .*, got both in both.csv"),
             ("rough.csv", "--landmarks: want a standard deviation in column 'pixel_sigma' .* none for 'post'"),
+            ("thousands.csv", "--landmarks: want decimal commas in all numbers and no mark .*, got '192.111' beside"),
             ("few.csv", "--landmarks: want at least 4 with a pixel, got 3 in few.csv"),
             ("line.csv", "line.csv: want points that do not lie on one line"),
             ("alike.csv", "alike.csv: want points that are all distinct, got 6 with 'mast' and 'again' alike"),
