@@ -43,6 +43,7 @@ class RigFit:
         restrained: cameras whose terms below the line are held, for without that their lens folds.
         restraint: what fixes the frame of free points; `None` where none are free.
         positions: of the shared unknowns that are held.
+        prior_variance: the variance of residuals that what the target's print is known by was weighed against.
     """
 
     views: RigViews
@@ -60,6 +61,7 @@ class RigFit:
     restrained: tuple[str, ...] = ()
     restraint: Restraint | None = None
     positions: tuple[int, ...] = ()
+    prior_variance: float = 1.0
 
     @property
     def prior(self) -> Prior | None:

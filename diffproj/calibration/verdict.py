@@ -75,11 +75,11 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     known = found.plain_covariance()
     no_pose = used & known.undetermined_views
     mirrored = ~no_pose & _mirrored(R, t, task.points, used, board)
-    misfits = ~no_pose & used & (_relative_error(found) > MAX_RELATIVE_RESIDUAL)
+    error = _relative_error(found)
+    misfits = ~no_pose & used & (error > MAX_RELATIVE_RESIDUAL)
     unknown = known.undetermined.clone()
-    if (
-        task.restraint is not None and not task.surveyed
-    ):  # points that hardly any view shows stay where they are, and say nothing of others
+    # Points that hardly any view shows stay where they are, and say nothing of others.
+    if task.restraint is not None and not task.surveyed:
         unknown[:, task.parameters.few :] &= ~task.restraint.unknown
         size = (task.points - task.points.mean(0)).square().sum(-1).mean().sqrt()
         unsure = known.shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, task.parameters.few :]
@@ -99,7 +99,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     status = solution.status
     wrong_lens = finite & ~folded & gravely_inadequate(found)
     at_fault = (mirrored | misfits | no_pose).any(-1)
-    handed = finite & ~no_pose.any(-1) & left_handed(task, solution, _unexplained(found))
+    handed = finite & ~no_pose.any(-1) & left_handed(task, solution, _unexplained(found, error))
     degenerate = none | handed | at_fault | unknown.any(-1) | ~redundant | alone | folded | wrong_lens
     status = torch.where(degenerate & finite & (status != Status.DIVERGED), Status.DEGENERATE, status)
     causes = [""] * len(status)
@@ -205,9 +205,8 @@ def _relative_error(found: Fit) -> Tensor:
     return (squares / spread.clamp(min=1e-30)).sqrt().nan_to_num(0.0)
 
 
-def _unexplained(found: Fit) -> Tensor:
-    """The same where the noise is not known to explain it; 0 where it is."""
-    error = _relative_error(found)
+def _unexplained(found: Fit, error: Tensor) -> Tensor:
+    """That error where the noise is not known to explain it; 0 where it is."""
     if not found.knows_noise:
         return error
     explained = found.variance_of_residuals() <= EXPLAINED

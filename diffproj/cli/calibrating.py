@@ -24,6 +24,7 @@ from diffproj.cli.terminal import (
     progress_bars,
     result,
     rounded,
+    sentence,
     working,
 )
 from diffproj.cli.which_board import given_board
@@ -170,10 +171,10 @@ def _say_how_it_ended(calibration: Calibration, reject_outliers: bool) -> None:
     if reject_outliers:
         count = int(calibration.rejected.sum())
         result(f"{count or 'no'} corner{'s' * (count > 1)} rejected as outlier{'s' * (count > 1)}".capitalize())
-    how, *remarks = calibration.message.split("; ")
+    how, *remarks = in_options(calibration.message).split("; ")
     result(f"Solver {how}")
     for remark in remarks:
-        result(textwrap.fill(_with_unit(in_options(remark[0].upper() + remark[1:]), calibration.unit), 79))
+        result(textwrap.fill(_with_unit(sentence(remark), calibration.unit), 79))
     result("\n" + textwrap.fill(_with_unit(in_options(calibration.verdict), calibration.unit), 79))
 
 

@@ -23,7 +23,7 @@ from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.fleet_file import append, done_before, line_of
 from diffproj.cli.fleet_folder import Folder, Searched, on_one_core, searched
 from diffproj.cli.inputs import check_writable, writing
-from diffproj.cli.terminal import RESULTS, as_json, counted, failure, note, progress_bars, result
+from diffproj.cli.terminal import RESULTS, as_json, counted, failure, in_options, note, progress_bars, result
 from diffproj.cli.which_board import KINDS, NEEDS, TAKES, given_board
 from diffproj.targets.boards import Board
 from diffproj.targets.tasks import as_done
@@ -175,7 +175,7 @@ def _tell(options: argparse.Namespace, lines: list[dict[str, Any]], new: int, se
             found = line["summary"]
             sure = f"{found['f_x']:.1f} ± {found['f_x_deviation']:.1f}"
             views = f"{found['views']} of {line['photographs']}"
-            verdict = line["verdict"].partition(".")[0]
+            verdict = in_options(line["verdict"].partition(". ")[0])
             table.add_row(escape(line["name"]), views, f"{found['rms']:.4f}", sure, escape(verdict))
         RESULTS.print(table)
     for line in failed:

@@ -10,6 +10,7 @@ from diffproj.cli.terminal import as_json, result
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.load import content_of, found_in
+from diffproj.files.own_json import holds_fleet
 from diffproj.files.save import save_camera
 from diffproj.geometry.camera import Camera
 
@@ -66,13 +67,16 @@ def _told(options: argparse.Namespace, found: Camera | Calibration | RigCalibrat
 def _wanted(options: argparse.Namespace) -> Camera | Calibration | RigCalibration:
     """What to write: a whole calibration or rig where nothing of it is to change."""
     document = Document.read(options.input)
-    plain = options.source is None and options.camera is None and options.size is None and not options.without_pose
-    if plain:
+    plain = options.source is None and options.size is None and not options.without_pose
+    if plain and options.camera is None:
         found = content_of(document)
     else:
         among = found_in(document, options.source)
         try:
-            found = among.chosen(named(among, options.camera))
+            one = named(among, options.camera)
+            found = among.chosen(one)
+            if plain and holds_fleet(document):
+                found = content_of(document, name_in(among, one))
         except ValueError as error:
             raise ValueError(f"{options.input}: {error}") from error
     return found if isinstance(found, Calibration | RigCalibration) else _sized(found, options)
@@ -83,6 +87,11 @@ def named(found: Found, name: str | None) -> str | int | None:
     if name is None or not name.isdecimal():
         return name
     return name if name in found.cameras or name in found.aside else int(name[:9])
+
+
+def name_in(found: Found, one: str | int | None) -> str | None:
+    """The name of a camera that a file has, of its name or its number."""
+    return list(found.cameras)[one] if isinstance(one, int) else one
 
 
 def _sized(camera: Camera, options: argparse.Namespace) -> Camera:

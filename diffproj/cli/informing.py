@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 import torch
 
 from diffproj.calibration.result import Calibration
-from diffproj.cli.converting import named
+from diffproj.cli.converting import name_in, named
 from diffproj.cli.terminal import alert, as_json, result
 from diffproj.files.document import Document
 from diffproj.files.formats import CONVENTIONS, format_of, name_of
 from diffproj.files.load import content_of, found_in
+from diffproj.files.own_json import holds_fleet
 from diffproj.files.writing import has_pose
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import model_of
@@ -41,7 +42,8 @@ def run(options: argparse.Namespace) -> int:
         except ValueError as error:
             raise ValueError(f"{options.file}: --{error}") from error
     format_ = name_of(format_of(document, options.source))
-    content = content_of(document) if format_ == "json" else None
+    whole = format_ == "json" and not (holds_fleet(document) and one is None)  # of a fleet, one at a time
+    content = content_of(document, name_in(found, one)) if whole else None
     calibration = content if isinstance(content, Calibration) else None
     told = {
         "file": str(options.file),

@@ -40,17 +40,21 @@ def write_page(options: argparse.Namespace, scene: "Scene", plane: "Plane", sigm
         ValueError: the photograph has another size than the camera's images.
         OSError: it cannot be read, or the page not be written.
     """
+    import numpy as np
+
     from diffproj.report.document import document
     from diffproj.report.measuring import measuring_part
 
+    known = scene.photograph
     part = measuring_part(
-        options.photograph,
+        options.photograph if known is None else np.asarray(known.source),
         scene.calibration,
         plane,
         scene.view,
         sigma,
         unit=scene.square.unit or scene.calibration.unit,
         orientation=options.orientation,
+        name=None if known is None else known.name,
     )
     with writing("--page", options.page):
         write_whole(options.page, document(part.title, [part]))

@@ -144,6 +144,16 @@ def _named(path: Path) -> list[Path]:
     return files
 
 
+def _inside(folder: Path) -> str:
+    """Which folders of a folder hold photographs, as a remedy; empty where none does."""
+    inner = sorted(one for one in folder.iterdir() if one.is_dir() and not one.name.startswith("."))
+    there = [one for one in inner if any(file.suffix.lower() in SUFFIXES for file in one.iterdir())]
+    if not there:
+        return ""
+    named = ", ".join(map(str, there[:3])) + ", ..." * (len(there) > 3)
+    return f"; there are in {named}: name {'that' if len(there) == 1 else 'one of them'}"
+
+
 def _in_folder(folder: Path) -> list[Path]:
     """The photographs in a folder."""
     files = [file for file in folder.iterdir() if not file.is_dir()]
@@ -157,7 +167,7 @@ def _in_folder(folder: Path) -> list[Path]:
     others = len(seen) - sum(map(len, kinds.values())) - len(there)
     told = [f"{len(found)} {remedy.format('s' * (len(found) > 1))}" for remedy, found in kinds.items() if found]
     if not there:
-        rest = "".join(f"; it holds {text}" for text in told) or "; name another"
+        rest = "".join(f"; it holds {text}" for text in told) or _inside(folder) or "; name another"
         raise ValueError(
             f"{folder}: want a folder with photographs ({', '.join(sorted(SUFFIXES))}), found none in it{rest}"
         )

@@ -63,7 +63,9 @@ def scene_of(options: argparse.Namespace) -> Scene:
     """
     if options.view is not None:
         return stored_view(options)
-    return new_photograph(options, one_photograph(options.photograph, options.orientation))
+    # A page shows it in colour: decoded so once, in which the detector's grey is at most one level off the file's own.
+    in_colour = options.page is not None
+    return new_photograph(options, one_photograph(options.photograph, options.orientation, in_colour))
 
 
 def stored_view(options: argparse.Namespace) -> Scene:
@@ -142,12 +144,20 @@ def loaded(path: Path) -> tuple[Camera, Calibration | None]:
         OSError: the file cannot be read.
         ValueError: it holds no camera, or several.
     """
-    found = load(path)
+    try:
+        found = load(path)
+    except ValueError as error:
+        if "camera: want the name of one of" not in str(error):
+            raise
+        raise ValueError(
+            f"--camera: want one camera, got a fleet in {path}; 'diffproj convert {path} one.json --camera NAME' "
+            "takes one of them out, error bars and all"
+        ) from error
     detail(f"{path}: read")
     if isinstance(found, RigCalibration):
         raise ValueError(  # noqa: TRY004
             f"--camera: want one camera, got a rig of {', '.join(found.names)} in {path}; diffproj convert "
-            "--camera NAME takes one of them out"
+            "--camera NAME takes one of them out, without error bars"
         )
     camera, calibration = (found.camera, found) if isinstance(found, Calibration) else (found, None)
     if camera.batch_shape:

@@ -31,6 +31,25 @@ class _Results(Console):
 RESULTS = _Results(highlight=False, emoji=False)
 NOTES = Console(stderr=True, highlight=False, emoji=False)
 
+WORDS = (
+    (r"^(calibrate|refine|locate|measure): ", ""),
+    (r", or (let fixed or priors hold|fix) the principal point and the lens( \([^)]*\))?", ""),
+    (r", or give priors=\{[^}]*\}( where it is known roughly)?", ""),
+    (r"priors=\{[^}]*\} or (other views)", r"\1"),
+    (r"; or say how well the target was printed, such as priors=\{[^}]*\}", ""),
+    (r": fixed=\([^)]*\) fits as well", ""),
+    (r"; fix (it|them), or take a simpler lens", "; take a simpler lens"),
+    (r"\b(distortion|shape)=(['\"]?)(\w*)\2", r"--\1 \3"),
+    (r"'(none|brown\d+|fisheye|auto)'", r"\1"),
+    (r"\bskew=True", "--skew"),
+    (r"\breject_outliers=True", "--reject-outliers"),
+    (r"give legacy=True", "give --legacy"),
+    (r"give legacy=False", "leave --legacy out"),
+    (r"give Chessboard\((\d+), (\d+), \.\.\.\)", r"give --board \1x\2"),
+    (r"\bCheck target, and that", "Check the board's options, and that"),
+)
+"""What the library says, as patterns, and what the command line says in its place."""
+
 
 @dataclass
 class Voice:
@@ -108,16 +127,14 @@ def counted(count: int, thing: str) -> str:
 
 def in_options(text: str) -> str:
     """What the library says, with the command's options in place of Python's, and without what it has not."""
-    text = re.sub(r"^(calibrate|refine|locate|measure): ", "", text)
-    text = re.sub(r", or (let fixed or priors hold|fix) the principal point and the lens( \([^)]*\))?", "", text)
-    text = re.sub(r"\b(distortion|shape)=(['\"]?)(\w*)\2", r"--\1 \3", text)
-    return (
-        text.replace("skew=True", "--skew")
-        .replace("reject_outliers=True", "--reject-outliers")
-        .replace("'auto'", "auto")
-        .replace("give legacy=True", "give --legacy")
-        .replace("give legacy=False", "leave --legacy out")
-    )
+    for python, option in WORDS:
+        text = re.sub(python, option, text)
+    return text
+
+
+def sentence(text: str) -> str:
+    """A remark with a capital letter, unless it begins with the name of a parameter, such as k1 or f_x."""
+    return text if re.match(r"[a-z]+\d|[a-z]+_[xy]\b", text) else text[:1].upper() + text[1:]
 
 
 def failure(error: Exception) -> str:
@@ -132,7 +149,7 @@ def failure(error: Exception) -> str:
         return in_options(" ".join(str(error).split()))
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}" + REMEDIES.get(type(error), "")
-    return " ".join(str(error).split())
+    return in_options(" ".join(str(error).split()))
 
 
 def progress_bars() -> Progress:

@@ -1,5 +1,6 @@
 """What every part of a report looks at, taken from a calibration once: corners, residuals and boards, as arrays."""
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,6 +16,8 @@ from diffproj.report.document import shortened
 
 NAME = 80
 """Characters of a name that are shown."""
+OPTION = re.compile(r"\b(distortion|shape)=(['\"]?)(\w+)\2")
+"""Of Python in the calibration's sentences, that the command line has by the same name."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +37,10 @@ class Facts:
         """The world's unit."""
         return self.calibration.unit or "world units"
 
-    def in_unit(self, text: str) -> str:
-        """A sentence of the calibration with the world's unit by its name."""
-        return text.replace("world units", self.unit)
+    def in_words(self, text: str) -> str:
+        """A sentence of the calibration with the unit by its name, and the command's options beside Python's."""
+        text = OPTION.sub(r"\g<0> (--\1 \3)", text.replace("world units", self.unit))
+        return text.replace("skew=True", "skew=True (--skew)")
 
     @cached_property
     def names(self) -> list[str]:

@@ -39,11 +39,9 @@ def folds_part(facts: Facts, folds: CrossValidation | int | None, target: Target
     if found is not None:
         table = found.to_dict()
         names = ("in_sample_px", "held_out_px", "in_sample_world", "held_out_world")
-        rows = [
-            [str(fold), *map(_shown, row)] for fold, *row in zip(*(table[n] for n in ("fold", *names)), strict=True)
-        ]
         means = {name: _rms(table[name]) for name in names}
-        rows.append(["all", *map(_shown, means.values())])
+        columns = [_column([*table[name], means[name]]) for name in names]
+        rows = [list(row) for row in zip([*map(str, table["fold"]), "all"], *columns, strict=True)]
         figure = _figure(table["in_sample_px"], table["held_out_px"])
     html = render(
         "folds.html",
@@ -100,8 +98,13 @@ def _rms(values: list[float]) -> float:
     return math.sqrt(sum(value * value for value in values) / len(values))
 
 
-def _shown(value: float) -> str:
-    return svg.plain(value, 4) if math.isfinite(value) else "failed"
+def _column(values: list[float]) -> list[str]:
+    """Numbers with as many decimals as show four digits of the last, their mean."""
+    last = (
+        values[-1] if math.isfinite(values[-1]) and values[-1] > 0 else max(filter(math.isfinite, values), default=0.0)
+    )
+    decimals = min(max(0, 3 - math.floor(math.log10(last))), 12) if last > 0 else 4
+    return [f"{value:.{decimals}f}" if math.isfinite(value) else "failed" for value in values]
 
 
 def _figure(fitted: list[float], held_out: list[float]) -> Markup:

@@ -34,9 +34,16 @@ def usage_part(facts: Facts, camera_file: str) -> Part:
 
 
 def _row(values: list[float]) -> str:
-    """A list with all digits that count."""
-    return f"[{', '.join(map(repr, values))}]"
+    """A list with all digits that count, three numbers a line."""
+    texts = [repr(value) for value in values]
+    return _lines([", ".join(texts[i : i + 3]) for i in range(0, len(texts), 3)])
 
 
 def _rows(values: list[list[float]]) -> str:
-    return "[" + ", ".join(map(_row, values)) + "]"
+    """A matrix with all digits that count, a row a line."""
+    return _lines([f"[{', '.join(map(repr, row))}]" for row in values])
+
+
+def _lines(parts: list[str]) -> str:
+    """A list whose parts have a line each, so that a narrow page shows all of it."""
+    return "".join(["[\n", *(f"    {part},\n" for part in parts), "]"])

@@ -1,10 +1,12 @@
 """The first part: whether the camera is known well enough, for what, what to photograph next, and what not to trust."""
 
+import re
 import warnings
 from typing import NamedTuple
 
 import torch
 
+from diffproj._core.shown import rounded
 from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.distinct import alike, described
 from diffproj.geometry.plane import Plane
@@ -49,16 +51,16 @@ def verdict_part(facts: Facts) -> Part:
         kind=kind,
         heading=heading,
         judgement=judgement,
-        reasons=[_sentence(facts.in_unit(reason)) for reason in judgement.reasons],
-        remedies=[_sentence(remedy) for remedy in judgement.remedies],
-        note=facts.in_unit(judgement.note),
+        reasons=[sentence(facts.in_words(reason)) for reason in judgement.reasons],
+        remedies=[sentence(remedy) for remedy in judgement.remedies],
+        note=facts.in_words(judgement.note),
         figures=_figures(facts),
         uses=_uses(facts),
         view=facts.names[facts.usual_view] if facts.names else "",
         distance=f"{svg.plain(float(facts.distances[facts.usual_view]), 3)} {facts.unit}" if facts.names else "",
         hand=HAND_PX,
         doubts=doubts(facts),
-        wanted=[_sentence(one.words) for one in wanted],
+        wanted=[sentence(one.words) for one in wanted],
         sketches=sketches,
     )
     return Part("Is it good enough?", "verdict", html, svg.STYLE)
@@ -96,7 +98,7 @@ def doubts(facts: Facts) -> list[str]:
         found.append(
             "the file that it was read from holds no deviations, so nothing here says how sure the numbers are"
         )
-    return [_sentence(facts.in_unit(text)) for text in found]
+    return [sentence(facts.in_words(text)) for text in found]
 
 
 def _joined(texts: list[str]) -> list[str]:
@@ -112,10 +114,8 @@ def _figures(facts: Facts) -> list[tuple[str, str]]:
         ("RMS reprojection error", f"{svg.plain(facts.rms, 3)} px"),
     ]
     if facts.converged:
-        f = facts.calibration.shared[0].item()
-        spread = facts.deviations.get("f_x", 0.0)
-        sure = f" ± {svg.plain(spread)}" if 0 < spread < float("inf") else ""
-        found.append(("focal length", f"{f:.{1 if spread > 0.05 or not spread else 3}f}{sure} px"))
+        f, sure = rounded(facts.calibration.shared[0].item(), facts.deviations.get("f_x", 0.0))
+        found.append(("focal length", f"{f} ± {sure} px" if sure else f"{f} px"))
     return found
 
 
@@ -155,7 +155,8 @@ def _uses(facts: Facts) -> list[Use]:
     ]
 
 
-def _sentence(text: str) -> str:
-    """A remark as a sentence."""
+def sentence(text: str) -> str:
+    """A remark as a sentence; the name of a parameter, such as k1 or f_x, stays as it is."""
     text = text.strip().rstrip(".")
-    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith('?') else '.'}"
+    start = text[:1] if re.match(r"[a-z]+\d|[a-z]+_[xy]\b", text) else text[:1].upper()
+    return f"{start}{text[1:]}{'' if text.endswith('?') else '.'}"

@@ -174,6 +174,11 @@ def _common_size(listing: list[Photograph], sizes: list[tuple[int, int]]) -> tup
         return sizes[0]
     most = max(groups, key=lambda size: len(groups[size]))
     got = " and ".join(f"{w} x {h} px in {_named(labels)}" for (w, h), labels in groups.items())
+    if set(groups) == {most, most[::-1]}:
+        raise ValueError(
+            f"photographs: want one size, got {got}; some were turned after they were taken: give all as the sensor "
+            "recorded them, for a turned one has another principal point"
+        )
     raise ValueError(
         f"photographs: want one size, got {got}; one camera with one zoom gives one size: give those of {most[0]} x "
         f"{most[1]} px alone, and calibrate the others by themselves"

@@ -181,7 +181,7 @@ def random_cameras(
     distance: tuple[float, float] = (1.5, 3.0),
     seed: int = 0,
 ) -> Camera:
-    """The camera at random poses with the whole board in view, of batch shape `(*B, V)`.
+    """The camera at random poses with the whole board in view, its face towards the camera, of batch shape `(*B, V)`.
 
     Args:
         camera: of batch shape `*B`, with an image size; its pose is ignored.
@@ -213,7 +213,8 @@ def random_cameras(
     points = board.points.to(camera.dtype)
     middle, extent = points.mean(dim=0), float((points.amax(dim=0) - points.amin(dim=0)).amax())
     _, right, down = (torch.from_numpy(part).to(camera.dtype) for part in board.artwork.axes)
-    upright = torch.stack([right, down, torch.linalg.cross(right, down)])
+    away = torch.linalg.cross(right, down)
+    upright = torch.stack([right, down, away])
     here = camera.to("cpu")  # as the draws, so that a seed gives the same poses on every device
     singles = [here] if not camera.batch_shape else [here[i] for i in _indices(camera.batch_shape)]
     rotations, shifts = [], []
@@ -232,7 +233,8 @@ def random_cameras(
             shift = direction * depth.unsqueeze(-1) - turned @ middle
             pixels, seen = single.at(turned, shift).project(points)
             last = torch.tensor([width - 1.0, height - 1.0], dtype=camera.dtype, device="cpu")
-            whole = valid & (seen & (pixels >= 0).all(-1) & (pixels <= last).all(-1)).all(-1)
+            face = (turned @ away * (direction * depth.unsqueeze(-1))).sum(-1) > 0  # not its back, as far off the axis
+            whole = valid & face & (seen & (pixels >= 0).all(-1) & (pixels <= last).all(-1)).all(-1)
             R, t = torch.cat([R, turned[whole]]), torch.cat([t, shift[whole]])
             if len(R) >= views:
                 break

@@ -9,7 +9,7 @@ import pytest
 
 import diffproj as dp
 from diffproj import __main__, cli
-from diffproj.cli.terminal import failure, in_options, rounded
+from diffproj.cli.terminal import failure, in_options, rounded, sentence
 
 
 def test_failures_name_options_of_the_command_line() -> None:
@@ -24,6 +24,39 @@ def test_failures_name_options_of_the_command_line() -> None:
 def test_remedies_name_options_of_the_command_line() -> None:
     said = "refine: take shape='free', distortion='auto' or distortion=brown8, or skew=True"
     assert in_options(said) == "take --shape free, --distortion auto or --distortion brown8, or --skew"
+
+
+@pytest.mark.parametrize(
+    ("said", "wanted"),
+    [
+        (
+            'one is not enough; tilt it, or give priors={"focal": (value, deviation)} where it is known roughly',
+            "tilt it",
+        ),
+        (
+            "that is the board, give Chessboard(9, 6, ...). Check target, and that",
+            "give --board 9x6. Check the board's",
+        ),
+        ("There is one of the legacy pattern: give legacy=True.", "give --legacy."),
+        ("try distortion='brown8' or 'fisheye' ('auto' compares", "--distortion brown8 or fisheye (auto compares"),
+        (
+            "0.2 % larger: fixed=('k4', 'k5', 'k6') fits as well; fix them, or take a simpler lens",
+            "larger; take a simpler",
+        ),
+    ],
+)
+def test_advice_that_the_command_line_cannot_take_is_left_out(said: str, wanted: str) -> None:
+    told = failure(ValueError(said))
+    assert wanted in told
+    assert not any(python in told for python in ("priors", "fixed=", "Chessboard", "legacy=", "'fisheye'"))
+
+
+def test_a_parameter_at_the_beginning_keeps_its_name() -> None:
+    assert [sentence(text) for text in ("k4 stands", "f_x is", "the residuals")] == [
+        "k4 stands",
+        "f_x is",
+        "The residuals",
+    ]
 
 
 def test_help_and_module(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

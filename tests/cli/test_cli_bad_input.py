@@ -70,6 +70,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("nothing", "phones", "broken", "folder.json", "folder.png"):
         (folder / name).mkdir()
     (folder / "phones" / "1.HEIC").touch()
+    (folder / "outer" / "inner").mkdir(parents=True)
+    (folder / "outer" / "inner" / "1.jpg").touch()
     (folder / "broken" / "1.jpg").touch()
     return folder
 
@@ -87,6 +89,7 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
     (("calibrate", "nowhere.png", *BOARD), 1, "no such file: nowhere.png"),
     (("calibrate", "", *BOARD), 2, "PHOTO: want the name of a file, got ''"),
     (("calibrate", "nothing", *BOARD), 1, r"nothing: want a folder with photographs \(\.bmp, .*\), found none in it"),
+    (("calibrate", "outer", *BOARD), 1, "outer: .* found none in it; there are in outer/inner: name that"),
     (("calibrate", "phones", *BOARD), 1, "phones: .* found none in it; it holds 1 HEIC .* convert to JPEG"),
     (("calibrate", "phone.heic", *BOARD), 1, r"phone\.heic: HEIC .* convert to JPEG in full size"),
     (("calibrate", "phone*", *BOARD), 1, r"phone\.heic: HEIC .* convert to JPEG in full size|phones"),

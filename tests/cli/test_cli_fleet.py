@@ -71,6 +71,14 @@ def test_each_camera_gets_its_line(fleet, truth, tmp_path, capsys):
         assert dp.load(file, name).summary() == found.summary()
         assert bool((dp.load_camera(file, camera=name).K == found.camera.K).all())
     assert dp.load_camera(file).batch_shape == (2,)
+    one = tmp_path / "one.json"
+    assert main(["convert", str(file), str(one), "--camera", "cam10"]) == 0
+    assert dp.load_calibration(one).summary() == dp.load_calibration(file, "cam10").summary()  # error bars and all
+    assert main(["info", str(file), "--camera", "cam10"]) == 0
+    assert "a calibration of 5 views" in capsys.readouterr().out
+    assert main(["info", str(file)]) == 0
+    assert main(["measure", "--camera", str(file), "--view", "0.png", "--points", "1,2"]) == 1
+    assert "--camera: want one camera, got a fleet" in capsys.readouterr().err
     assert lines["wall"]["error"].startswith("photographs: want a board with 8 x 5 inner corners, found none in")
     assert "want a folder with photographs" in lines["empty"]["error"]
     assert "cam3" not in truth[1]

@@ -226,7 +226,7 @@ def test_files_are_read_once(capsys: pytest.CaptureFixture[str], monkeypatch: py
 
     monkeypatch.setattr(cv2, "imdecode", counted_decode)
     monkeypatch.setattr(Document, "read", counted_document)
-    parser("measure")(capsys, *PHOTO, *POINTS, "--draw", "measured.png")
+    parser("measure")(capsys, *PHOTO, *POINTS, "--draw", "measured.png", "--page", "page.html")
     assert read == {"decoded": 1, "camera.json": 1}
     read.clear()
     parser("rectify")(capsys, *PHOTO, "--resolution", "2")

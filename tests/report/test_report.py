@@ -153,12 +153,18 @@ def test_ids_differ_and_nothing_is_fetched(page: str) -> None:
     assert not [name for _, a in outline.elements for name in a if name.startswith("on") or name == "style"]
 
 
+def test_remedies_are_told_to_those_without_python_too(page: str) -> None:
+    text = words(page)
+    assert "take shape='free' (--shape free), which finds" in text
+    assert 'distortion="auto" , --distortion auto on the command line' in text.replace('"auto",', '"auto" ,')
+
+
 def test_numbers_are_the_calibration_s(calibration: dp.Calibration, page: str) -> None:
     text = words(page)
     facts = calibration.to_dict()
     assert "13 views with 702 corners, 640 \N{MULTIPLICATION SIGN} 480 px" in text
     assert f"RMS reprojection error {facts['rms']:.3f} px" in text
-    assert f"focal length {facts['f_x']:.1f} ± {facts['f_x_deviation']:.2f} px" in text
+    assert f"focal length {facts['f_x']:.2f} ± {facts['f_x_deviation']:.2f} px" in text
     for reason in calibration.judgement.reasons:
         assert reason[1:] in text
     for name, rms in zip(calibration.views.names, calibration.view_rms.tolist(), strict=True):

@@ -350,6 +350,14 @@ def test_pixels_are_those_of_the_sensor_whichever_way_up_the_camera_was_held(tmp
         detect(tmp_path, BOARD, orientation="exif")
 
 
+def test_photographs_that_were_turned_are_named_as_that():
+    image, _ = photograph()
+    with pytest.raises(
+        ValueError, match=r"400 x 300 px in image 1 and 300 x 400 px in image 2; some were turned after"
+    ):
+        detect([image, np.rot90(image)], BOARD)
+
+
 def test_sizes_that_differ_are_told_by_groups():
     image, _ = photograph()
     small = image[:, 1:]

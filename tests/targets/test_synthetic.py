@@ -120,3 +120,16 @@ def test_blur_wider_than_the_image(blur_px: float) -> None:
     image = synthetic.photograph(small, setup.board, blur_px=blur_px, noise=0.0, vignetting=0.0)
     assert image.shape == (48, 64)
     assert int(image.max()) - int(image.min()) < 160
+
+
+def test_a_board_shows_its_face_where_a_lens_sees_behind_itself() -> None:
+    """Off the axis by 100 degrees and more a board that is turned like the camera would show its back."""
+    lens = dp.KannalaBrandt(torch.tensor([0.02, -0.01, 0.003, -0.001], dtype=torch.float64))
+    K = torch.tensor([[300.0, 0.0, 640.0], [0.0, 300.0, 480.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    wide = dp.Camera(K, distortion=lens, size=(1280, 960))
+    for board in (dp.Chessboard(), dp.Chessboard(axes="paper"), dp.CharucoBoard(8, 6, 25.0, 18.0, "5X5_100")):
+        cameras = dp.synthetic.random_cameras(wide, board, 40, seed=3)
+        middle = cameras.R @ board.points.mean(0) + cameras.t
+        into = 1.0 if not isinstance(board, dp.Chessboard) or board.axes != "paper" else -1.0
+        assert bool(((into * cameras.R[..., 2] * middle).sum(-1) > 0).all())
+        assert bool((middle[:, 2] < 0).any())  # some of them behind the camera

@@ -71,6 +71,10 @@ function fillMeasures(sheet, results, unit, actions) {
   byId("m-empty").hidden = rows.length > 0;
 }
 
+// Short, for three of them stand side by side.
+const placeText = (value, deviation) =>
+  deviation === Infinity ? `${plainNumber(value)} ± ∞` : withDeviation(value, deviation, "");
+
 function fillPoints(sheet, results, unit, actions) {
   const rows = sheet.measures.flatMap((measure, m) =>
     measure.points.map(({ name, pixel }, n) => {
@@ -87,7 +91,7 @@ function fillPoints(sheet, results, unit, actions) {
         field(`v-${key}`, `v of ${name}`, Number(pixel[1].toFixed(3)), set(1), numbers),
         ...[0, 1, 2].map((i) =>
           spread
-            ? numberCell(withDeviation(measured.point[i], spread[i], ""), {
+            ? numberCell(placeText(measured.point[i], spread[i]), {
                 value: measured.point[i],
                 deviation: spread[i],
               })
