@@ -114,7 +114,7 @@ def of_camera(priors: Priors | None) -> Priors | None:
 
 
 def printing_precision(priors: Priors | None, batch: Sequence[int], points: Tensor) -> Tensor | None:
-    """The precision `(P, 3 N)` of free points' displacements, in world units; `None` where nothing is known.
+    """The precision `(P, N, 3, 3)` of free points' displacements, in world units; `None` where nothing is known.
 
     Raises:
         ValueError: a shape that does not fit, or a deviation that is not positive.
@@ -143,7 +143,7 @@ def printing_precision(priors: Priors | None, batch: Sequence[int], points: Tens
         own = deviation.unsqueeze(-1) if len(axes) == 1 else deviation
         precision[..., axes] = own.square().reciprocal()
         known = True
-    return precision.reshape(-1, points.numel()) if known else None
+    return torch.diag_embed(precision.reshape(-1, *points.shape)) if known else None
 
 
 def _written(into: Tensor, where: list[int], value: Any, name: str, batch: Sequence[int]) -> Tensor:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from diffproj.cli.inputs import LARGEST_NUMBER
 
-
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
 
 
@@ -72,8 +71,8 @@ class Spreadsheet:
             return None
         if self._decimal_commas and "." in cell:
             raise ValueError(
-                f"{self._option}: want decimal commas in all numbers and no mark between thousands, got {cell!r} beside "
-                f"decimal commas in {self.path}"
+                f"{self._option}: want decimal commas in all numbers and no mark between thousands, got {cell!r} "
+                f"beside decimal commas in {self.path}"
             )
         return value if abs(value) <= LARGEST_NUMBER else None
 
