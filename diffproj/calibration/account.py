@@ -180,8 +180,9 @@ class Account(Shown):
 
     @property
     def _scatter(self) -> float:
-        """The standard deviation of a corner's coordinate of one camera in px."""
-        return float(self.rms) / math.sqrt(2) if self.pixel_sigma is None else float(self.pixel_sigma)
+        """The standard deviation of a corner's coordinate of one camera in px, as the residuals show it."""
+        said = self.degrees_of_freedom is not None and bool(self.degrees_of_freedom.isinf())
+        return float(self.rms) / math.sqrt(2) if self.pixel_sigma is None or said else float(self.pixel_sigma)
 
     def summary(self) -> str:
         """One camera as a text for people: parameters with deviations, RMS of each view, how it ended, the verdict.

@@ -6,6 +6,7 @@ residuals leave something over. The limits are rules of thumb; error bars hold w
 """
 
 import math
+import re
 from dataclasses import dataclass
 
 import torch
@@ -36,6 +37,8 @@ ODD = 3.0
 """Times the median RMS of all views from which on a view is named."""
 OTHER_LENS = "another lens"
 """What a remark says of residuals that another lens would explain."""
+CONTRADICTED = re.compile(r"[^;:,]*times what[^;:,]*")
+"""What a remark says where residuals contradict the deviations that were given."""
 POSES_ONLY = "Poses only, the camera was given"
 ACROSS, DOWN = ("left", "", "right"), ("top", "", "bottom")
 
@@ -156,6 +159,9 @@ def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | 
         remedies.append("more landmarks, near and far, in all parts of the image")
     if OTHER_LENS in remarks:
         faults.append("this lens model does not fit the lens")
+    if contradicted := CONTRADICTED.search(remarks):
+        faults.append(contradicted.group().strip())
+        remedies.append("a look at wrong landmarks and wrong priors, or larger deviations for them")
     if not faults:
         known = [f"focal length and principal point are known to {100 * unsure:.1g} %"] if unsure else []
         return Judgement("Good", (f"{count} landmarks are met to {sigma:.2g} px in each coordinate", *known))
@@ -171,6 +177,8 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
     """What makes it weak."""
     faults = []
     count = int(seen.used.sum())
+    if contradicted := CONTRADICTED.search(seen.remarks):
+        faults.append(contradicted.group().strip())
     if seen.different < FEW_VIEWS:
         alike = f" of {count}" if round(seen.different) < count else ""
         number = f"only {round(seen.different)}{alike}"

@@ -85,10 +85,22 @@ def make_prior(
             raise ValueError(f"priors: want a positive standard deviation for {name!r}, got {pair[1]}")
         if not bool(mean.detach()[:, where].isfinite().all()):
             raise ValueError(f"priors: want (mean, deviation) with a finite mean for {name!r}, got {value!r}")
+        if pair[0] is not None:
+            check_focal(name, mean[:, where], pair[0])
         chosen = torch.zeros_like(mean)
         chosen[:, where[:1] if name == "focal" and tied_focal else where] = 1.0
         precision = precision * (1 - chosen) + chosen / deviation.square()
     return Prior(torch.where(precision > 0, mean, 0.0), torch.diag_embed(precision))
+
+
+def check_focal(name: str, mean: Tensor, said: Any) -> None:
+    """Check what is said of a focal length.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if name in ("focal", "f_x", "f_y") and not bool((mean.detach() > 0).all()):
+        raise ValueError(f"priors: want a focal length in px, more than 0, for {name!r}, got {called(said)}")
 
 
 def of_points(name: str) -> tuple[int, ...]:
@@ -102,7 +114,7 @@ def of_camera(priors: Priors | None) -> Priors | None:
 
 
 def printing_precision(priors: Priors | None, batch: Sequence[int], points: Tensor) -> Tensor | None:
-    """The precision `(P, 3 N)` of free points' displacements, in world units; `None` where nothing is known.
+    """The precision `(P, N, 3, 3)` of free points' displacements, in world units; `None` where nothing is known.
 
     Raises:
         ValueError: a shape that does not fit, or a deviation that is not positive.
@@ -131,7 +143,7 @@ def printing_precision(priors: Priors | None, batch: Sequence[int], points: Tens
         own = deviation.unsqueeze(-1) if len(axes) == 1 else deviation
         precision[..., axes] = own.square().reciprocal()
         known = True
-    return precision.reshape(-1, points.numel()) if known else None
+    return torch.diag_embed(precision.reshape(-1, *points.shape)) if known else None
 
 
 def _written(into: Tensor, where: list[int], value: Any, name: str, batch: Sequence[int]) -> Tensor:

@@ -78,13 +78,12 @@ def with_free_points(flat: Fit, data: Data, options: Options, prior: Prior | Non
 def _as_printed(data: Data, options: Options) -> tuple[Tensor | None, Tensor | None]:
     """The precision of each displacement `(P, N, 3, 3)`, if it is known, and where points may move: see `_basis`."""
     printed = printing_precision(options.priors, data.batch, data.points)
-    blocks = None if printed is None else torch.diag_embed(printed.unflatten(-1, (-1, 3)))
     held = [axis for name in options.fixed for axis in of_points(name)]
     if not held:
-        return blocks, None
+        return printed, None
     count = data.points.numel()
     free = [number for number in range(count) if number % 3 not in held]
-    return blocks, torch.eye(count, dtype=data.points.dtype, device=data.points.device)[:, free]
+    return printed, torch.eye(count, dtype=data.points.dtype, device=data.points.device)[:, free]
 
 
 def _as_surveyed(data: Data) -> tuple[Tensor, Tensor | None]:

@@ -9,12 +9,14 @@ from torch import Tensor
 
 from diffproj._core.arguments import called, words
 from diffproj._core.numerics import check_tensor, in_float64
-from diffproj.calibration.constraints import Priors
+from diffproj.calibration.constraints import Priors, check_focal
 from diffproj.calibration.parametrisation import POSE, Parametrisation
 from diffproj.calibration.pose_parameters import ANGLES, PLACE, TURNS, PoseParameters
 from diffproj.calibration.solver import Prior
 from diffproj.geometry.camera import Camera
 
+MOST_TILT = 180.0
+"""Tilt in degrees beyond which it is none; between 90 and this a camera leans over backwards."""
 STEEPEST = 89.9
 """Tilt in degrees, down or up, from which on roll and heading turn about the same axis."""
 
@@ -173,6 +175,10 @@ def _known(names: PoseParameters, name: str, value: Any, tied_focal: bool) -> Kn
         raise ValueError(f"priors: want a positive standard deviation for {name!r}, got {called(pair[1])}")
     if mean is not None and name == "height" and not bool((mean.detach() > 0).all()):
         raise ValueError(f"priors: want a height above the ground, more than 0, got {called(pair[0])}")
+    if mean is not None and name == "tilt" and not bool((mean.detach().abs() <= MOST_TILT).all()):
+        raise ValueError(f"priors: want a tilt in degrees below the horizon, from -90 to 90, got {called(pair[0])}")
+    if mean is not None:
+        check_focal(name, mean, pair[0])
     return Known(name, tuple(where), mean, deviation)
 
 

@@ -63,7 +63,7 @@ def locate(
     sees them, as photographs of another camera, zoom or focus: see `mismatch`.
     A calibration that fitted the target's shape brings that along, too, for the same target. `Landmarks` may lie
     anywhere; where they come with a sigma of their own, each view's pose carries it, as if other views had other
-    landmarks.
+    landmarks; with a calibration that was found on them they are where that has them.
 
     Args:
         views: corners `(*B, V, N, 2)`.

@@ -66,7 +66,8 @@ class CalibrationOptions(LocateOptions, TypedDict, total=False):
             origin, axes and size as a whole stay the target's, in the sense of least squares. That takes more views
             (six and more), or a word on how well the target was printed: `priors={"points": 0.1}` has a standard
             deviation of 0.1 world units for each coordinate. `fixed=["points_z"]` keeps the points in the plane. Not
-            with the plane objective, for only a flat target has one plane.
+            with the plane objective, for only a flat target has one plane. `Landmarks` with a sigma that several views
+            show are free points anyway, and that is what is known of them.
         bow: `True` is `shape="bow"`, as it was called before.
         skew: fit the skew of K too, `K[0, 1]`, for sensors whose rows and columns are not at right angles. False if
             left out: it stays what it is, 0 in `calibrate`.

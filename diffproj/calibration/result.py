@@ -78,7 +78,7 @@ class Calibration(Account, Copied, Recorded):
         landmarks: the names of the N points, where they are `Landmarks`; `None` for a board.
         unit: the world's unit, such as `"mm"`, where it is known; files keep it.
         displacements: how far each point of the target lies from where it was given `(*B, N, 3)` in world units, where
-            `shape="free"` fitted them.
+            `shape="free"` fitted them, or several views showed `Landmarks` with a sigma.
         rig: which rig the camera is of, where it was calibrated with others: a text that these have, too. The errors of
             all of them go together.
     """

@@ -149,8 +149,8 @@ def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
     phi = _dispersion(found, H, M)
     scores, precision = Scores(M.U, M.E, M.W), None
     if found.restraint is not None and bool((found.restraint.printed > 0).any()):
-        of_print = torch.nn.functional.pad(found.prior_variance * found.restraint.printed, (found.parameters.few, 0))
-        precision = torch.diag_embed(of_print)  # of the prior's scores, in the unit of the corners'
+        few = found.parameters.few  # the prior's scores, in the unit of the corners'
+        precision = torch.nn.functional.pad(found.prior_variance * found.restraint.measured, (few, 0, few, 0))
     found_one = covariance(
         H,
         found.parameters.names,

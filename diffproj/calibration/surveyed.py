@@ -9,7 +9,8 @@ and residuals multiplied by `s C^(-1/2)` have the noise s in every direction, wh
 and the tests of a fit work with (errors in variables, to first order; Deming 1943). C depends on the pose, and s, where
 it is not known, on the residuals: both are taken anew from the last minimum until they stand.
 
-Of one view that is the whole error. Several views see the same landmark off in the same way, which no weight says.
+Of one view that is the whole error. Several views see the same landmark off in the same way, which no weight says:
+there the landmarks' places are unknowns that the views share (`free_points.py`).
 """
 
 from dataclasses import replace

@@ -6,13 +6,15 @@ from pathlib import Path
 from diffproj.cli.common_options import add_camera, add_photograph, add_said, describe, pixel_noise
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import add_orientation, some_path
+from diffproj.cli.known_beforehand import fixed, prior
 from diffproj.cli.units import METRES
 
 DESCRIPTION = """\
 Finds where a camera stood from surveyed points that a photograph shows: on the
 ground, on a facade, anywhere in space. Prints its position, tilt, roll and
 heading with their standard deviations, and how far off each landmark is.
-Four landmarks that do not lie on a line are enough where the camera is known.
+Four landmarks that do not lie on a line are enough where the camera is known;
+fewer, or more unknowns, where something of the camera is known beforehand.
 """
 
 EPILOG = """\
@@ -36,11 +38,23 @@ the focal length:
   the first coefficient of the lens too. Both need six landmarks or more that do
   not lie on a plane; what they do not tell is said.
 
+what is known beforehand:
+  --prior height=12+-0.02 says that the camera stands at z = 12, with a standard
+  deviation of 0.02; --fixed roll=0 that something is certain. Names are height
+  (the camera's z, over z = 0), x, y, tilt (degrees below the horizon), roll (by
+  which the horizon sinks to the right) and heading (clockwise from y); --prior
+  takes focal, f_x, f_y, c_x, c_y, k1 and so on too, and finds them along.
+  Priors weigh against the pixels: give --pixel-sigma along. Both may be given
+  several times, and with them fewer than four landmarks may be enough.
+
 examples:
   diffproj locate beach.jpg --camera drone.yaml --landmarks survey.csv \\
       -o located.json --draw located.png
   diffproj locate river.jpg --camera camera.yaml --landmarks gcp.csv \\
       --free focal,k1 --pixel-sigma 2
+  diffproj locate mast.jpg --camera camera.yaml --landmarks marks.csv \\
+      --prior height=12.30+-0.02 --prior focal=1550+-50 --fixed roll=0 \\
+      --pixel-sigma 1
   diffproj measure --camera located.json --view beach.jpg --points 2000,1000
 
 The file that -o writes is the camera at its place, with its error bars, for
@@ -71,6 +85,23 @@ def add_options(command: argparse.ArgumentParser) -> None:
         metavar="NAMES",
         help="what else is to be found, with commas between: focal, f_x, f_y, principal_point, or coefficients of the "
         "lens such as k1 (default: the pose alone)",
+    )
+    more.add_argument(
+        "--prior",
+        type=prior,
+        action="append",
+        default=[],
+        metavar="NAME=VALUE+-S",
+        help="what is known beforehand, with its standard deviation, such as height=12+-0.02 or focal=1550+-50; may be "
+        "given several times",
+    )
+    more.add_argument(
+        "--fixed",
+        type=fixed,
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="what is certain of where the camera stood and looked, such as roll=0; may be given several times",
     )
     more.add_argument(
         "--pixel-sigma",

@@ -50,9 +50,11 @@ def document(
     camera = found.cameras[0]
     mounting = camera.mounting()
     values = (mounting.tilt, mounting.roll, mounting.heading, *mounting.position, mounting.height)
+    held = {one.name for one in options.fixed}
+    held = {"z" if name == "height" else name for name in held}
     spread = mounting_covariance(found).diagonal().clamp(min=0).sqrt()
     where = {
-        name: {"value": float(value), "deviation": known(float(deviation))}
+        name: {"value": float(value), "deviation": 0.0 if name in held else known(float(deviation))}
         for name, value, deviation in zip(MOUNTING, values, spread, strict=True)
     }
     intrinsics = {
@@ -63,6 +65,7 @@ def document(
     rows = _landmarks(found, surveyed)
     used = [row for row in rows if row["used"]]
     includes = ["pixels", "landmarks"] if surveyed.landmarks.covariances is not None else ["pixels"]
+    includes += ["priors"] if options.prior else []
     return {
         "camera": str(options.camera),
         "photograph": None if options.photograph is None else str(options.photograph),
@@ -72,6 +75,8 @@ def document(
         "position": {axis: where[axis] for axis in "xyz"},
         "mounting": {name: where[name] for name in ANGLES},
         "intrinsics": intrinsics,
+        "priors": {one.name: {"value": one.value, "deviation": one.deviation} for one in options.prior},
+        "fixed": {one.name: one.value for one in options.fixed},
         "rms": float(found.rms),
         "pixel_sigma": None if found.pixel_sigma is None else known(float(found.pixel_sigma)),
         "degrees_of_freedom": None if found.degrees_of_freedom is None else known(float(found.degrees_of_freedom)),
@@ -136,7 +141,7 @@ def _camera_table(told: dict[str, Any]) -> Table:
     rows = {f"{axis}, {unit}": told["position"][axis] for axis in "xyz"}
     rows |= {IN_WORDS[name]: told["mounting"][name] for name in ANGLES}
     rows |= {_title(name): found for name, found in told["intrinsics"].items()}
-    pairs = [rounded(row["value"], math.inf if row["deviation"] is None else row["deviation"]) for row in rows.values()]
+    pairs = [_shown(row["value"], row["deviation"]) for row in rows.values()]
     table = Table(title="The camera, if z points up", title_justify="left")
     table.add_column("")
     table.add_column("value", no_wrap=True)
@@ -144,6 +149,10 @@ def _camera_table(told: dict[str, Any]) -> Table:
     for name, *pair in zip(rows, *(aligned(column) for column in zip(*pairs, strict=True)), strict=True):
         table.add_row(name, *pair)
     return table
+
+
+def _shown(value: float, deviation: float | None) -> tuple[str, str]:
+    return (f"{value:.6g}", "fixed") if deviation == 0 else rounded(value, math.inf if deviation is None else deviation)
 
 
 def _title(name: str) -> str:
@@ -176,6 +185,7 @@ def _about_deviations(told: dict[str, Any]) -> str:
             f" from {counted(round(freedom), 'degree')} of freedom only" if freedom < 8 else ""
         )
     survey = ", the landmarks' own deviations" if "landmarks" in told["deviations_include"] else ""
+    survey += ", what --prior says" if told["priors"] else ""
     if "camera" in told["deviations_include"]:
         return f"The deviations hold the noise of the pixels ({noise}){survey} and how surely the camera is known."
     return (

@@ -2,17 +2,22 @@
 
 import argparse
 import re
+import warnings
 from dataclasses import replace
 from typing import Any
 
 from torch import Tensor
 
+from diffproj.calibration.adjust import adjust
+from diffproj.calibration.adjusted_view import of_view
 from diffproj.calibration.locate import locate
+from diffproj.calibration.observations import Seen
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.refine import refine
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
 from diffproj.cli.inputs import check_not_the_same, check_writable, writing
+from diffproj.cli.known_beforehand import FOCAL, POSE, check_together, one_focal_length, posed, standing_near
 from diffproj.cli.landmarks_file import Surveyed, read_landmarks
 from diffproj.cli.locate_document import document, say
 from diffproj.cli.photographs import one_photograph
@@ -25,6 +30,8 @@ from diffproj.targets.views import Views
 
 FEWEST = 4
 """Landmarks that a pose needs."""
+OPTIONS = {"priors": "--prior", "fixed": "--fixed", "pixel_sigma": "--pixel-sigma"}
+"""Of the library, and what they are called here."""
 
 
 def run(options: argparse.Namespace) -> int:
@@ -36,6 +43,7 @@ def run(options: argparse.Namespace) -> int:
     if options.photograph is not None:
         check_no_photograph(options.draw, [options.photograph])
     camera, calibration = loaded(options.camera)
+    check_together(options.prior, options.fixed, camera)
     surveyed = read_landmarks(options.landmarks)
     picture, size = None, camera.size
     if options.photograph is not None:
@@ -81,27 +89,102 @@ def _located(
     path = options.landmarks
     visible = surveyed.pixels.isfinite().all(-1)
     count = int(visible.sum())
-    if count < FEWEST:
-        raise ValueError(f"--landmarks: want at least {FEWEST} with a pixel, got {count} in {path}")
-    steps: dict[str, Any] = {"reject_outliers": options.reject_outliers, "pixel_sigma": _noise(options, surveyed)}
+    _check_count(options, count)
+    sigma = _noise(options, surveyed)
+    if options.prior and sigma is None:
+        raise ValueError(
+            "--prior: want --pixel-sigma beside it, or a column 'pixel_sigma', for it weighs against the pixels' noise"
+        )
+    steps: dict[str, Any] = {"reject_outliers": options.reject_outliers, "pixel_sigma": sigma}
+    free = _free(options, camera)
+    named = [*options.free, *(one.name for one in options.prior)]
+    tied = one_focal_length(named)
+    priors = {one.name: (one.value, one.deviation) for one in options.prior}
+    of_pose = [one for one in (*options.prior, *options.fixed) if one.name in POSE]
+    target = surveyed.landmarks
     try:
         views = Views(surveyed.pixels.unsqueeze(0), visible.unsqueeze(0), [view], size)
-        if not options.free:
-            found = locate(views, surveyed.landmarks, camera if calibration is None else calibration, **steps)
+        if of_pose and (free or count < FEWEST):
+            found = _adjusted(options, camera, calibration, surveyed, views, sigma, free, tied)
+        elif of_pose:
+            start: Camera | Calibration = camera if calibration is None else calibration
+            held = tuple(one.name for one in options.fixed)
+            found = locate(views, target, posed(start, options.fixed), fixed=held, priors=priors or None, **steps)
+        elif free:
+            held = tuple(name for name in Parametrisation.of(camera).names if name not in free)
+            steps |= {"fixed": held, "tied_focal": tied, "priors": priors or None}
+            found = refine(views, target, camera.without_pose(), **steps)
         else:
-            free = _free(options, camera)
-            fixed = [name for name in Parametrisation.of(camera).names if name not in free]
-            start, tied = camera.without_pose(), "focal" in options.free
-            found = refine(views, surveyed.landmarks, start, fixed=fixed, tied_focal=tied, **steps)
+            found = locate(views, target, camera if calibration is None else calibration, **steps)
     except (ValueError, CalibrationError) as error:
         text = _in_words(failure(error), surveyed)
         raise ValueError(text if text.startswith("--") else f"{path}: {text}") from error
     return replace(found, unit=options.unit)
 
 
+def _adjusted(
+    options: argparse.Namespace,
+    camera: Camera,
+    calibration: Calibration | None,
+    surveyed: Surveyed,
+    views: Views,
+    sigma: Tensor | float | None,
+    free: tuple[str, ...],
+    tied: bool,
+) -> Calibration:
+    """The camera from landmarks and what is known of both its place and its lens, or from fewer than four of them.
+
+    Raises:
+        ValueError: options that do not go together.
+        CalibrationError: they do not determine it.
+    """
+    if sigma is None:
+        raise ValueError(
+            "--fixed: want --pixel-sigma beside it where there are fewer than 4 landmarks, or --free, got none"
+        )
+    if options.reject_outliers:
+        raise ValueError(
+            "--reject-outliers: want 4 landmarks at least, and either what is known of the place or --free, got both"
+        )
+    start = camera.without_pose()
+    if int(views.visible.sum()) >= FEWEST:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            start = locate(views, surveyed.landmarks, camera, throw=False).cameras[0]
+    if not bool(start.t.isfinite().all()) or not bool((start.center != 0).any()):
+        start = standing_near(camera, surveyed.landmarks.points)
+    start = posed(start, [*options.prior, *options.fixed])
+    freed = (*(name for name in free if name not in FOCAL[1:] or not tied), *(("focal",) if tied else ()))
+    taken = {one.name for one in options.prior}
+    known = calibration
+    adjusted = adjust(
+        start if known is None else replace(known, camera=start),
+        Seen(surveyed.landmarks, surveyed.pixels, pixel_sigma=sigma),
+        priors={one.name: (one.value, one.deviation) for one in options.prior},
+        fixed=tuple(one.name for one in options.fixed),
+        free=tuple(name for name in freed if name not in taken),
+        tied_focal=tied,
+    )
+    return of_view(adjusted, views, surveyed.landmarks, sigma)
+
+
+def _check_count(options: argparse.Namespace, count: int) -> None:
+    """Check that there are landmarks enough.
+
+    Raises:
+        ValueError: there are not.
+    """
+    least = 1 if options.prior or options.fixed else FEWEST
+    if count < least:
+        fewer = "; fewer are enough with --prior or --fixed" * (least > 1)
+        raise ValueError(f"--landmarks: want at least {least} with a pixel, got {count} in {options.landmarks}{fewer}")
+
+
 def _in_words(text: str, surveyed: Surveyed) -> str:
     """What the library says of the landmarks, with their names and the command's options."""
-    text = re.sub("^(target|views): |^refine: ", "", text)
+    text = re.sub("^(target|views): |^(refine|adjust): ", "", text)
+    text = re.sub("^(priors|fixed|pixel_sigma): ", lambda m: f"{OPTIONS[m[1]]}: ", text)
+    text = re.sub(r"; fix (\w+|some of them) or give a prior, as .*$", r"; tell \1 by --fixed or --prior", text)
     text = re.sub(r"; fixed=\(.*$", "; or less in --free", text)
     names = surveyed.landmarks.names
     return re.sub(
@@ -112,7 +195,9 @@ def _in_words(text: str, surveyed: Surveyed) -> str:
 def _free(options: argparse.Namespace, camera: Camera) -> tuple[str, ...]:
     """The names of the intrinsics that are found along with the pose."""
     parameters = Parametrisation.of(camera)
-    places = {place for name in options.free for place in parameters.positions("--free", name)}
+    named = [*options.free, *(one.name for one in options.prior if one.name not in POSE)]
+    named += ["focal"] if one_focal_length(named) else []
+    places = {place for name in named for place in parameters.positions("--free", name)}
     return tuple(parameters.names[place] for place in sorted(places))
 
 

@@ -2,10 +2,13 @@
 
 import csv
 import io
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 from diffproj.cli.inputs import LARGEST_NUMBER
+
+DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
 
 
 class Spreadsheet:
@@ -33,7 +36,11 @@ class Spreadsheet:
         except UnicodeDecodeError:
             raise ValueError(f"{option}: want a text file in UTF-8, got something else in {path}") from None
         self._option, self._want, self.path = option, want, path
-        self.separator = next((mark for mark in ";\t" if mark in self._text), ",")
+        told = (line for line in self._text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
+        first = next(told, "")
+        self.separator = next((mark for mark in ";\t" if mark in first), ",")
+        cells = [] if self.separator == "," else re.split(f"[{self.separator}\n]", self._text)
+        self._decimal_commas = any(DECIMAL_COMMA.fullmatch(cell.strip()) for cell in cells)
 
     def lines(self) -> Iterator[tuple[int, list[str]]]:
         """The number of each line, from 1, and its cells without spaces around them.
@@ -53,11 +60,20 @@ class Spreadsheet:
             ) from None
 
     def number(self, cell: str) -> float | None:
-        """The number in a cell; `None` where there is none, or one that is not finite or beyond 1e100."""
+        """The number in a cell; `None` where there is none, or one that is not finite or beyond 1e100.
+
+        Raises:
+            ValueError: it has a point in a file of decimal commas: for thousands, or for decimals?
+        """
         try:
             value = float(cell if self.separator == "," else cell.replace(",", "."))
         except ValueError:
             return None
+        if self._decimal_commas and "." in cell:
+            raise ValueError(
+                f"{self._option}: want decimal commas in all numbers and no mark between thousands, got {cell!r} "
+                f"beside decimal commas in {self.path}"
+            )
         return value if abs(value) <= LARGEST_NUMBER else None
 
     def joined(self, cells: list[str]) -> str:

@@ -29,6 +29,10 @@ class Landmarks(Copied, Shown):
     length too; fewer, and be it one, are evidence beside other for `adjust`, as `Seen`. In `Views` each has a pixel, in
     the landmarks' order, or is not visible.
 
+    Where they come with a sigma, `locate` and one view count that along with the pixels' noise. Several views in
+    `calibrate` and `refine` see a landmark off in the same way: its place is found along with the camera then, from
+    where it was surveyed, as surely as that is (`Calibration.points`, `points_deviation`).
+
     Attributes:
         points: in the world `(N, 3)`, in the caller's unit, such as metres.
         names: N of them, in the same order.

@@ -476,6 +476,8 @@ def test_turns_are_known_of_a_camera_that_looks_straight_down() -> None:
         (lambda: dp.adjust(START, priors={"tilt": 1.0}, fixed=("tilt",)), "got 'tilt', also in priors"),
         (lambda: dp.adjust(START, priors={"tilt": 1.0, "turn_x": 1.0}), "got both 'tilt' and 'turn_x'"),
         (lambda: dp.adjust(START, priors={"height": (-3.0, 1.0)}), "priors: want a height above the ground"),
+        (lambda: dp.adjust(START, priors={"tilt": (200.0, 1.0)}), "priors: want a tilt in degrees below the horizon"),
+        (lambda: dp.adjust(START, priors={"focal": (-900.0, 1.0)}), "priors: want a focal length in px, more than 0"),
         (lambda: dp.Seen(LANDMARKS, seen()[:4]), "pixels: want one for each of 6 landmarks, got 4"),
         (lambda: dp.Seen(LANDMARKS, seen(), sigma=[1.0, 2.0]), "sigma: want a number"),
         (lambda: dp.Horizon([[1.0, float("nan")]]), "pixels: want finite pixels"),

@@ -85,6 +85,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             f"{line[:-1]},{s}\n" for line, s in zip(lines, ["sigma_z", *"1"] + ["-1"] * 4, strict=True)
         ),
         "both.csv": "u,v,x,y,sigma,sigma_x\n1,2,3,4,5,6\n",
+        "thousands.csv": RIVER.replace("192111,36369", "192.111"),
+        "noted.csv": "# a; note\n" + BEACH.replace("mast", "mast; old"),
         "alike.csv": BEACH + "again" + lines[1][4:],
         "mixed.csv": BEACH.replace("2521.9588508,483.68938913", "@")
         .replace("3770.57121219,1802.68876725", "2521.9588508,483.68938913")
@@ -275,7 +277,113 @@ def test_the_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None
         figures.landmarks(bare)
 
 
+MAST = """name,u,v,x,y
+m0,522.262,757.193,109.9413,224.2934
+m1,1283.634,467.345,136.5859,228.0441
+m2,587.407,368.361,127.0766,255.6045
+m3,1240.050,653.880,123.8799,219.1246
+m4,1336.106,294.309,166.7439,248.4278
+"""
+"""Marks on the ground around a mast 12.3 high at (100, 200), seen by a camera of f = 1510 with a noise of 1 px."""
+
+
+@pytest.fixture
+def mast(tmp_path: Path) -> tuple[str, ...]:
+    """The options for it; the camera's file has f = 1560."""
+    camera = dp.Camera.from_opencv([[1560, 0, 959.5], [0, 1560, 539.5], [0, 0, 1]], [0, 0, 0, 0], size=(1920, 1080))
+    dp.save_camera(tmp_path / "mast.yaml", camera)
+    (tmp_path / "marks.csv").write_text(MAST)
+    (tmp_path / "two.csv").write_text("".join(MAST.splitlines(keepends=True)[:3]))
+    return "--camera", str(tmp_path / "mast.yaml"), "--landmarks", str(tmp_path / "marks.csv"), "--pixel-sigma", "1"
+
+
+def test_what_is_known_beforehand_is_what_the_library_makes_of_it(
+    mast: tuple[str, ...], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Of the place alone, of the focal length alone, and of both; the file holds it, and measures with it."""
+    surveyed, camera = read_landmarks(Path(mast[3])), dp.load_camera(mast[1])
+    views = dp.Views(surveyed.pixels.unsqueeze(0), size=(1920, 1080))
+    both = ("--prior", "height=12.30±0.02", "--fixed", "roll=0", "--prior", "focal=1550 +- 50")
+    found = parsed(capsys, *mast, *both, "-o", str(tmp_path / "out.json"))
+    start = dp.Camera.mounted(12.3, 18.0, 0.0, 40.0, focal=1560.0, size=(1920, 1080), position=[100.0, 200.0])
+    seen = dp.Seen(surveyed.landmarks, surveyed.pixels, pixel_sigma=1.0)
+    priors = {"height": (12.3, 0.02), "focal": (1550.0, 50.0)}
+    expected = dp.adjust(start, seen, priors=priors, fixed=("roll",))
+    assert found["position"]["x"]["value"] == pytest.approx(float(expected.mounting.position[0]), abs=1e-4)
+    assert found["position"]["z"]["deviation"] == pytest.approx(float(expected.mounting_deviations.height), rel=1e-3)
+    deviation = float(expected.covariance.deviations["f_x"])
+    assert found["intrinsics"]["f_x"] == {
+        "value": pytest.approx(float(expected.camera.K[0, 0]), abs=1e-2),
+        "deviation": pytest.approx(deviation, rel=1e-3),
+    }
+    assert abs(found["intrinsics"]["f_x"]["value"] - 1510) < 3 * deviation
+    assert found["mounting"]["roll"] == {"value": pytest.approx(0, abs=1e-9), "deviation": 0.0}
+    assert found["fixed"] == {"roll": 0.0}
+    assert found["priors"]["height"] == {"value": 12.3, "deviation": 0.02}
+    assert found["deviations_include"] == ["pixels", "priors"]
+    again = dp.load_calibration(tmp_path / "out.json")
+    ground = dp.measure([[800.0, 600.0]], again, dp.Plane.z(0.0), view=0, pixel_sigma=1.0)
+    wanted = dp.measure([[800.0, 600.0]], expected, dp.Plane.z(0.0), pixel_sigma=1.0)
+    torch.testing.assert_close(ground.points, wanted.points, rtol=0, atol=1e-3)
+    torch.testing.assert_close(ground.deviations, wanted.deviations, rtol=1e-3, atol=1e-9)
+
+    one = parsed(capsys, *mast, "--prior", "f_x=1550+-50")["intrinsics"]
+    held = ("principal_point", "distortion")
+    known = {"priors": {"f_x": (1550.0, 50.0)}, "fixed": held, "tied_focal": True, "pixel_sigma": 1.0}
+    refined = dp.refine(views, surveyed.landmarks, camera, **known).to_dict()
+    assert one["f_x"]["value"] == one["f_y"]["value"] == pytest.approx(refined["f_x"], abs=1e-6)
+    assert one["f_x"]["deviation"] == pytest.approx(refined["f_x_deviation"], rel=1e-6)
+
+    place = parsed(capsys, *mast, "--prior", "z=12,3+/-0.02")["position"]["z"]
+    located = dp.locate(views, surveyed.landmarks, camera, pixel_sigma=1.0, priors={"height": (12.3, 0.02)})
+    assert place["value"] == pytest.approx(float(located.cameras.center[0, 2]), abs=1e-6)
+
+
+def test_two_landmarks_and_what_is_known(mast: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    two = (*mast[:3], mast[3].replace("marks.csv", "two.csv"), *mast[4:])
+    known = ("height=12.3+-0.02", "tilt=18+-0.5", "x=100+-0.5", "y=200+-0.5", "focal=1510+-5")
+    options = [part for one in known for part in ("--prior", one)]
+    found = parsed(capsys, *two, *options, "--fixed", "roll=0")
+    for axis, value in (("x", 100.0), ("y", 200.0), ("z", 12.3)):
+        assert abs(found["position"][axis]["value"] - value) < 4 * found["position"][axis]["deviation"]
+    code, _, err = run(capsys, *two, "--prior", "height=12.3+-0.02")
+    assert code == 1
+    assert re.search(r"two\.csv: roll, heading and position: .*; tell some of them by --fixed or --prior$", err.strip())
+
+
+def test_priors_that_contradict_the_landmarks_are_told(
+    mast: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for more in ((), ("--prior", "focal=1510+-1")):
+        found = parsed(capsys, *mast, "--prior", "height=15+-0.01", *more)
+        assert "times what" in found["verdict"]
+        assert not found["verdict"].startswith("Good")
+
+
 CASES: list[tuple[tuple[str, ...], int, str]] = [
+    ((*DRONE, *LANDMARKS, "--prior", "tilt=12"), 2, r"--prior: want a standard deviation .*; --fixed tilt=12 holds it"),
+    ((*DRONE, *LANDMARKS, "--prior", "tilt=12+-0"), 2, "--prior: want a standard deviation above 0, got 'tilt=12"),
+    (
+        (*DRONE, *LANDMARKS, "--prior", "12+-1"),
+        2,
+        r"--prior: want NAME=VALUE\+-DEVIATION, such as height=12\+-0.02, got",
+    ),
+    ((*DRONE, *LANDMARKS, "--prior", "height=-1+-1"), 2, "--prior: want a height above z = 0, more than 0, got"),
+    ((*DRONE, *LANDMARKS, "--prior", "tilt=100+-1"), 2, "--prior: want degrees below the horizon, from -90 to 90, got"),
+    ((*DRONE, *LANDMARKS, "--fixed", "k1=0"), 2, "--fixed: want a name from tilt, .*, got 'k1'; of the camera"),
+    ((*DRONE, *LANDMARKS, "--fixed", "roll"), 2, "--fixed: want NAME=VALUE, such as roll=0, got 'roll'"),
+    ((*DRONE, *LANDMARKS, "--prior", "hight=1+-1"), 1, "--prior: want a name from tilt, roll, .*, got 'hight'"),
+    ((*DRONE, *LANDMARKS, "--prior", "height=80+-1"), 1, "--prior: want --pixel-sigma beside it"),
+    (
+        (*DRONE, *LANDMARKS, "--prior", "z=80+-1", "--fixed", "height=80"),
+        1,
+        "--fixed: want each name once, got 'height'",
+    ),
+    (
+        (*DRONE, *LANDMARKS, "--prior", "focal=2300+-9", "--prior", "f_x=2300+-9"),
+        1,
+        "--prior: want either 'focal' or 'f_x' and 'f_y', got both",
+    ),
     ((*DRONE,), 2, "the following arguments are required: --landmarks"),
     ((*LANDMARKS,), 2, "the following arguments are required: --camera"),
     ((*DRONE, *LANDMARKS, "--free", "focal;k1"), 2, "--free: want names with commas between, such as focal"),
@@ -327,6 +435,7 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
             ),
             ("both.csv", "--landmarks: want either a column 'sigma' or sigma_x, .*, got both in both.csv"),
             ("rough.csv", "--landmarks: want a standard deviation in column 'pixel_sigma' .* none for 'post'"),
+            ("thousands.csv", "--landmarks: want decimal commas in all numbers and no mark .*, got '192.111' beside"),
             ("few.csv", "--landmarks: want at least 4 with a pixel, got 3 in few.csv"),
             ("line.csv", "line.csv: want points that do not lie on one line"),
             ("alike.csv", "alike.csv: want points that are all distinct, got 6 with 'mast' and 'again' alike"),
