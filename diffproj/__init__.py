@@ -89,6 +89,7 @@ __all__ = [
     "Landmarks",
     "LearnableCamera",
     "LearnablePlane",
+    "LearnableRig",
     "Lengths",
     "Lens",
     "LensComparison",
@@ -151,6 +152,7 @@ __all__ = [
     "run_experiment",
     "save_camera",
     "stack",
+    "torchvision_warp",
     "write_measuring_page",
     "write_report",
 ]

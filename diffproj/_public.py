@@ -61,6 +61,7 @@ from diffproj.geometry.rectification import geotransform as geotransform
 from diffproj.geometry.rectification import plane_axes as plane_axes
 from diffproj.geometry.rectification import rectify as rectify
 from diffproj.geometry.rectification import render as render
+from diffproj.geometry.torchvision_warp import torchvision_warp as torchvision_warp
 from diffproj.lens.brown_conrady import BrownConrady as BrownConrady
 from diffproj.lens.kannala_brandt import KannalaBrandt as KannalaBrandt
 from diffproj.lens.models import register_lens as register_lens
@@ -80,6 +81,7 @@ from diffproj.nn.loss import PlaneLoss as PlaneLoss
 from diffproj.nn.plane import LearnablePlane as LearnablePlane
 from diffproj.nn.prior import CalibrationPrior as CalibrationPrior
 from diffproj.nn.projector import PlaneProjector as PlaneProjector
+from diffproj.nn.rig import LearnableRig as LearnableRig
 from diffproj.paper.experiment import Experiment as Experiment
 from diffproj.paper.experiment import run_experiment as run_experiment
 from diffproj.paper.route import paper_route as paper_route

@@ -17,6 +17,13 @@ def bow_shape(points: Float[Tensor, "n 3"]) -> Float[Tensor, "2 n"]:
     return 1 - ((along - (low + high) / 2) / half).square()
 
 
+def bow_deviation(points: Float[Tensor, "n 3"], bow: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch n 3"]:
+    """Standard deviations of the points' coordinates, for a bow with this covariance."""
+    shape = bow_shape(points)
+    z = (shape * (bow @ shape)).sum(-2).clamp(min=0).sqrt()
+    return torch.nn.functional.pad(z.unsqueeze(-1), (2, 0))
+
+
 def bowed(points: Float[Tensor, "n 3"], bow: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch n 3"]:
     """The points of a flat board `(N, 3)` as its bow `(*B, 2)` lifts them."""
     z = (bow.unsqueeze(-1) * bow_shape(points)).sum(-2)

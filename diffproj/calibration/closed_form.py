@@ -13,7 +13,6 @@ coarse grid: the one under which the columns of `K^-1 H` are closest to orthonor
 import math
 
 import torch
-from kornia.geometry.homography import find_homography_dlt
 from torch import Tensor
 
 FOCAL_SCALE = (0.4, 0.6, 0.8, 1.0, 1.3, 1.8, 2.5, 4.0)
@@ -35,20 +34,47 @@ MAX_ANGLE = math.radians(75)
 def homographies(points: Tensor, xy: Tensor, used: Tensor) -> Tensor:
     """Homographies `(P, V, 3, 3)` from the board, with its centroid as origin, to `xy (P, V, N, 2)`.
 
-    Not finite or arbitrary where the used corners do not determine one.
+    The direct linear transform with normalised points (Hartley 1997). Its matrix of nine unknowns is made of moments of
+    the points, so that the first six are eliminated by a matrix of 3 x 3, and what is left has its null vector in
+    closed form. Not finite or arbitrary where the used corners do not determine a homography.
     """
-    P, V, N, _ = xy.shape
-    board = (points[:, :2] - points[:, :2].mean(0)).expand(P, V, N, 2)
+    N = xy.shape[2]
+    board = points[:, :2] - points[:, :2].mean(0)
     if N > MAX_CORNERS:  # an initial estimate needs no more
-        order = used.cumsum(-1) * MAX_CORNERS // used.sum(-1, keepdim=True).clamp(min=MAX_CORNERS)
-        spread = used & (order != torch.nn.functional.pad(order[..., :-1], (1, 0)))
-        chosen = spread.to(xy.dtype).topk(MAX_CORNERS).indices
-        used = spread.gather(-1, chosen)
-        chosen = chosen.unsqueeze(-1).expand(-1, -1, -1, 2)
-        board, xy = board.gather(2, chosen), xy.gather(2, chosen)
-    board, xy = board.reshape(P * V, -1, 2), xy.reshape(P * V, -1, 2)
-    # Always with weights, even where all are 1: the code path of one view must not depend on another.
-    return find_homography_dlt(board, xy, used.flatten(0, 1).to(xy.dtype), solver="lu").reshape(P, V, 3, 3)
+        step = torch.arange(1, MAX_CORNERS + 1, device=xy.device)
+        if bool(used.all()):
+            chosen = -(-step * N // MAX_CORNERS) - 1
+            board, xy, used = board[chosen], xy[:, :, chosen], used[:, :, chosen]
+        else:
+            number = used.cumsum(-1)
+            count = number[..., -1:]
+            place = -(-step * count.clamp(min=MAX_CORNERS) // MAX_CORNERS)
+            chosen = torch.searchsorted(number, place).clamp(max=N - 1)
+            used, board = step <= count, board[chosen]
+            xy = xy.gather(2, chosen.unsqueeze(-1).expand(-1, -1, -1, 2))
+    both = torch.cat([board.expand_as(xy), xy], dim=-1)
+    both = torch.where(used.unsqueeze(-1), both, 0.0)
+    weight = used.unsqueeze(-1).to(both)
+    count = weight.sum(-2, keepdim=True).clamp(min=1)
+    middle = both.sum(-2, keepdim=True) / count
+    both = (both - middle) * weight
+    size = (both.square().sum(-2) / count.squeeze(-2)).unflatten(-1, (2, 2)).sum(-1).sqrt()
+    both = both.unflatten(-1, (2, 2)) / size[..., None, :, None]
+    # The moments of (x, y, 1) times its transpose, with 1, u, v and u^2 + v^2.
+    a, uv = torch.cat([both[..., 0, :], weight], dim=-1), both[..., 1, :]
+    factors = torch.cat([weight, uv, uv.square().sum(-1, keepdim=True)], dim=-1)
+    moments = ((a.unsqueeze(-1) * a.unsqueeze(-2)).flatten(-2).mT @ factors).unflatten(-2, (3, 3))
+    A, by_u, by_v, by_both = moments.unbind(-1)
+    follow = torch.linalg.solve_ex(A, torch.cat([by_u, by_v], dim=-1))[0]
+    left = by_both - by_u @ follow[..., :3] - by_v @ follow[..., 3:]
+    last = torch.linalg.cross(left[..., 0], left[..., 1])  # of the symmetric matrix, what is across to two columns
+    last = last / last[..., 2:]
+    rows = (follow.unflatten(-1, (2, 3)) * last[..., None, None, :]).sum(-1)  # (P, V, 3, 2): by u and by v
+    upper = rows.mT * size[..., 1, None, None] + middle[..., 2:].mT * last.unsqueeze(-2)
+    H = torch.cat([upper, last.unsqueeze(-2)], dim=-2)
+    linear = H[..., :2] / size[..., 0, None, None]
+    H = torch.cat([linear, H[..., 2:] - linear @ middle[..., :2].mT], dim=-1)
+    return H / H[..., 2:, 2:]
 
 
 def division(
@@ -181,6 +207,31 @@ def intrinsics(H: Tensor, middle: Tensor, size: float, enough: Tensor) -> tuple[
     plausible = (inverse > 0).all(-1) & (inverse < 100).all(-1) & (c.abs() < 20).all(-1)
     f = torch.where(plausible.unsqueeze(-1), inverse, 1.0).rsqrt()
     return f * size, middle + torch.where(plausible.unsqueeze(-1), c, 0.0) * size, plausible
+
+
+def principal_point(H: Tensor, middle: Tensor, size: float, enough: Tensor) -> Tensor:
+    """Principal points `(P, 2)` of cameras with square pixels and no lens, whatever the focal length.
+
+    With `q = c_x^2 + c_y^2 + f^2` as an unknown of its own Zhang's equations are linear and have a solution, even where
+    no focal length goes with it. Arguments are those of `intrinsics`; the middle where the solution is none.
+    """
+    h1, h2 = _centred_columns(H, middle, size)
+
+    def row(a: Tensor, b: Tensor) -> Tensor:
+        """What multiplies (c_x, c_y, q) in `a^T B b`, and what is left."""
+        mixed = [-(a[..., i] * b[..., 2] + a[..., 2] * b[..., i]) for i in (0, 1)]
+        return torch.stack([*mixed, a[..., 2] * b[..., 2], a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]], dim=-1)
+
+    rows = torch.stack([row(h1, h2), row(h1 + h2, h1 - h2) / 2], dim=2)
+    sound = (enough & rows.isfinite().all(-1).all(-1))[..., None, None]
+    A = torch.where(sound, rows, 0.0).flatten(1, 2)
+    gram = A.mT @ A
+    scale = gram.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+    gram = gram * scale.unsqueeze(-1) * scale.unsqueeze(-2)
+    solved = torch.linalg.solve_ex(gram[:, :3, :3], -gram[:, :3, 3:])[0].squeeze(-1)
+    c = (solved * scale[:, :3] / scale[:, 3:])[:, :2]
+    plausible = c.isfinite().all(-1) & (c.abs() < 20).all(-1)
+    return middle + torch.where(plausible.unsqueeze(-1), c, 0.0) * size
 
 
 def poses(H: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -60,9 +60,11 @@ def held_at(reference: Tensor, shared: Tensor, parameters: Parametrisation, fixe
 
 
 def make_prior(
-    priors: Priors | None, shared: Tensor, parameters: Parametrisation, batch: Sequence[int]
+    priors: Priors | None, shared: Tensor, parameters: Parametrisation, batch: Sequence[int], tied_focal: bool
 ) -> Prior | None:
     """The prior on the shared parameters; gradients flow to tensors among its values.
+
+    Focal lengths that are tied are one number: a prior on `focal` then is one measurement, of `f_x`.
 
     Raises:
         ValueError: an unknown name, a shape that does not fit, or a deviation that is not positive.
@@ -84,7 +86,7 @@ def make_prior(
         if not bool(mean.detach()[:, where].isfinite().all()):
             raise ValueError(f"priors: want (mean, deviation) with a finite mean for {name!r}, got {value!r}")
         chosen = torch.zeros_like(mean)
-        chosen[:, where] = 1.0
+        chosen[:, where[:1] if name == "focal" and tied_focal else where] = 1.0
         precision = precision * (1 - chosen) + chosen / deviation.square()
     return Prior(torch.where(precision > 0, mean, 0.0), torch.diag_embed(precision))
 

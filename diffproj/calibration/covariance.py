@@ -140,6 +140,19 @@ class Covariance(Copied, Shown):
         cross, pose = self.cross(view), self.between(view, view)
         return torch.cat([torch.cat([self.shared, cross.mT], dim=-1), torch.cat([cross, pose], dim=-1)], dim=-2)
 
+    def with_points_turned(self, turn: Float[Tensor, "3 3"], few: int) -> "Covariance":
+        """The same with the coordinates of free points, behind `few` other parameters, along other axes `turn x`.
+
+        Those of a point count as undetermined together, or not at all.
+        """
+        s = self.shared.shape[-1]
+        if s == few:
+            return self
+        J = torch.block_diag(torch.eye(few, dtype=turn.dtype, device=turn.device), *[turn] * ((s - few) // 3))
+        infinite = torch.diag_embed(torch.where(self.undetermined, torch.inf, 0.0).to(self.shared))
+        shared = _without_negative(J @ zero_where_infinite(self.shared) @ J.mT) + infinite
+        return replace(self, shared=shared, _follow=self._follow @ J.mT, _mixed=self._mixed @ J.mT)
+
     def following(self, known: "Covariance") -> "Covariance":
         """The covariance of these poses together with shared parameters from another calibration, `known`.
 
@@ -261,6 +274,11 @@ def zero_where_infinite(covariance: Tensor) -> Tensor:
     return torch.where(covariance.isinf(), 0.0, covariance)
 
 
+def _without_negative(covariance: Tensor) -> Tensor:
+    """The same with 0 for variances that rounding made negative, as of what is held across the axes."""
+    return covariance - torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1).clamp(max=0))
+
+
 class Scores(NamedTuple):
     """Covariance of the scores per view: shared-shared `(P, V, s, s)`, shared-local, local-local."""
 
@@ -330,7 +348,7 @@ def covariance(
     if basis is not None:
         # Sensitivity to all shared parameters, fixed ones included, to propagate their known errors (`following`).
         follow = inverse_W @ equations.E.mT
-        shared, mixed = basis @ shared @ basis.mT, mixed @ basis.mT.unsqueeze(1)
+        shared, mixed = _without_negative(basis @ shared @ basis.mT), mixed @ basis.mT.unsqueeze(1)
         unknown = (basis.abs() @ unknown.to(basis).unsqueeze(-1)).squeeze(-1) > 0
         unseen = None if unseen is None else unseen & (basis != 0).any(-1)
     unknown = unknown if unseen is None else unknown | unseen

@@ -52,10 +52,16 @@ class DampingControl:
         self.previous = np.full_like(cost, np.inf)
         self.failed = np.zeros(cost.shape, dtype=bool)
 
+    def part(self, which: np.ndarray) -> "DampingControl":
+        """That of some of the problems `(P,)`."""
+        other = object.__new__(DampingControl)
+        other.__dict__.update({name: of_each[which] for name, of_each in self.__dict__.items()})
+        return other
+
     def stop(self, expected: np.ndarray, tolerance: float, negligible: float) -> np.ndarray:
         """Stop problems that have converged, which are returned, and those whose damping exceeds its maximum."""
         # The current step will still be applied: the criterion is the reduction of the step after it, extrapolated.
-        after = expected * np.clip(expected / self.previous, BEST_CONTRACTION, 1)
+        after = expected * np.minimum(np.maximum(expected / self.previous, BEST_CONTRACTION), 1)
         self.previous = np.where(self.active, expected, self.previous)
         converged = (after <= tolerance * self.cost) & (expected <= FINAL_STEP_REDUCTION * self.cost)
         # Where the reduction is below the cost's rounding error, acceptance is random: the first failure ends it.

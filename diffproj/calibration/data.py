@@ -1,5 +1,6 @@
 """What calibration is given, checked: views, board and weights."""
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -8,6 +9,7 @@ from torch import Tensor
 
 from diffproj._core.arguments import Array, first_of, tensor_of
 from diffproj._core.numerics import in_float64
+from diffproj.calibration.constraints import of_points
 from diffproj.calibration.distinct import shares
 from diffproj.calibration.losses import SMALLEST
 from diffproj.calibration.own_frame import OwnFrame, flattened, own_frame
@@ -101,8 +103,13 @@ class Data:
         """How much each view counts in what all views share `(P, V)`; `None` where all count fully."""
         return shares(self.points, self.pixels, self.used)
 
-    def check_options(self, objective: str, bow: bool, shape: str) -> None:
+    def check_options(self, objective: str, shape: str, named: Sequence[str] = ()) -> None:
         """Check what a target can be asked for in `calibrate` and `refine`.
+
+        Args:
+            objective: what is minimised.
+            shape: of the target.
+            named: parameters that are fixed, or have a prior.
 
         Raises:
             ValueError: it cannot.
@@ -113,11 +120,11 @@ class Data:
                 "objective: want 'image' for points that are not all on z = 0, got 'plane', which puts corners back "
                 "there"
             )
-        if bow and not level:
+        if shape == "bow" and not level:
             raise ValueError(
                 "shape: want 'flat' for points that are not all on z = 0, got 'bow', which flat boards have"
             )
-        if shape == "free" and not level:
+        if shape == "free" and not level and self.spread is None:
             raise ValueError(
                 "shape: want 'flat' for points that are not all on z = 0, got 'free'; give Landmarks a sigma instead"
             )
@@ -125,12 +132,19 @@ class Data:
             return
         if objective == "plane":
             raise ValueError("objective: want 'image' for landmarks with a sigma, got 'plane'; or leave out the sigma")
-        if int(self.used.any(-1).sum(-1).amax()) > 1:
+        if shape == "bow":
+            raise ValueError("shape: want 'flat' for landmarks with a sigma, got 'bow'; or leave out the sigma")
+        points = [name for name in named if of_points(name)]
+        if points:
             raise ValueError(
-                "target: want landmarks without sigma, or one view: several views see a landmark off in the same way, "
-                "which calibrate and refine do not carry; dp.locate does, for each view; on z = 0, shape='free' with "
-                "priors={'points': sigma} finds where they are, of landmarks without sigma"
+                f"fixed, priors: want no {points[0]!r} beside landmarks with a sigma, which says how they are known, "
+                "coordinate by coordinate; 0 holds one"
             )
+
+    def surveyed(self, shape: str) -> bool:
+        """Whether landmarks' own errors are unknowns that views share; of one view they weigh as noise does."""
+        several = shape == "free" or int(self.used.any(-1).sum(-1).amax()) > 1
+        return self.spread is not None and several
 
     def task(self, model: LensModel, **options: Any) -> Task:
         """What is to be minimised on these corners."""

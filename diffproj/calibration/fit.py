@@ -90,8 +90,8 @@ class Fit:
             off = self.solution.shared.detach() - self.task.prior.mean
             cost = cost - (off.unsqueeze(-2) @ self.task.prior.precision @ off.unsqueeze(-1)).flatten() / 2
         if self.task.restraint is not None:
-            moves = self.displacements().flatten(1)
-            cost = cost - (self.task.restraint.printed * moves.square()).sum(-1) / 2
+            moves = self.displacements().unsqueeze(-1)
+            cost = cost - (moves.mT @ self.task.restraint.printed @ moves).sum((1, 2, 3)) / 2
         spare = self.degrees_of_freedom()
         return torch.where(spare > 0, 2 * cost / spare, torch.nan)
 
@@ -164,7 +164,7 @@ class Fit:
             return {}
         few = self.task.parameters.few
         unknown = torch.nn.functional.pad(self.task.restraint.unknown, (few, 0))
-        parts = {"frame": self.task.restraint.frame, "printed": torch.diag_embed(self.task.restraint.printed)}
+        parts = {"frame": self.task.restraint.frame, "printed": self.task.restraint.measured}
         wide = {name: torch.nn.functional.pad(part, (few, 0, few, 0)) for name, part in parts.items()}
         return {**wide, "unseen": unknown}
 

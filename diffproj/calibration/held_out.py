@@ -95,12 +95,12 @@ def errors_of(calibration: Calibration, pixels: Tensor, evaluated: Tensor, measu
     cameras, pixels = calibration.cameras, pixels.to(calibration.nominal)
     points = calibration.board_points.unsqueeze(-3)
     px, seen = projected_minus_seen(cameras, points, pixels, evaluated)
-    if calibration.shape != "flat":  # each corner on a plane through its own place
+    level = bool((calibration.nominal[:, 2] == 0).all())
+    if calibration.shape != "flat" and level:  # each corner on a plane through its own place
         put_back, valid = back_project(pixels, cameras, Plane.per_point([0.0, 0.0, 1.0], points[..., 2]))
         landed = valid & evaluated
         world = torch.where(landed.unsqueeze(-1), put_back - points, 0.0)
     else:
-        level = bool((calibration.nominal[:, 2] == 0).all())
         in_space = put_back_minus_known if level else nearest_minus_known
         world, landed = in_space(cameras, points, pixels, evaluated)
     squared = px.square().sum(-1)

@@ -15,6 +15,7 @@ from diffproj.calibration.bow import bowed
 from diffproj.calibration.data import Data
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.parametrisation import POSE, moved
+from diffproj.calibration.shape import block_diagonal
 from diffproj.calibration.solver import Prior
 from diffproj.calibration.task import Task
 from diffproj.targets.residuals import projected_minus_seen, put_back_minus_known
@@ -44,7 +45,7 @@ def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
         share = torch.ones_like(H[..., :1, :1]) if task.shares is None else task.shares[..., None, None]
         gradient = torch.cat([gradient[..., :few], pulls.flatten(2), gradient[..., few:]], dim=-1)
         U, g = (share * H[..., :s, :s]).sum(1), (share.squeeze(-1) * gradient[..., :s]).sum(1)
-        U[:, few:, few:] = _block_diagonal((share.unsqueeze(-1) * own).sum(1))
+        U[:, few:, few:] = block_diagonal((share.unsqueeze(-1) * own).sum(1))
         if prior is not None:
             U = U + prior.precision.detach()
             g = g + (prior.precision @ (solution.shared - prior.mean).unsqueeze(-1)).squeeze(-1)
@@ -92,24 +93,14 @@ def _second(gradient: Tensor, pulls: Tensor, theta: Tensor, moves: Tensor) -> tu
     upper = torch.cat([H[..., :few, :few], cross[..., :few, :], H[..., :few, few:]], dim=-1)
     middle = torch.cat([cross[..., :few, :].mT, nothing, cross[..., few:, :].mT], dim=-1)
     lower = torch.cat([H[..., few:, :few], cross[..., few:, :], H[..., few:, few:]], dim=-1)
-    own = rows(pulls)[1].detach().movedim(2, 3) if moves.numel() else moves.detach().unsqueeze(-1)
+    own = rows(pulls)[1].detach().movedim(2, 3) if moves.numel() else moves.new_zeros(*moves.shape, 3)
     return torch.cat([upper, middle, lower], dim=-2), own
-
-
-def _block_diagonal(blocks: Tensor) -> Tensor:
-    """A matrix `(P, 3 N, 3 N)` of the blocks `(P, N, 3, 3)`; of none, an empty one."""
-    P, N = blocks.shape[:2]
-    whole = blocks.new_zeros(P, N, 3, N, 3)
-    number = torch.arange(N, device=blocks.device)
-    whole[:, number, :, number] = blocks.movedim(0, 1) if N else whole[:, number, :, number]
-    return whole.flatten(3).flatten(1, 2)
 
 
 def _restraining(task: Task, points: Tensor, found: Fit) -> Tensor:
     """The gradient `(P, 3 N)` of what restrains free points, whose frame follows the target's points `(N, 3)`."""
     held = task.restraint_at(points)
-    moves = found.displacements().flatten(1)
-    return (held.frame @ moves.unsqueeze(-1)).squeeze(-1) + held.printed * moves
+    return (held.precision @ found.displacements().flatten(1).unsqueeze(-1)).squeeze(-1)
 
 
 def _gradient_only(step: Tensor) -> Tensor:

@@ -145,6 +145,8 @@ def located(
     # Each view is a problem of its own, with a step and an end of its own, from each of its starts.
     V = len(views)
     task = data.task(parameters.lens, **model, loss=chosen.loss, basis=shared.new_zeros(*shared.shape, 0))
+    if parameters.points and isinstance(shaped, Calibration) and shaped.has_covariance:
+        task = replace(task, spread=None)  # landmarks are where the calibration has them, as surely as it knows
     single = replace(
         task,
         pixels=data.pixels.flatten(0, 1).unsqueeze(1),
@@ -230,7 +232,9 @@ def _with_shape(
     )
     if known.shape == "flat" or not same:
         return shared, parameters
-    parts = known.bow if known.displacements is None else known.displacements.flatten(-2)
+    parts = known.bow
+    if known.displacements is not None:
+        parts = data.frame.turned(known.displacements.to(data.points)).flatten(-2)
     parts = parts.detach().to(shared).expand(*data.batch, -1).reshape(len(shared), -1)  # type: ignore[union-attr]
     points = len(data.points) if known.shape == "free" else 0
     return torch.cat([shared, parts], dim=-1), replace(parameters, bow=known.shape == "bow", points=points)

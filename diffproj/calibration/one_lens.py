@@ -36,7 +36,7 @@ def fitted(views: Views, target: Target, distortion: LensModel, chosen: Options)
     """The minimum alone, with what it is of; nothing is said of it yet."""
     model_named(distortion)
     data = Data(views, target, chosen.weights, chosen.pixel_sigma)
-    data.check_options(chosen.objective, chosen.bow, chosen.shape)
+    data.check_options(chosen.objective, chosen.shape, (*chosen.fixed, *(chosen.priors or ())))
     if views.size is None:
         raise ValueError("views: want the photographs' size, got None; give Views(..., size=(width, height))")
     parameters = Parametrisation(distortion, chosen.bow, chosen.skew)
@@ -49,9 +49,9 @@ def fitted(views: Views, target: Target, distortion: LensModel, chosen: Options)
     every = torch.arange(len(data.pixels), device=data.pixels.device)
     for other in starts[1:]:
         found = lower_fit(found, _from_start(data, chosen, parameters, other, straight), every, chosen.outlier_limit)
-    if chosen.shape == "free":
-        flat = found
-        found, _ = with_free_points(flat, data, chosen, None)
+    flat = found
+    found, _ = with_free_points(flat, data, chosen, None)
+    if found is not flat:
         limits: dict[str, Any] = {name: getattr(chosen, name) for name in ("max_iterations", "tolerance")}
         found = unfolded(found, flat, views.size, reject=chosen.outlier_limit, **limits)
     return data, found

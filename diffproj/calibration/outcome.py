@@ -42,7 +42,7 @@ def minimised(
     fixed = tuple(name for name in options.fixed if not of_points(name))
     fixed = fixed if options.skew or not parameters.skew else (*fixed, SKEW)
     steps = {name: getattr(options, name) for name in ("max_iterations", "tolerance", "progress")}
-    prior = make_prior(of_camera(options.priors), reference, parameters, data.batch)
+    prior = make_prior(of_camera(options.priors), reference, parameters, data.batch, options.tied_focal)
     shared = held_at(reference, shared, parameters, fixed)
     task = data.task(
         parameters.lens,
@@ -113,7 +113,9 @@ def outcome(
         shaped(noise.variance.sqrt()),
         shares=None if task.shares is None else shaped(task.shares),
         skew=task.skew,
-        displacements=shaped(solution.shared[:, few:].unflatten(-1, (-1, 3))) if task.free else None,
+        displacements=shaped(data.frame.turned_back(solution.shared[:, few:].unflatten(-1, (-1, 3))))
+        if task.free
+        else None,
         degrees_of_freedom=shaped(noise.freedom),
         lens_region=None if known is None else known.region,
         rig=None if known is None else known.rig,
@@ -133,6 +135,7 @@ def _covariance(found: Fit, data: Data, noise: Noise | None, known: Calibration 
     before = None if known is None or not known.has_covariance else known.covariance_of_kept_poses
     own = covariance_of(found, noise, None if before is None else before.dispersion.expand(batch).reshape(-1))
     own = doubt.widened(own)
+    own = own if data.frame.axes is None else own.with_points_turned(data.frame.axes.mT, found.task.parameters.few)
     R, _ = data.frame.world_pose(*(z.detach() for z in found.solution.local))
     own = replace(reshaped(own, batch), middle=data.middle, _arm=(R @ data.middle).reshape(*batch, -1, 3))
     return own if before is None else own.following(before)

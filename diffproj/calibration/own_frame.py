@@ -33,6 +33,14 @@ class OwnFrame(NamedTuple):
         centred = points - self.middle
         return centred if self.axes is None else centred @ self.axes.mT
 
+    def turned(self, moves: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch n 3"]:
+        """Displacements of points along the own axes, of those along the world's."""
+        return moves if self.axes is None else moves @ self.axes.mT
+
+    def turned_back(self, moves: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch n 3"]:
+        """Displacements along the world's axes, of those along the own."""
+        return moves if self.axes is None else moves @ self.axes
+
     def pose(self, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         """Poses `(*, 3, 3)` and `(*, 3)` of the own frame, of those of the world."""
         t = t + R @ self.middle

@@ -70,7 +70,7 @@ def refine(
 
     def fit(views: Views) -> Calibration:
         data = Data(views, target, chosen.weights, chosen.pixel_sigma)
-        data.check_options(chosen.objective, chosen.bow, chosen.shape)
+        data.check_options(chosen.objective, chosen.shape, (*chosen.fixed, *(chosen.priors or ())))
         shared, local, parameters = start.from_camera(beginning, data, chosen.bow, chosen.skew)
         found, prior = minimised(data, chosen, parameters, shared, local, shared)
         found, prior = with_free_points(found, data, chosen, prior)

@@ -1,7 +1,7 @@
 """The calibration's least-squares problem: residuals on the image, with all derivatives in closed form.
 
 For each of P cameras with V views of N board points, a panel `(P, V, s + 7, 2, N)` whose rows are, each with its two
-components over the points,
+components over the points (and in memory one after the other, which is twice as fast for many views),
 
     f_x f_y c_x c_y | lens coefficients | skew | bow_x bow_y | omega (3) | tau (3) | residual
 
@@ -15,14 +15,15 @@ Free points have no rows, for the residuals of one point depend on its own displ
 The order of the parameters is that of `parametrisation.py`; `bow.py` says what xi and eta are.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from diffproj.calibration import shape
 from diffproj.calibration.bow import bow_shape
-from diffproj.calibration.lens_derivatives import DERIVATIVES
+from diffproj.calibration.lens_derivatives import DERIVATIVES, Place
 from diffproj.calibration.parametrisation import INTRINSICS, POSE, Parametrisation, moved
 from diffproj.calibration.solver import LocalState
 from diffproj.lens.models import MODELS, LensModel
@@ -52,21 +53,42 @@ class Reprojection:
     whitening: Tensor | None = None
     free: bool = False
     parameters: Parametrisation = field(init=False, repr=False)
-    _panel: Tensor = field(init=False, repr=False)
     _plane_points: Tensor = field(init=False, repr=False)
     _bow_shape: Tensor = field(init=False, repr=False)
     _seen: Tensor = field(init=False, repr=False)
     _unused: Tensor | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        P, V, N, _ = self.pixels.shape
-        self.parameters = Parametrisation(self.lens, self.bow, self.skew, N if self.free else 0)
-        self._panel = self.pixels.new_zeros(P, V, self.parameters.few + POSE + 1, 2, N)
-        self._panel[:, :, 2, 0], self._panel[:, :, 3, 1] = 1.0, 1.0  # by c_x, c_y
+        self.parameters = Parametrisation(self.lens, self.bow, self.skew, self.pixels.shape[2] if self.free else 0)
         self._plane_points = self.points.mT.contiguous()
         self._bow_shape = bow_shape(self.points)
         self._seen = self.pixels.mT.contiguous()
         self._unused = None if bool(self.used.all()) else ~self.used
+
+    @cached_property
+    def _panel(self) -> Tensor:
+        P, V, N, _ = self.pixels.shape
+        rows = self.pixels.new_empty(self.parameters.few + POSE + 1, P, V, 2, N)
+        rows[: len(INTRINSICS)] = 0.0
+        rows[2, :, :, 0], rows[3, :, :, 1] = 1.0, 1.0  # by c_x, c_y
+        if self.skew:
+            rows[self.parameters.lens_end] = 0.0
+        return rows.permute(1, 2, 0, 3, 4)
+
+    @cached_property
+    def _place(self) -> Place:
+        """The panel's rows of the lens and of the translation."""
+        return Place(self._panel[:, :, len(INTRINSICS) : self.parameters.lens_end], self._panel[:, :, -4:-1])
+
+    @cached_property
+    def _by_focal(self) -> Tensor:
+        """Of the panel, u by f_x and v by f_y `(P, V, 2, N)`."""
+        return self._panel[:, :, :2].diagonal(dim1=2, dim2=3).movedim(-1, 2)
+
+    def part(self, which: Tensor) -> "Reprojection":
+        """The problems of some of the cameras `(n,)`."""
+        whitening = None if self.whitening is None else self.whitening[which]
+        return replace(self, pixels=self.pixels[which], used=self.used[which], whitening=whitening)
 
     def linearise(self, shared: Tensor, local: LocalState) -> Tensor:
         """The panel; what it holds is overwritten by the next call."""
@@ -75,9 +97,8 @@ class Reprojection:
     def linearise_at(self, q: Tensor, shared: Tensor, local: LocalState) -> Tensor:
         """The panel at turned points `q = R X (P, V, 3, N)`, which may differ from view to view."""
         R, t = local
-        model, first, last = MODELS[self.lens], len(INTRINSICS), self.parameters.lens_end
-        panel, by_tau = self._panel, self._panel[:, :, -4:-1]
-        by_coefficient = panel[:, :, first:last]
+        model, last = MODELS[self.lens], self.parameters.lens_end
+        panel, by_axis = self._panel, self._place.by_axis
         X_cam = q + t.unsqueeze(-1)
         if model.perspective:
             z = X_cam[:, :, 2]
@@ -86,28 +107,29 @@ class Reprojection:
             z.clamp_(min=0)  # behind the camera there is no cost: what follows is not finite
         elif self._unused is not None:
             X_cam[:, :, 2].masked_fill_(self._unused, 1.0)
-        distorted = DERIVATIVES[model.kind](shared[:, first:last], X_cam, by_coefficient, by_tau)
         f, c = shared[:, None, :2, None], shared[:, None, 2:4, None]
-        panel[:, :, 0, 0], panel[:, :, 1, 1] = distorted[:, :, 0], distorted[:, :, 1]
-        torch.sub(torch.addcmul(c, f, distorted), self._seen, out=panel[:, :, -1])
-        skew = shared[:, last, None, None] if self.skew else None
-        for part in (by_tau, by_coefficient) if model.count else (by_tau,):
-            sheared = None if skew is None else skew.unsqueeze(2) * part[:, :, :, 1]
-            part *= f.unsqueeze(2)
-            if sheared is not None:
-                part[:, :, :, 0] += sheared
-        if skew is not None:  # u = f_x x + skew y + c_x, with (x, y) distorted
+        distorted = DERIVATIVES[model.kind](shared[:, len(INTRINSICS) : last], f, X_cam, self._place)
+        self._by_focal.copy_(distorted)
+        residual = panel[:, :, -1]
+        torch.sub(c, self._seen, out=residual)
+        residual.addcmul_(f, distorted)
+        if self.skew:  # u = f_x x + skew y + c_x, with (x, y) distorted
+            skew = shared[:, last, None, None]
+            shear = (skew / shared[:, 1, None, None]).unsqueeze(2)
+            for part in (self._place.by_point, self._place.by_coefficient):
+                part[:, :, :, 0].addcmul_(shear, part[:, :, :, 1])
             panel[:, :, last, 0] = distorted[:, :, 1]
-            panel[:, :, -1, 0].addcmul_(skew, distorted[:, :, 1])
+            residual[:, :, 0].addcmul_(skew, distorted[:, :, 1])
         if self.bow:
-            normal = (R[..., 2, None, None] * by_tau).sum(2)
+            normal = (R[..., 2, None, None] * self._place.by_point).sum(2)
             for row in range(2):
                 torch.mul(normal, self._bow_shape[row], out=panel[:, :, last + self.skew + row])
+        across = q.unsqueeze(3).unbind(2)
         for axis in range(3):
             a, b = (axis + 1) % 3, (axis + 2) % 3
             row = panel[:, :, axis - 7]
-            torch.mul(q[:, :, a, None], by_tau[:, :, b], out=row)
-            row.addcmul_(q[:, :, b, None], by_tau[:, :, a], value=-1)
+            torch.mul(across[a], by_axis[b], out=row)
+            row.addcmul_(across[b], by_axis[a], value=-1)
         if self._unused is not None:
             panel.masked_fill_(self._unused[:, :, None, None], 0.0)
         if self.whitening is None:

@@ -15,7 +15,7 @@ from diffproj.calibration import ambiguity as ambiguities
 from diffproj.calibration import mismatch as mismatches
 from diffproj.calibration.account import Account
 from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
-from diffproj.calibration.bow import bowed
+from diffproj.calibration.bow import bow_deviation, bowed
 from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.mismatch import Mismatch
@@ -130,6 +130,9 @@ class Calibration(Account, Copied, Recorded):
         Raises:
             ValueError: the calibration came from a file without a covariance.
         """
+        if self.bow is not None:
+            first = self.parameters.few - 2
+            return bow_deviation(self.nominal, self.covariance.shared[..., first : first + 2, first : first + 2])
         if self.displacements is None:
             return torch.zeros_like(self.board_points)
         spread = self.covariance.points.diagonal(dim1=-2, dim2=-1)

@@ -4,28 +4,21 @@ Each camera is calibrated on its own, the best-connected pairs are chained, and 
 one pose a camera relative to the first, one pose of the target a moment. It computes in float64.
 """
 
-from collections.abc import Mapping
-from typing import Any, Unpack
+from collections.abc import Mapping, Sequence
+from typing import Any, Unpack, overload
 
-from torch import Tensor
-
-from diffproj.calibration.parametrisation import Parametrisation
+from diffproj.calibration.one_rig import rig_calibrated
 from diffproj.calibration.result import CalibrationError
-from diffproj.calibration.rig_alone import alone, checked_cameras, lenses
-from diffproj.calibration.rig_fit import rig_fit
-from diffproj.calibration.rig_options import RigOptions, held, held_places, held_points, rig_options
-from diffproj.calibration.rig_outcome import rig_outcome
-from diffproj.calibration.rig_problem import RigParameters
+from diffproj.calibration.rig_fleet import each_rig
+from diffproj.calibration.rig_options import RigOptions, rig_options
 from diffproj.calibration.rig_result import RigCalibration
-from diffproj.calibration.rig_shape import with_shape
-from diffproj.calibration.rig_start import rig_start
-from diffproj.calibration.rig_views import Moments, rig_views
-from diffproj.calibration.solver import Status
+from diffproj.calibration.rig_views import Moments
 from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
 
+@overload
 def calibrate_rig(
     views_by_camera: Mapping[str, Views],
     target: Target,
@@ -33,7 +26,28 @@ def calibrate_rig(
     moments: Moments | None = None,
     cameras: Any = None,
     **options: Unpack[RigOptions],
-) -> RigCalibration:
+) -> RigCalibration: ...
+
+
+@overload
+def calibrate_rig(
+    views_by_camera: Sequence[Mapping[str, Views]],
+    target: Target,
+    distortion: LensModel | Mapping[str, LensModel] = "brown5",
+    moments: Moments | Sequence[Moments | None] | None = None,
+    cameras: Any = None,
+    **options: Unpack[RigOptions],
+) -> list[RigCalibration | CalibrationError]: ...
+
+
+def calibrate_rig(
+    views_by_camera: Mapping[str, Views] | Sequence[Mapping[str, Views]],
+    target: Target,
+    distortion: LensModel | Mapping[str, LensModel] = "brown5",
+    moments: Moments | Sequence[Moments | None] | None = None,
+    cameras: Any = None,
+    **options: Unpack[RigOptions],
+) -> RigCalibration | list[RigCalibration | CalibrationError]:
     """Find intrinsics, lenses and places of several cameras that minimise the error of the corners, all together.
 
     The first camera is the rig's frame: its axes and its centre. A view of a moment that no other camera shares tells
@@ -42,18 +56,21 @@ def calibrate_rig(
 
     Args:
         views_by_camera: corners `(V, N, 2)` by the camera's name. Cameras may miss any moments, and views any corners;
-            a view with fewer than 4 takes no part. Sizes may differ.
+            a view with fewer than 4 takes no part. Sizes may differ. Or a list with those of one rig each: all their
+            cameras on their own are calibrated side by side.
         target: a board, `Landmarks` without sigma, or anything with `.points (N, 3)`; its unit is the world's.
         distortion: which lens to fit, as for `calibrate`; or one by camera.
         moments: by camera, the name or number of each view's moment. Left out, the views' names are the moments', with
             the camera's own name taken out where they would share none: `left03.jpg` and `right03.jpg` are `03.jpg`.
         cameras: known beforehand, by name: cameras, calibrations, or a rig that was calibrated before. Their intrinsics
-            are what is started from, or held; their poses count where the rig is held, `fixed=("rig",)`.
-        options: `fixed`, `shape`, `weights`, `loss`, `reject_outliers`, `max_iterations`, `tolerance`, `progress` and
-            `throw`: see `RigOptions`.
+            are what is started from, or held; their poses count where the rig is held, `fixed=("rig",)`. For a list of
+            rigs, moments, cameras and weights may be lists of as many.
+        options: `fixed`, `shape`, `priors`, `weights`, `loss`, `reject_outliers`, `max_iterations`, `tolerance`,
+            `progress` and `throw`: see `RigOptions`.
 
     Returns:
-        The rig, in float64.
+        The rig, in float64. For a list of rigs a list in its order, each the same as alone; where one failed, the
+        `CalibrationError` that says why stands in its place, and the others go on. `progress` then counts rigs.
 
     Raises:
         TypeError: no mapping from names to views, or an option is unknown or of another type.
@@ -68,50 +85,7 @@ def calibrate_rig(
         >>> rig
         RigCalibration(2 cameras, 13 moments, baseline 83.2, RMS 0.1732 px, converged)
     """
-    chosen = rig_options("calibrate_rig", options)
-    return rig_calibrated(views_by_camera, target, distortion, moments, cameras, chosen, "calibrate_rig")
-
-
-def rig_calibrated(
-    views_by_camera: Mapping[str, Views],
-    target: Target,
-    distortion: LensModel | Mapping[str, LensModel],
-    moments: Moments | None,
-    cameras: Any,
-    chosen: Any,
-    who: str,
-    moved: Tensor | None = None,
-) -> RigCalibration:
-    """What `calibrate_rig` promises, for checked options; errors name `who` was asked.
-
-    With `moved (N, 3)` the target's points are known to lie so far from where it has them.
-    """
-    views = rig_views(views_by_camera, target, moments, chosen.weights, who)
-    known = checked_cameras(cameras, views.names)
-    lens = lenses(distortion, views.names)
-    # What is held has to be known by camera before each is calibrated on its own; a known camera brings its lens.
-    kinds = {name: Parametrisation.of(known[name]) if name in known else Parametrisation(lens[name]) for name in lens}
-    parameters = RigParameters(views.names, tuple(kinds.values()))
-    freed = chosen.shape == "free" or moved is not None
-    if freed and bool((views.data[views.names[0]].given_points.detach()[:, 2] != 0).any()):
-        raise ValueError("shape: want 'flat' for points that are not all on z = 0, got 'free'")
-    fixed, points = held_points(chosen.fixed, len(views.points))
-    names, positions = held(parameters, fixed)
-    own = alone(views, target, lens, known, names, chosen, who)
-    seen = {name: one.seen for name, one in own.items()}
-    start = rig_start(views, seen, held_places(parameters, positions, known), who)
-    found = rig_fit(
-        views,
-        parameters,
-        {name: one.shared for name, one in seen.items()},
-        start,
-        {name: one.used for name, one in seen.items()},
-        positions,
-        chosen,
-    )
-    if freed:
-        found = with_shape(found, points, chosen, moved)
-    rig = rig_outcome(found, own)
-    if chosen.throw and rig.status != Status.CONVERGED:
-        raise CalibrationError(f"{who}: {rig.message}", rig)
-    return rig
+    who, chosen = "calibrate_rig", rig_options("calibrate_rig", options)
+    if isinstance(views_by_camera, list | tuple) and views_by_camera:
+        return each_rig(views_by_camera, target, distortion, moments, cameras, chosen, who)
+    return rig_calibrated(views_by_camera, target, distortion, moments, cameras, chosen, who)  # type: ignore[arg-type]

@@ -9,6 +9,7 @@ import cv2
 from torch import Tensor
 
 from diffproj._core.shown import Shown, number
+from diffproj.calibration.parametrisation import BOW
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
@@ -77,21 +78,26 @@ class RigAccount(Shown):
             seen = int(one.used.any(-1).sum())
             lines.append(f"{name}: RMS {float(one.rms):.4f} px over {int(one.used.sum())} corners in {seen} views")
             spread = one.covariance.deviations if self.has_covariance else {}
+            named = zip(one.parameters.of_camera.names, one.shared.tolist(), strict=False)
             parts = [
                 f"{key} {_spread(float(value), spread.get(key), 2 if index < 4 else 5)}"
-                for index, (key, value) in enumerate(zip(one.parameters.few_names, one.shared.tolist(), strict=False))
+                for index, (key, value) in enumerate(named)
             ]
             lines += [f"  {', '.join(parts[:4])} px", *([f"  {', '.join(parts[4:])}"] if parts[4:] else [])]
             if name != self.names[0]:
                 lines += self._place(name)
         first = self.calibrations[self.names[0]]
+        if first.bow is not None:
+            spread = first.covariance.deviations if self.has_covariance else {}
+            texts = [_spread(float(value), spread.get(key), 4) for key, value in zip(BOW, first.bow, strict=True)]
+            lines.append(f"bow along x, y: {', '.join(texts)} world units")
         if first.displacements is not None:
             off = first.displacements.square().mean(0).sqrt().tolist()
             texts = [f"{value:.4f}" for value in off]
             if self.has_covariance:
-                spread = first.points_deviation
-                told = spread.isfinite().all(-1)
-                sure = spread[told].square().mean(0).sqrt().tolist()
+                deviations = first.points_deviation
+                told = deviations.isfinite().all(-1)
+                sure = deviations[told].square().mean(0).sqrt().tolist()
                 texts = [f"{text} ± {value:.4f}" for text, value in zip(texts, sure, strict=True)]
             lines.append(f"points off by {', '.join(texts)} world units in x, y, z (RMS)")
         lines += [f"RMS {self.rms:.4f} px", *(self.message.split("; "))]

@@ -1,7 +1,7 @@
 """Each camera of a rig on its own: intrinsics where none are given, and the target as each of its views sees it."""
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import torch
@@ -10,9 +10,13 @@ from torch import Tensor
 from diffproj._core.arguments import called
 from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.constraints import held_at
+from diffproj.calibration.data import Data
+from diffproj.calibration.fit import Fit
+from diffproj.calibration.fleet import FILLED, MOST
 from diffproj.calibration.locate import located
-from diffproj.calibration.one_lens import calibrated
+from diffproj.calibration.one_lens import calibrated, fitted
 from diffproj.calibration.options import Options, calibration_options
+from diffproj.calibration.outcome import outcome
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.rig_start import Seen
@@ -85,18 +89,10 @@ class Alone(NamedTuple):
     others: Callable[[], OtherPoses]
 
 
-def alone(
-    views: RigViews,
-    target: Target,
-    lens: Mapping[str, LensModel],
-    known: Mapping[str, Camera],
-    fixed: Mapping[str, tuple[str, ...]],
-    options: Options,
-    who: str,
-) -> dict[str, Alone]:
-    """Each camera on its own.
+class Asked(NamedTuple):
+    """What the cameras of a rig are looked at by, each on its own.
 
-    Args:
+    Attributes:
         views: of all cameras.
         target: that they saw.
         lens: to fit, by camera.
@@ -104,57 +100,97 @@ def alone(
         fixed: names of the parameters that are held, by camera.
         options: checked.
         who: was asked, for messages.
+    """
+
+    views: RigViews
+    target: Target
+    lens: Mapping[str, LensModel]
+    known: Mapping[str, Camera]
+    fixed: Mapping[str, tuple[str, ...]]
+    options: Options
+    who: str
+
+
+def alone(asked: Asked) -> dict[str, Alone]:
+    """Each camera of a rig on its own.
 
     Raises:
         CalibrationError: the views of a camera do not determine it.
         ValueError: photographs of unknown size, or nothing is known of what is to be held.
     """
-    found: dict[str, Alone] = {}
-    alike: dict[Any, list[str]] = {}
-    for name in views.names:
-        own = views.data[name].views
-        if name in known:
-            found[name] = _located(views, name, target, known[name], fixed[name], options, who)
-        elif own.size is None:
-            raise ValueError(f"views_by_camera[{name!r}]: want the photographs' size, got None; give Views(..., size=)")
-        else:
-            alike.setdefault((lens[name], own.size, fixed[name]), []).append(name)
-    for (model, _, held), cameras in alike.items():
-        free = {"fixed": held, "reject_outliers": options.reject_outliers, "throw": False}
-        chosen = calibration_options(who, _limits(options) | free)
+    found = alone_together([asked])[0]
+    if isinstance(found, Exception):
+        raise found
+    return found
+
+
+def alone_together(asked: Sequence[Asked]) -> list[dict[str, Alone] | CalibrationError | ValueError]:
+    """The same of many rigs, whose cameras alike are calibrated side by side; in the place of a rig, what it lacks."""
+    found: list[dict[str, Alone] | CalibrationError | ValueError] = [{} for _ in asked]
+    alike: dict[Any, list[tuple[int, str]]] = {}
+    for number, one in enumerate(asked):
         try:
-            found |= _calibrated(views, cameras, target, model, chosen, who)
-        except ValueError as error:
-            if not str(error).startswith("fixed:"):
-                raise
-            raise ValueError(
-                f"fixed: want cameras={{{cameras[0]!r}: ...}} with it, for of its {', '.join(held)} nothing is known"
-            ) from None
-    return {name: found[name] for name in views.names}
+            found[number] = _known_ones(one)
+        except (CalibrationError, ValueError) as error:
+            found[number] = error
+            continue
+        for name in one.views.names:
+            if name not in one.known:
+                own = one.views.data[name].views
+                alike.setdefault((one.lens[name], own.size, one.fixed[name], own.device), []).append((number, name))
+    for members in alike.values():
+        for batch in _batches(asked, members):
+            for (number, name), one in zip(batch, _calibrated(asked, batch), strict=True):
+                so_far = found[number]
+                if isinstance(one, Exception):
+                    found[number] = so_far if isinstance(so_far, Exception) else one
+                elif not isinstance(so_far, Exception):
+                    so_far[name] = one
+    return [
+        own if isinstance(own, Exception) else {name: own[name] for name in one.views.names}
+        for own, one in zip(found, asked, strict=True)
+    ]
+
+
+def _known_ones(asked: Asked) -> dict[str, Alone]:
+    """The cameras of a rig that are known beforehand."""
+    found = {}
+    for name in asked.views.names:
+        if name in asked.known:
+            found[name] = _located(asked, name)
+        elif asked.views.data[name].views.size is None:
+            raise ValueError(f"views_by_camera[{name!r}]: want the photographs' size, got None; give Views(..., size=)")
+    return found
+
+
+def _batches(asked: Sequence[Asked], members: list[tuple[int, str]]) -> list[list[tuple[int, str]]]:
+    """Cameras alike, those of one rig together; of many rigs, as many in a batch as have about as many views."""
+    if len(asked) == 1:
+        return [members]
+    counts = {(number, name): len(asked[number].views.data[name].views) for number, name in members}
+    batches: list[list[tuple[int, str]]] = []
+    for member in sorted(members, key=lambda one: counts[one]):
+        if not batches or len(batches[-1]) == MOST or counts[member] > FILLED * counts[batches[-1][0]]:
+            batches.append([])
+        batches[-1].append(member)
+    return batches
 
 
 def _limits(options: Options) -> dict[str, Any]:
     return {name: getattr(options, name) for name in ("loss", "max_iterations", "tolerance")}
 
 
-def _located(
-    views: RigViews,
-    name: str,
-    target: Target,
-    camera: Camera,
-    fixed: tuple[str, ...],
-    options: Options,
-    who: str,
-) -> Alone:
+def _located(asked: Asked, name: str) -> Alone:
     """The views of a camera that is known."""
-    data = views.data[name]
+    data, fixed = asked.views.data[name], asked.fixed[name]
     weights = None if data.weights is None else data.weights[0]
+    limits = _limits(asked.options)
     try:
-        found = located(data.views, target, camera, weights=weights, throw=False, **_limits(options))
+        found = located(data.views, asked.target, asked.known[name], weights=weights, throw=False, **limits)
     except ValueError as error:
         raise ValueError(str(error).replace("camera:", f"cameras[{name!r}]:", 1)) from None
     if bool(found.status != Status.CONVERGED):
-        raise CalibrationError(f"{who}: {name!r} with the camera that was given: {found.message}", found)
+        raise CalibrationError(f"{asked.who}: {name!r} with the camera that was given: {found.message}", found)
     R, t = found.cameras.R.detach(), found.cameras.t.detach()
     shared = found.shared.detach()
     if fixed:  # what is held stays as it was given
@@ -164,10 +200,13 @@ def _located(
 
 
 def _calibrated(
-    views: RigViews, cameras: list[str], target: Target, lens: LensModel, options: Options, who: str
-) -> dict[str, Alone]:
+    asked: Sequence[Asked], members: Sequence[tuple[int, str]]
+) -> list[Alone | CalibrationError | ValueError]:
     """Cameras alike, calibrated side by side; those with fewer views get some in which nothing is seen."""
-    own = [views.data[name] for name in cameras]
+    first, name = asked[members[0][0]], members[0][1]
+    free = {"fixed": first.fixed[name], "reject_outliers": first.options.reject_outliers, "throw": False}
+    chosen = calibration_options(first.who, _limits(first.options) | free)
+    own = [asked[number].views.data[name] for number, name in members]
     most = max(len(data.views) for data in own)
 
     def filled(part: Tensor) -> Tensor:
@@ -181,37 +220,66 @@ def _calibrated(
     if any(data.weights is not None for data in own):
         ones = [data.weights if data.weights is not None else torch.ones_like(data.pixels[..., 0]) for data in own]
         weights = torch.stack([filled(part[0]) for part in ones])
-    together = Views.unchecked(pixels, visible, tuple(map(str, range(most))), own[0].views.size)
-    found = calibrated(together, target, lens, options.but(weights=weights), who)
-    alone = {}
-    for i, name in enumerate(cameras):
-        if bool(found.status[i] != Status.CONVERGED):
-            _refuse(views, name, target, lens, options, who)
-        count = len(own[i].views)
-        R, t = found.cameras.R[i, :count].detach(), found.cameras.t[i, :count].detach()
-        seen = Seen(
-            found.shared[i].detach(),
-            *own[i].frame.pose(R, t),
-            found.used[i, :count],
-        )
-        alone[name] = Alone(
-            found.parameters,
-            seen,
-            float(found.rms[i]),
-            partial(_remark, found, i),
-            partial(_others, found, (i, slice(count))),
-        )
-    return alone
+    whole = Views.unchecked(pixels, visible, tuple(map(str, range(most))), own[0].views.size)
+    try:
+        together, fit = fitted(whole, first.target, first.lens[name], chosen.but(weights=weights))
+    except ValueError as error:
+        if not str(error).startswith("fixed:"):
+            raise
+        return [_unknown(asked[number], name) for number, name in members]
+    found = outcome(first.who, together, fit, whole.size, throw=False)
+    results: list[Alone | CalibrationError | ValueError] = []
+    for row, (number, name) in enumerate(members):
+        if bool(found.status[row] != Status.CONVERGED):
+            results.append(_refusal(asked[number], name, chosen))
+            continue
+        data, count = own[row], len(own[row].views)
+        R, t = found.cameras.R[row, :count].detach(), found.cameras.t[row, :count].detach()
+        seen = Seen(found.shared[row].detach(), *data.frame.pose(R, t), found.used[row, :count])
+        late: tuple[Callable[[], str], Callable[[], OtherPoses]]
+        if len(asked) == 1:
+            late = partial(_remark, found, row), partial(_others, found, (row, slice(count)))
+        else:  # a rig carries along what is of its own cameras alone
+            part = _Part(first.who, data, fit.alone(row, count))
+            late = part.remark, part.others
+        results.append(Alone(found.parameters, seen, float(found.rms[row]), *late))
+    return results
 
 
-def _refuse(views: RigViews, name: str, target: Target, lens: LensModel, options: Options, who: str) -> None:
-    """Say why a camera is not determined by its own views, with their names."""
-    data = views.data[name]
+class _Part:
+    """One camera of a batch, as it would be alone."""
+
+    def __init__(self, who: str, data: Data, fit: Fit) -> None:
+        self._given = who, data, fit
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """What is said of it."""
+        who, data, fit = self._given
+        return outcome(who, data, fit, data.views.size, throw=False)
+
+    def remark(self) -> str:
+        """What is to be known of it."""
+        return self.calibration.remarks[0]
+
+    def others(self) -> OtherPoses:
+        """The other pose of each of its views."""
+        return self.calibration.other_poses
+
+
+def _unknown(asked: Asked, name: str) -> ValueError:
+    held = ", ".join(asked.fixed[name])
+    return ValueError(f"fixed: want cameras={{{name!r}: ...}} with it, for of its {held} nothing is known")
+
+
+def _refusal(asked: Asked, name: str, options: Options) -> CalibrationError:
+    """Why a camera is not determined by its own views, with their names."""
+    data = asked.views.data[name]
     weights = None if data.weights is None else data.weights[0]
-    found = calibrated(data.views, target, lens, options.but(weights=weights), who)
-    raise CalibrationError(
-        f"{who}: camera {name!r} on its own: {found.message}; or give its intrinsics, cameras={{{name!r}: ...}} with "
-        f"fixed=({name + '.intrinsics'!r},)",
+    found = calibrated(data.views, asked.target, asked.lens[name], options.but(weights=weights), asked.who)
+    return CalibrationError(
+        f"{asked.who}: camera {name!r} on its own: {found.message}; or give its intrinsics, cameras={{{name!r}: ...}} "
+        f"with fixed=({name + '.intrinsics'!r},)",
         found,
     )
 

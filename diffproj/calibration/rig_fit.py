@@ -43,6 +43,7 @@ class RigFit:
         restrained: cameras whose terms below the line are held, for without that their lens folds.
         restraint: what fixes the frame of free points; `None` where none are free.
         positions: of the shared unknowns that are held.
+        prior_variance: the variance of residuals that what the target's print is known by was weighed against.
     """
 
     views: RigViews
@@ -60,6 +61,7 @@ class RigFit:
     restrained: tuple[str, ...] = ()
     restraint: Restraint | None = None
     positions: tuple[int, ...] = ()
+    prior_variance: float = 1.0
 
     @property
     def prior(self) -> Prior | None:
@@ -168,9 +170,9 @@ def prior_of(restraint: Restraint | None, parameters: RigParameters) -> Prior | 
     if restraint is None:
         return None
     few = parameters.few
-    held = torch.nn.functional.pad(restraint.alone + restraint.printed, (few, 0))
+    held = torch.nn.functional.pad(torch.diag_embed(restraint.alone) + restraint.measured, (few, 0, few, 0))
     root = torch.nn.functional.pad(restraint.root, (0, 0, few, 0))
-    return Prior(torch.zeros_like(held), torch.diag_embed(held), root=root)
+    return Prior(torch.zeros_like(held[..., 0]), held, root=root)
 
 
 class Rounds:

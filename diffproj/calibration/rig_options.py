@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import Array
-from diffproj.calibration.constraints import of_points
+from diffproj.calibration.constraints import Priors, of_points
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.options import Options, Progress, calibration_options
 from diffproj.calibration.parametrisation import SKEW, Parametrisation
@@ -24,10 +24,15 @@ class RigOptions(TypedDict, total=False):
             of these of one camera, as `"left.intrinsics"`, `"left.k3"`, `"right.pose"`. Values are those of `cameras`;
             where there is none, as in `calibrate`, the middle of the image and 0 for the lens. With free points,
             `"points_z"` keeps them in the plane.
-        shape: of the target. `"flat"`, the default, has its points where the target says. `"free"` fits the place of
-            every point, in the plane and out of it, to all cameras together: `RigCalibration.points` then is the target
-            as it was printed. Its origin, axes and size as a whole stay the target's, in the sense of least squares.
-            That takes six views that differ, over all cameras.
+        shape: of the target. `"flat"`, the default, has its points where the target says. `"bow"` fits the board's bow
+            too, a paraboloid of two parameters that all cameras share. `"free"` fits the place of every point, in the
+            plane and out of it, to all cameras together: `RigCalibration.points` then is the target as it was printed.
+            Its origin, axes and size as a whole stay the target's, in the sense of least squares. That takes six views
+            that differ, over all cameras, or a word on how well the target was printed.
+        priors: how well the target of `shape="free"` was printed: `{"points": 0.1}` has a standard deviation of 0.1
+            world units for each coordinate about its nominal place; or one for each axis, `(3,)`, or coordinate,
+            `(N, 3)`; or `"points_x"`, `"points_y"` and `"points_z"`. It weighs against corners whose standard deviation
+            is `1 / sqrt(weight)` px; without weights, against the noise that the residuals tell.
         weights: of the corners, by camera, each broadcasting to `(V, N)`: one over the variance of their coordinates,
             in px^-2; or one number. A corner of weight 0 takes no part. 1 everywhere if left out.
         loss: a robust loss such as `dp.Huber(0.5)`, its scale in pixels; least squares if left out.
@@ -41,7 +46,8 @@ class RigOptions(TypedDict, total=False):
     """
 
     fixed: Sequence[str]
-    shape: Literal["flat", "free"]
+    shape: Literal["flat", "bow", "free"]
+    priors: Priors | None
     weights: Mapping[str, Tensor | Array | float] | float | None
     loss: Loss | None
     reject_outliers: bool | float
@@ -61,9 +67,14 @@ def rig_options(who: str, given: Mapping[str, Any]) -> Options:
     unknown = [name for name in given if name not in RigOptions.__annotations__]
     if unknown:
         raise TypeError(f"{who}: want options of {', '.join(RigOptions.__annotations__)}, got {unknown[0]!r}")
-    if given.get("shape") == "bow":
-        raise ValueError("shape: want 'flat' or 'free' for a rig, got 'bow'; free points find a bow, too")
-    return calibration_options(who, given)
+    options = calibration_options(who, given)
+    other = next((name for name in options.priors or () if not of_points(name)), None)
+    if other is not None:
+        raise ValueError(
+            f"priors: want 'points', 'points_x', 'points_y' or 'points_z' for a rig, got {other!r}; what is known of a "
+            "camera is given by cameras= and held by fixed="
+        )
+    return options
 
 
 def held_points(fixed: Sequence[str], points: int) -> tuple[tuple[str, ...], list[int]]:

@@ -58,6 +58,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
             torch.tensor(found.iterations, device=own.device),
             causes=(cause,),
             pixel_sigma=noise.pixel_variance[c].sqrt(),
+            bow=bow_of(found),
             skew=kind.skew,
             degrees_of_freedom=noise.freedom[c],
             displacements=displacements(found),
@@ -95,6 +96,11 @@ def displacements(found: RigFit) -> Tensor | None:
     if not found.parameters.points:
         return None
     return found.shared[0, found.parameters.few :].unflatten(-1, (-1, 3)).clone()
+
+
+def bow_of(found: RigFit) -> Tensor | None:
+    """The board's bow `(2,)` in world units; `None` where it was not fitted."""
+    return found.shared[0, -2:].clone() if found.parameters.bow else None
 
 
 class _Late:
@@ -154,10 +160,12 @@ def _verdict(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone]) -> t
         lost = unknown[few:] & ~found.restraint.unknown[0]
         lost |= deviation[few:].isfinite() & (deviation[few:] > MAX_RELATIVE_STD * size)
         views = sum(int(used.any(-1).sum()) for used in found.used.values())
-        if bool(lost.any()) or views < FEWEST_FOR_A_SHAPE:
+        alone_tell = not bool((found.restraint.printed > 0).any())
+        if bool(lost.any()) or (alone_tell and views < FEWEST_FOR_A_SHAPE):
             return Status.DEGENERATE, (
                 f"{views} views do not determine the shape of the target together with the cameras: take more moments "
-                "that differ, tilted by 20 to 50 degrees about both axes; or take shape='flat'"
+                "that differ, tilted by 20 to 50 degrees about both axes; or say how well the target was printed, such "
+                "as priors={'points': 0.1}; or take shape='flat'"
             )
         unknown = unknown[:few]
     for c in range(len(found.views.names)):
@@ -192,7 +200,8 @@ def _remarks(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone], stat
     for name in names:
         used = found.used[name]
         squares, count = residuals[name].square().sum((-2, -1)), used.sum(-1)
-        if alone[name].remark() and found.restraint is None:  # on its own it had a flat target
+        flat = found.restraint is None and not found.parameters.bow
+        if alone[name].remark() and flat:  # on its own it had a flat target
             said.append(f"{name}, on its own: {alone[name].remark()}")
         rms = float((squares.sum() / count.sum().clamp(min=1)).sqrt())
         if rms > WORSE_TOGETHER * alone[name].rms and rms > 1e-6:

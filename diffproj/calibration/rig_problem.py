@@ -3,7 +3,7 @@
 The cameras share the moments, the views of a camera its intrinsics and its pose in the rig:
 
     shared    f_x f_y c_x c_y | coefficients | skew | omega (3) | tau (3)     camera after camera; the first has no pose
-              x_0 y_0 z_0 x_1 ...                                             behind them, where the points are free
+              bow_x bow_y, or x_0 y_0 z_0 x_1 ...                             behind them, where the shape is fitted
     local     the pose of the target in the rig, one a moment
 
 A view of camera c at moment m sees the target at `R = R_c R_m`, `t = R_c t_m + t_c`. Its residuals and their
@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.losses import Loss
-from diffproj.calibration.parametrisation import POSE, Parametrisation, Pose, moved
+from diffproj.calibration.parametrisation import BOW, POSE, Parametrisation, Pose, moved
 from diffproj.calibration.reprojection import Reprojection
 from diffproj.calibration.rig_views import RigViews
 from diffproj.calibration.shape import by_displacement, names_of
@@ -43,11 +43,13 @@ class RigParameters:
         cameras: their names.
         kinds: the parameters of each.
         points: how many points of the target are free; 0 where their places are known.
+        bow: whether the board's bow is among them.
     """
 
     cameras: tuple[str, ...]
     kinds: tuple[Parametrisation, ...]
     points: int = 0
+    bow: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -56,16 +58,16 @@ class RigParameters:
         for number, (camera, kind) in enumerate(zip(self.cameras, self.kinds, strict=True)):
             own = kind.names if number == 0 else (*kind.names, *POSE_NAMES)
             parts += [f"{camera}.{name}" for name in own]
-        return (*parts, *names_of(self.points))
+        return (*parts, *(BOW if self.bow else ()), *names_of(self.points))
 
     @property
     def size(self) -> int:
         """How many there are."""
-        return self.few + 3 * self.points
+        return self.few + 2 * self.bow + 3 * self.points
 
     @property
     def few(self) -> int:
-        """How many there are without the displacements of points."""
+        """How many there are without the target's shape."""
         return sum(kind.size + POSE for kind in self.kinds) - POSE
 
     def intrinsics(self, camera: int) -> slice:
@@ -85,6 +87,11 @@ class RigParameters:
         own, pose = self.intrinsics(camera), self.pose(camera)
         return [*range(own.start, own.stop), *range(pose.start, pose.stop)]
 
+    def columns_of_views(self, camera: int) -> list[int]:
+        """Those that the views of a camera depend on, but for free points: intrinsics, the bow, and its pose."""
+        own, bow = self.columns(camera), range(self.few, self.few + 2 * self.bow)
+        return [*own[:-POSE], *bow, *own[-POSE:]]
+
 
 class Group:
     """The views of all cameras of one lens model, one after the other.
@@ -93,6 +100,7 @@ class Group:
         camera: the number of each view's camera `(n,)`.
         moment: of its moment `(n,)`.
         number: of the view among those of its camera `(n,)`.
+        size: how many shared unknowns there are in a view, but for its camera's pose and for free points.
         pixels: `(n, N, 2)`; used `(n, N)`; weights `(n, N)` or `None`.
     """
 
@@ -115,16 +123,17 @@ class Group:
             self.pixels.unsqueeze(1),
             self.used.unsqueeze(1),
             kind.lens,
+            bow=parameters.bow,
             skew=kind.skew,
             free=parameters.points > 0,
         )
-        columns = torch.zeros(len(parameters.cameras), kind.size + POSE, dtype=torch.long, device=self.camera.device)
+        self.size = kind.size + 2 * parameters.bow
+        columns = torch.zeros(len(parameters.cameras), self.size + POSE, dtype=torch.long, device=self.camera.device)
         for c in cameras:
-            columns[c] = torch.tensor(parameters.columns(c), device=columns.device)
+            columns[c] = torch.tensor(parameters.columns_of_views(c), device=columns.device)
         self.columns = columns[self.camera]
         self.by_camera, self.members = columns[list(cameras)], list(cameras)
         self.slot = torch.searchsorted(torch.tensor(list(cameras), device=columns.device), self.camera)
-        self.size = kind.size
 
 
 class RigProblem:
@@ -219,18 +228,20 @@ class RigProblem:
             half = residual[:, -1] / 2
             cost = cost + (half.sum() if robust is None else robust)
             own, b = slice(0, k + POSE), k + POSE
-            # The views of a camera add to its own block of U; a view is alone with its camera in its moment's E.
+            # The views of a camera add to its own block of U. A view is alone with its camera in its moment's E, but
+            # for a bow, which all share.
+            adds = self.parameters.bow
             if by_moment:
                 at, where = group.moment, group.columns
-                U[at[:, None, None], where.unsqueeze(-1), where.unsqueeze(-2)] = by_own[:, own, own]
-                g[at.unsqueeze(-1), where] = residual[:, own]
+                U.index_put_((at[:, None, None], where.unsqueeze(-1), where.unsqueeze(-2)), by_own[:, own, own], adds)
+                g.index_put_((at.unsqueeze(-1), where), residual[:, own], adds)
             else:
                 where, count = group.by_camera, len(group.members)
                 sums = new(count, b, b).index_add_(0, group.slot, by_own[:, own, own])
                 pulls = new(count, b).index_add_(0, group.slot, residual[:, own])
                 U.index_put_((where.unsqueeze(-1), where.unsqueeze(-2)), sums, accumulate=True)
                 g.index_put_((where,), pulls, accumulate=True)
-            E[group.moment.unsqueeze(-1), group.columns] = by_own[:, own, b:]
+            E.index_put_((group.moment.unsqueeze(-1), group.columns), by_own[:, own, b:], adds)
             if self.parameters.points:
                 self._add_points(group, panel, shared, local, (U, E, g))
             W.index_add_(0, group.moment, by_own[:, b:, b:])

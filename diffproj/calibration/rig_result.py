@@ -95,9 +95,7 @@ class RigCalibration(RigAccount, Copied, RigRecorded):
         Raises:
             ValueError: the covariance is not known.
         """
-        if self.shape == "flat":
-            return torch.zeros_like(self.points)
-        return self.covariance.points.diagonal().sqrt().unflatten(-1, (-1, 3))
+        return next(iter(self.calibrations.values())).points_deviation
 
     @property
     def shape(self) -> Shape:

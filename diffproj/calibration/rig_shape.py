@@ -1,47 +1,97 @@
-"""From a rig's fit to a flat target to one whose points are free, or stand where they were found before.
+"""From a rig's fit to a flat target to one that is bent, whose points are free, or stand where they were found before.
 
-All cameras see one target, so that its points are unknowns of the whole rig: what one camera alone could take for its
-lens, the others contradict. Their frame and what holds them besides is that of one camera: see `shape.py`.
+All cameras see one target, so that its shape is among the unknowns of the whole rig: what one camera alone could take
+for its lens, the others contradict. The frame of free points and what holds them besides is that of one camera: see
+`shape.py`.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from diffproj.calibration.constraints import printing_precision
+from diffproj.calibration.free_points import MAX_ROUNDS, SAME_NOISE
 from diffproj.calibration.options import Options
 from diffproj.calibration.rig_fit import RigFit, Rounds, in_normal_tensors
 from diffproj.calibration.rig_options import free_directions
+from diffproj.calibration.rig_problem import RigParameters
+from diffproj.calibration.rig_uncertainty import camera_noise, pooled_variance
 from diffproj.calibration.shape import Restraint, restraint_of
 
+STIFF = 100.0
+"""How many times as firmly as without a prior the frame is held beside one, which leaves it no say about the frame."""
 
-def with_shape(flat: RigFit, held_points: list[int], options: Options, known: Tensor | None = None) -> RigFit:
+
+def with_bow(flat: RigFit, options: Options) -> RigFit:
+    """The fit with the board's bow."""
+    parameters = replace(flat.parameters, bow=True)
+    return _fitted(flat, parameters, (), flat.shared.new_zeros(2), options)
+
+
+def with_points(flat: RigFit, held_points: Sequence[int], options: Options) -> RigFit:
     """The fit with free points.
+
+    Where corners have no weights, how well the target was printed weighs against the noise that the residuals tell,
+    which depends on it in turn: a few rounds settle both.
 
     Args:
         flat: to the flat target.
         held_points: coordinates of the displacements that stay 0, numbers from 0.
         options: checked.
-        known: displacements `(N, 3)` that are not fitted, but known.
     """
     views, few = flat.views, flat.parameters.few
-    count = len(views.points)
-    parameters = replace(flat.parameters, points=count)
-    held = range(3 * count) if known is not None else held_points
-    basis = free_directions(parameters, [*flat.positions, *(few + i for i in held)], flat.shared)
-    restraint = None if known is not None else _restraint(flat)
-    moves = flat.shared.new_zeros(3 * count) if known is None else known.to(flat.shared).flatten()
-    shared = torch.cat([flat.shared, moves.unsqueeze(0)], dim=-1)
-    given = {name: views.data[name].used[0] for name in views.names}
+    parameters = replace(flat.parameters, points=len(views.points))
+    printed = printing_precision(options.priors, (), views.points)
+    weighed = any(data.weights is not None for data in views.data.values())
+    settled = printed is None or weighed
+    noise = 1.0 if settled else _noise(flat)
+    found, moves = flat, flat.shared.new_zeros(3 * parameters.points)
+    for _ in range(MAX_ROUNDS):
+        restraint = _restraint(flat, None if printed is None else noise * printed)
+        found = replace(_fitted(found, parameters, held_points, moves, options, restraint), prior_variance=noise)
+        moves = found.shared[0, few:]
+        before, noise = noise, noise if settled else _noise(found)
+        if abs(noise - before) <= SAME_NOISE * before:
+            break
+    return found
+
+
+def with_known_points(flat: RigFit, moves: Tensor, options: Options) -> RigFit:
+    """The fit with the points of the target displaced by `moves (N, 3)`, which are known."""
+    parameters = replace(flat.parameters, points=len(moves))
+    return _fitted(flat, parameters, range(moves.numel()), moves.to(flat.shared).flatten(), options)
+
+
+def _fitted(
+    begin: RigFit,
+    parameters: RigParameters,
+    held: Sequence[int],
+    shape: Tensor,
+    options: Options,
+    restraint: Restraint | None = None,
+) -> RigFit:
+    """From a fit to one with a shape, which starts at `shape` and of which some unknowns are held, numbers from 0."""
+    few = parameters.few
+    basis = free_directions(parameters, [*begin.positions, *(few + i for i in held)], begin.shared)
+    shared = torch.cat([begin.shared[:, :few], shape.unsqueeze(0)], dim=-1)
+    given = {name: begin.views.data[name].used[0] for name in begin.views.names}
     with torch.inference_mode():
-        fit = Rounds(views, parameters, flat.problem.base, basis, options, restraint)
-        fit.solve(flat.used, shared, flat.local)
-        found = fit.at_the_minimum(fit.without_outliers(given, flat.apart), flat.apart)
-    found = replace(found, iterations=flat.iterations + found.iterations)
-    return replace(in_normal_tensors(found), restrained=flat.restrained, positions=flat.positions)
+        fit = Rounds(begin.views, parameters, begin.problem.base, basis, options, restraint)
+        fit.solve(begin.used, shared, begin.local)
+        found = fit.at_the_minimum(fit.without_outliers(given, begin.apart), begin.apart)
+    found = replace(found, iterations=begin.iterations + found.iterations)
+    return replace(in_normal_tensors(found), restrained=begin.restrained, positions=begin.positions)
 
 
-def _restraint(flat: RigFit) -> Restraint:
+def _noise(found: RigFit) -> float:
+    """The variance of a residual; 1 where there are too few to tell."""
+    level = float(pooled_variance(camera_noise(found)))
+    return level if level > 0 else 1.0
+
+
+def _restraint(flat: RigFit, printed: Tensor | None) -> Restraint:
     """What fixes the frame, from all views of all cameras."""
     views = flat.views
     pixels = torch.cat([views.data[name].pixels[0] for name in views.names])
@@ -50,4 +100,5 @@ def _restraint(flat: RigFit) -> Restraint:
     ones = [torch.ones_like(views.data[name].pixels[0, :, :, 0]) for name in views.names]
     counts = torch.cat([one if given is None else given[0] for one, given in zip(ones, weights, strict=True)])
     # A point counts as shown where two views show it, of whichever cameras.
-    return restraint_of(views.points, pixels[None], used[None], counts[None], None)
+    found = restraint_of(views.points, pixels[None], used[None], counts[None], printed)
+    return found if printed is None else found._replace(root=STIFF * found.root)

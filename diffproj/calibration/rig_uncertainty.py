@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffproj.calibration.covariance import Covariance, Scores, covariance, local_inverse, reshaped
+from diffproj.calibration.covariance import Covariance, Scores, covariance, local_inverse, reduced, reshaped
 from diffproj.calibration.dispersion import FEW_VIEWS, FEW_VIEWS_OF_A_SHAPE, believed, contradiction
 from diffproj.calibration.losses import slope_and_bend
 from diffproj.calibration.parametrisation import POSE
@@ -55,7 +55,7 @@ def camera_noise(found: RigFit) -> CameraNoise:
     own = torch.stack(
         [free[parameters.columns(c)[: None if c else parameters.kinds[0].size]].sum() for c in range(len(names))]
     )
-    spare = 2 * count.sum(-1) - of_poses - own - told_points(found) * count.sum(-1) / count.sum().clamp(min=1)
+    spare = 2 * count.sum(-1) - of_poses - own - told_of_shape(found) * count.sum(-1) / count.sum().clamp(min=1)
     lost = torch.full_like(spare, torch.nan)
     rows = []
     for c, (name, residual) in enumerate(found.by_camera.items()):
@@ -82,28 +82,50 @@ def camera_noise(found: RigFit) -> CameraNoise:
     return CameraNoise(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
-def told_points(found: RigFit) -> int:
-    """How many of the free points' coordinates the corners tell, and not the frame."""
+def told_of_shape(found: RigFit) -> float:
+    """How many unknowns of the target's shape the corners tell, and neither the frame nor a prior.
+
+    Of a coordinate that both tell, the part that the corners do: what is left of the trace of the prior's precision
+    over all precision.
+    """
+    if found.parameters.bow:
+        free = torch.ones(2) if found.basis is None else found.basis[0, -2:].abs().sum(-1)
+        return float(free.sum())
     if found.restraint is None:
-        return 0
-    free = ~found.restraint.unknown[0]
-    if found.basis is not None:
-        free = free & (found.basis[0, found.parameters.few :].abs().sum(-1) > 0)
-    root = found.restraint.root[0, free]
-    return int(free.sum()) - int(torch.linalg.matrix_rank(root / root.norm().clamp(min=1e-300)))
+        return 0.0
+    few, basis, restraint = found.parameters.few, found.basis, found.restraint
+    free = ~restraint.unknown[0]
+    if basis is not None:
+        free = free & (basis[0, few:].abs().sum(-1) > 0)
+    if not bool((restraint.printed > 0).any()):
+        root = restraint.root[0, free]
+        return float(free.sum()) - float(torch.linalg.matrix_rank(root / root.norm().clamp(min=1e-300)))
+    S, told = reduced(found.equations, basis, None)[0], torch.nn.functional.pad(restraint.precision, (few, 0, few, 0))
+    told = told if basis is None else basis.mT @ told @ basis
+    scale = S.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt().unsqueeze(-1)
+    L, failed = torch.linalg.cholesky_ex(S * scale * scale.mT)
+    if bool(failed.any()):
+        return float(free.sum())
+    every = 3 * found.parameters.points if basis is None else int((basis[0, few:].abs().sum(0) > 0).sum())
+    return every - float(torch.cholesky_solve(told * scale * scale.mT, L).diagonal(dim1=-2, dim2=-1).sum())
+
+
+def pooled_variance(noise: CameraNoise) -> Tensor:
+    """The variance of a residual component of weight 1, if it is one for all cameras."""
+    freedom = noise.freedom.clamp(min=0)
+    return torch.where(freedom > 0, noise.variance * freedom, 0.0).sum() / freedom.sum().clamp(min=1)
 
 
 def plain_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
     """The covariance for one noise of all cameras and independent corners: what verdicts go by."""
-    freedom = noise.freedom.clamp(min=0)
-    pooled = (torch.where(freedom > 0, noise.variance * freedom, 0.0)).sum() / freedom.sum().clamp(min=1)
+    pooled = pooled_variance(noise)
     frame: dict[str, Any] = {}
     if found.restraint is not None:
         few, restraint = found.parameters.few, found.restraint
         wide = (few, 0, few, 0)
         frame = {
             "frame": torch.nn.functional.pad(restraint.frame, wide),
-            "printed": torch.nn.functional.pad(torch.diag_embed(restraint.printed), wide),
+            "printed": torch.nn.functional.pad(restraint.measured, wide),
         }
     return covariance(
         found.equations, found.parameters.names, pooled.unsqueeze(0), basis=found.basis, unseen=unseen(found), **frame
@@ -125,12 +147,16 @@ def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
         H = H._replace(U=H.U + found.prior.whole)
     _, M = problem.totals(*state, scale=(noise.variance * noise.inflation).nan_to_num(0.0), by_moment=True)
     phi = _dispersion(found, H, M)
-    scores = Scores(M.U, M.E, M.W)
+    scores, precision = Scores(M.U, M.E, M.W), None
+    if found.restraint is not None and bool((found.restraint.printed > 0).any()):
+        of_print = torch.nn.functional.pad(found.prior_variance * found.restraint.printed, (found.parameters.few, 0))
+        precision = torch.diag_embed(of_print)  # of the prior's scores, in the unit of the corners'
     found_one = covariance(
         H,
         found.parameters.names,
         torch.ones_like(phi),
         basis=found.basis,
+        precision=precision,
         scores=scores,
         dispersion=phi,
         unseen=unseen(found),
@@ -145,7 +171,7 @@ def _dispersion(found: RigFit, H: Equations, M: Equations) -> Tensor:
 
     Free points follow what the moments want: what is compared is how these pull at the cameras with the points held.
     """
-    few = found.parameters.few
+    few = found.parameters.few + 2 * found.parameters.bow
     kept = slice(0, few)
     basis = found.basis
     if basis is not None:
@@ -200,7 +226,7 @@ def of_camera(found: RigFit, joint: Covariance, camera: int) -> Covariance:
         follow[:, :, place] -= A
     few = parameters.few
     others = [i for i in range(few) if not own.start <= i < own.stop]
-    order = [*range(own.start, own.stop), *range(few, s), *others]  # its own, those of the points, those of others
+    order = [*range(own.start, own.stop), *range(few, s), *others]  # its own, the shape, those of others
     names = tuple(
         joint.names[i].removeprefix(f"{name}.") if own.start <= i < own.stop else joint.names[i] for i in order
     )

@@ -11,8 +11,8 @@ from torch import Tensor
 from diffproj._core.arguments import whole_number
 from diffproj._core.shown import Shown
 from diffproj.calibration.locate import located
+from diffproj.calibration.one_rig import rig_calibrated
 from diffproj.calibration.result import Calibration
-from diffproj.calibration.rig import rig_calibrated
 from diffproj.calibration.rig_options import RigOptions, rig_options
 from diffproj.calibration.rig_result import RigCalibration
 from diffproj.calibration.rig_views import Moments, rig_views
@@ -158,7 +158,7 @@ def _held_out(
             chosen = rig_options(who, {"fixed": ("rig", "intrinsics"), "throw": False})
             known = {name: fit.cameras[name] for name in seen}
             theirs = {name: labels[name] for name in seen}
-            moved = next(iter(fit.calibrations.values())).displacements
+            moved = None if fit.shape == "flat" else fit.points - next(iter(fit.calibrations.values())).nominal
             found = rig_calibrated(seen, target, "none", theirs, known, chosen, who, moved).calibrations
         for name, one in found.items():
             counts = held[name].visible & hidden & one.used.any(-1, keepdim=True)

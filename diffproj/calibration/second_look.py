@@ -22,11 +22,20 @@ from torch import Tensor
 from diffproj._core.numerics import spread_evenly
 from diffproj.calibration import closed_form
 from diffproj.calibration.fit import Fit, fit
+from diffproj.calibration.focal_ladder import (
+    LADDER,
+    climbed,
+    far_out,
+    moves_focal_length,
+    moves_principal_point,
+)
 from diffproj.calibration.parametrisation import INTRINSICS, Parametrisation, Pose
-from diffproj.calibration.solver import Solution, Status
+from diffproj.calibration.solver import Status
 from diffproj.calibration.start import Straightened
 from diffproj.calibration.task import Task
-from diffproj.calibration.two_poses import near_rivals, predicted_costs, replaced
+from diffproj.calibration.turned_views import choices
+from diffproj.calibration.two_poses import predicted_costs, replaced
+from diffproj.lens.models import MODELS
 
 FOCAL_GRID = tuple(0.3 * 1.5**i for i in range(14))
 """Focal lengths to look at, in units of the image's longer side: from a field of view of 118 degrees to one of 1."""
@@ -44,7 +53,10 @@ MANY_STEPS = 12
 SHORT_FIT = 40
 """Steps after which only the best of the starts goes on."""
 MAX_TURNS = 3
-"""Maximum number of views of a camera that are turned over, one after the other."""
+"""How often views of a camera are turned over, one time after the other."""
+ASIDE = 0.05
+"""Distance of the principal point from the image's middle, in both directions and relative to the image's longer side,
+from which on there may be valleys on four sides of it."""
 ALIKE = 1e-7
 """Part of the cost up to which two starts have led to one place."""
 LOWER = 1e-9
@@ -130,47 +142,92 @@ def second_look(
         best = lower_fit(best, others.part(number[rank, rows]), rows, reject)
     last = fit(task, best.solution.shared, best.solution.local, reject=reject, **steps)
     found = lower_fit(found, last, which, reject)
-    if straight.lens == "none" and (task.basis is None or bool(task.basis[:, 2:4].any())):
-        start = _other_side(found.task.parameters, found.part(which).solution, straight.middle[which])
-        found = lower_fit(found, fit(task, *start, reject=reject, **steps), which, reject)
+    if straight.lens == "none" and moves_principal_point(task):
+        found = _with_other_sides(found, straight.middle[which], which, short, steps, reject)
+    if straight.lens == "none" and MODELS[straight.model].count:
+        found = _along_focal_lengths(found, straight, which, reject, steps)
     return found if reject is not None else _with_views_turned_over(found, which, short, steps)
 
 
+def _along_focal_lengths(
+    found: Fit, straight: Straightened, which: Tensor, reject: float | None, steps: dict[str, Any]
+) -> Fit:
+    """The fit of those of some cameras `(n,)` that are lost with their principal point far out, by focal lengths."""
+    part = found.part(which)
+    part = Fit(replace(part.task, used=part.task.used | part.rejected), part.solution, part.rejected)
+    if not moves_focal_length(part.task) or not moves_principal_point(part.task):
+        return found
+    lost = (part.solution.status != Status.CONVERGED) | ~(correlation(part) <= CORRELATED)
+    rows = (lost & far_out(part, straight.part(which))).nonzero().flatten()
+    if len(rows) == 0:
+        return found
+    which, task = which[rows], part.task.part(rows)
+    lens = straight.part(which).elsewhere(task)
+    starts = [_start_at(task, part.solution.shared[rows], lens, lens.longer * rung) for rung in LADDER]
+    shared = torch.stack([shared for shared, _ in starts])
+    poses = tuple(torch.stack(parts) for parts in zip(*(poses for _, poses in starts), strict=True))
+    return lower_fit(found, climbed(task, shared, poses, reject=reject, **steps), which, reject)
+
+
 def _with_views_turned_over(found: Fit, which: Tensor, short: dict[str, Any], steps: dict[str, Any]) -> Fit:
-    """The fit of some cameras `(n,)` with one view turned over where that lets all parameters end lower.
+    """The fit of some cameras `(n,)` with views turned over where that lets all parameters end lower.
 
     With the shared parameters held a view's other pose may cost a little more, and less when all is solved again.
     """
     for _ in range(MAX_TURNS):
         part = found.part(which)
-        p, v, other = near_rivals(part.task, part.solution)
-        if len(p) == 0:
+        rows, starts = choices(part.task, part.solution)
+        if len(rows) == 0:
             break
-        rows = torch.arange(len(p), device=p.device)
-        starts = tuple(z[p].index_put((rows, v), new) for z, new in zip(part.solution.local, other, strict=True))
-        tried = fit(part.task.part(p), part.solution.shared[p], starts, **short)
-        costs = torch.full(part.task.used.shape[:2], torch.inf, dtype=starts[1].dtype, device=p.device)
-        costs = costs.index_put((p, v), tried.solution.cost.nan_to_num(torch.inf))
-        number = torch.zeros_like(costs, dtype=torch.long).index_put((p, v), rows)
-        lowest, view = costs.min(-1)
+        tried = fit(part.task.part(rows), part.solution.shared[rows], starts, **short)
+        costs = tried.solution.cost.nan_to_num(torch.inf)
+        lowest = torch.full_like(part.solution.cost, torch.inf).scatter_reduce(0, rows, costs, "amin")
+        number = torch.arange(len(rows), device=rows.device)
+        best = torch.zeros_like(which).index_put((rows[costs == lowest[rows]],), number[costs == lowest[rows]])
         lower = (lowest < part.solution.cost * (1 - LOWER)).nonzero().flatten()
         if len(lower) == 0:
             break
-        best = tried.part(number[lower, view[lower]])
-        which = which[lower]
-        last = fit(found.task.part(which), best.solution.shared, best.solution.local, **steps)
+        near, which = tried.part(best[lower]).solution, which[lower]
+        last = fit(found.task.part(which), near.shared, near.local, **steps)
         found = lower_fit(found, last, which, None)
     return found
 
 
-def _other_side(parameters: Parametrisation, solution: Solution, middle: Tensor) -> tuple[Tensor, Pose]:
-    """The same with the principal point on the other side of the image's middle `(P, 2)`, views shifted, and no lens.
+def _with_other_sides(
+    found: Fit, middle: Tensor, which: Tensor, short: dict[str, Any], steps: dict[str, Any], reject: float | None
+) -> Fit:
+    """The fit of some cameras `(n,)`, or what is lower from the principal point on the image's other sides.
 
     Of a long lens the principal point is hardly known, and with it decides which way the coefficients bend the image:
-    there are valleys on both sides.
+    there are valleys on both sides of the middle `(n, 2)`, and where it is far off in both directions, on four.
     """
-    shared, (R, t) = solution.shared.clone(), solution.local
-    moved = 2 * (middle - shared[:, 2:4])
+    part = found.part(which)
+    solution = part.solution
+    both = ~((solution.shared[:, 2:4] - middle).abs().amin(-1) <= ASIDE * 2 * middle.amax(-1))
+    every = torch.arange(len(which), device=which.device)
+    rows = torch.cat([every, every[both], every[both]])
+    sides = middle.new_tensor([(1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])
+    sides = sides.repeat_interleave(torch.tensor([len(every), *[int(both.sum())] * 2], device=rows.device), dim=0)
+    start = _other_side(
+        part.task.parameters, solution.shared[rows], part.part(rows).solution.local, middle[rows], sides
+    )
+    if not bool(both.any()):
+        return lower_fit(found, fit(part.task, *start, reject=reject, **steps), which, reject)
+    tried = fit(part.task.part(rows), *start, reject=reject, **short)
+    best = tried.part(every)
+    for first in (len(every), len(every) + int(both.sum())):
+        some = torch.arange(first, first + int(both.sum()), device=rows.device)
+        best = lower_fit(best, tried.part(some), every[both], reject)
+    last = fit(part.task, best.solution.shared, best.solution.local, reject=reject, **steps)
+    return lower_fit(found, last, which, reject)
+
+
+def _other_side(
+    parameters: Parametrisation, shared: Tensor, poses: Pose, middle: Tensor, sides: Tensor
+) -> tuple[Tensor, Pose]:
+    """The same with the principal point mirrored at the middle where `sides (n, 2)` are 1, views shifted, no lens."""
+    shared, (R, t) = shared.clone(), poses
+    moved = 2 * (middle - shared[:, 2:4]) * sides
     lens = slice(len(INTRINSICS), parameters.lens_end)
     # What is not the pinhole's goes back to nothing, and the views to where they are seen in the same place.
     shared[:, lens], shared[:, 2:4] = 0.0, shared[:, 2:4] + moved
@@ -205,18 +262,21 @@ def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Ten
     sample = order[:, spread_evenly(V, count, order.device)]
     costs = torch.stack([_profile(task, straight, grid[i].expand(P), sample) for i in range(len(grid))])
     best = lowest(costs)
-    starts = []
-    for rank in range(best.shape[0]):
-        f = grid[best[rank]]
-        every = torch.arange(V, device=f.device).expand(P, V)
-        _, (R, t) = _both_poses(task, straight, f, every)
-        shared = straight.shared(f, first.shape[-1])
-        if task.basis is not None:  # what is held, or tied, stays as the first start had it
-            T = task.basis
-            step = (T.mT @ (shared - first).unsqueeze(-1)) / T.square().sum(1).unsqueeze(-1)
-            shared = first + (T @ step).squeeze(-1)
-        starts.append((shared, (R, t)))
-    return starts
+    return [_start_at(task, first, straight, grid[best[rank]]) for rank in range(best.shape[0])]
+
+
+def _start_at(task: Task, first: Tensor, straight: Straightened, f: Tensor | float) -> tuple[Tensor, Pose]:
+    """Shared parameters `(P, s)` and poses at focal lengths `(P,)`; what is held, or tied, stays as first `(P, s)`."""
+    P, V = task.used.shape[:2]
+    f = first.new_tensor(f).expand(P) if isinstance(f, float) else f
+    every = torch.arange(V, device=f.device).expand(P, V)
+    _, poses = _both_poses(task, straight, f, every)
+    shared = straight.shared(f, first.shape[-1])
+    if task.basis is not None:
+        T = task.basis
+        step = (T.mT @ (shared - first).unsqueeze(-1)) / T.square().sum(1).unsqueeze(-1)
+        shared = first + (T @ step).squeeze(-1)
+    return shared, poses
 
 
 def _profile(task: Task, straight: Straightened, f: Tensor, views: Tensor) -> Tensor:

@@ -17,6 +17,10 @@ side of a chessboard's square, their size as a whole counts as exact.
 **Prior.** How well the target was printed, a standard deviation of each coordinate about its nominal place.
 
 A point that fewer than two views show stays at its nominal place, and its variance is infinite.
+
+**Landmarks** that were surveyed with an error of their own are free points, too: all views see such a landmark off in
+the same way. Their covariances are the prior, and the survey says where they are as a whole, as surely as it does: no
+frame is added. One of which nothing is seen has the covariance that it came with.
 """
 
 from typing import NamedTuple
@@ -37,9 +41,9 @@ class Restraint(NamedTuple):
     """What holds the displacements `(P, 3 N)` besides the residuals, as precisions in the unit of the weights.
 
     Attributes:
-        root: of the frame `(P, 3 N, 7)`, whose precision is `root root^T`: no measurement.
+        root: of the frame `(P, 3 N, 7)`, whose precision is `root root^T`: no measurement. `(P, 3 N, 0)` without one.
         alone: of points that too few views show `(P, 3 N)`: none either.
-        printed: of how well the target was printed `(P, 3 N)`.
+        printed: of how well each point was printed, or surveyed `(P, N, 3, 3)`.
         unknown: which displacements nothing tells `(P, 3 N)`.
     """
 
@@ -54,9 +58,23 @@ class Restraint(NamedTuple):
         return self.root @ self.root.mT + torch.diag_embed(self.alone)
 
     @property
+    def measured(self) -> Tensor:
+        """What is one `(P, 3 N, 3 N)`."""
+        return block_diagonal(self.printed)
+
+    @property
     def precision(self) -> Tensor:
         """All of it together `(P, 3 N, 3 N)`."""
-        return self.frame + torch.diag_embed(self.printed)
+        return self.frame + self.measured
+
+
+def block_diagonal(blocks: Float[Tensor, "p n 3 3"]) -> Float[Tensor, "p m m"]:
+    """A matrix `(P, 3 N, 3 N)` of the blocks of N points; of none, an empty one."""
+    P, N = blocks.shape[:2]
+    whole = blocks.new_zeros(P, N, 3, N, 3)
+    number = torch.arange(N, device=blocks.device)
+    whole[:, number, :, number] = blocks.movedim(0, 1) if N else whole[:, number, :, number]
+    return whole.flatten(3).flatten(1, 2)
 
 
 def names_of(points: int) -> tuple[str, ...]:
@@ -82,7 +100,8 @@ def restraint_of(
     pixels: Float[Tensor, "p v n 2"],
     used: Bool[Tensor, "p v n"],
     counts: Float[Tensor, "p v n"],
-    printed: Float[Tensor, "p m"] | None,
+    printed: Float[Tensor, "p n 3 3"] | None,
+    surveyed: bool = False,
 ) -> Restraint:
     """What fixes the frame of free points, and holds those that too few views show.
 
@@ -91,10 +110,15 @@ def restraint_of(
         pixels: the corners `(P, V, N, 2)`.
         used: which count `(P, V, N)`.
         counts: how much they do `(P, V, N)`: weights times the views' shares.
-        printed: precision of each displacement by the prior `(P, 3 N)`, if there is one.
+        printed: precision of each point's displacement by the prior `(P, N, 3, 3)`, if there is one.
+        surveyed: whether that says where the points are as a whole, too, so that no frame is to be fixed.
     """
     seen = used.sum(1)
-    printed = torch.zeros_like(seen.to(points)).repeat_interleave(3, dim=-1) if printed is None else printed
+    if printed is None:
+        printed = points.new_zeros(*seen.shape, 3, 3)
+    if surveyed:
+        nothing = points.new_zeros(len(seen), points.numel())
+        return Restraint(nothing[..., None][..., :0], nothing, printed, nothing > 0)
     held = seen < FEWEST_VIEWS
     # The image's scale, squared: the data's own precision, about, so that no direction is stiffer than another.
     count = torch.where(used, counts, 0.0).unsqueeze(-1)
@@ -108,7 +132,7 @@ def restraint_of(
     mean = total[:, :, 0, 0] / used.sum(-1).clamp(min=1)
     kappa = (scale * mean * shown).sum(-1).clamp(min=1e-300)[:, None, None]
     G = similarities(points, held)
-    alone = held.repeat_interleave(3, dim=-1) & (printed == 0)
+    alone = held.repeat_interleave(3, dim=-1) & (printed.diagonal(dim1=-2, dim2=-1).flatten(1) == 0)
     return Restraint(kappa.sqrt() * G, HELD * kappa.squeeze(-1) * alone, printed, alone)
 
 

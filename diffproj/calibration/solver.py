@@ -41,6 +41,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from diffproj.calibration.damping import FINAL_STEP_REDUCTION, HEAVY_DAMPING, DampingControl, Status
+from diffproj.calibration.everyone import Everyone, pays_to_part, rows
 from diffproj.calibration.losses import Loss
 
 __all__ = ["Status"]  # which comes with the solver wherever it is needed
@@ -62,6 +63,15 @@ class Problem(Protocol):
 
     def retract(self, local: LocalState, step: Tensor) -> LocalState:
         """Move the local blocks by tangent vectors `(P, V, l)`."""
+        ...
+
+
+@runtime_checkable
+class Parted(Problem, Protocol):
+    """A batch that can go on with some of its problems, where most have come to their end."""
+
+    def part(self, which: Tensor) -> Problem:
+        """Some of the problems `(n,)`."""
         ...
 
 
@@ -216,13 +226,15 @@ def solve(
     every = basis is None or basis.shape[-1] > 0  # where no shared unknown moves, those of the panel are enough
     terms = _Terms(problem, local_size, weights, loss, prior, every)
     cost, equations = terms.at(shared, local)
+    state = _State(shared, local, cost, equations)
     control = DampingControl(_array(cost))
+    everyone = Everyone(state, control)
     for iteration in range(1, max_iterations + 1):
-        along = equations.along(basis)
+        along = state.equations.along(basis)
         q, dz, reduction = damped_step(along, torch.from_numpy(control.damping).to(cost))
-        dx = q if basis is None else _times(basis, q)
-        trial = shared + dx, problem.retract(local, dz)
         predicted = _array(reduction)
+        dx = q if basis is None else _times(basis, q)
+        trial = state.shared + dx, problem.retract(state.local, dz)
         # Heavy damping makes every predicted reduction small: convergence is then judged by the gradient.
         heavy = control.damping > HEAVY_DAMPING
         expected = np.where(heavy, _array(_decoupled_reduction(along)), predicted) if heavy.any() else predicted
@@ -230,18 +242,34 @@ def solve(
         if done.any():
             # The final step still improves the unknowns, but its reduction is negligible: apply without evaluating it.
             last = done & (predicted <= FINAL_STEP_REDUCTION * control.cost)
-            shared, local = select(last, trial, (shared, local))
+            state = _State(*select(last, trial, state[:2]), *state[2:])
         if not control.active.any():
             break
+        if pays_to_part(control) and isinstance(problem, Parted):
+            which = torch.from_numpy(np.flatnonzero(control.active)).to(cost.device)
+            everyone.keep(state, control, which)
+            state, trial = (rows(part, which) for part in (state, trial))
+            problem, basis = problem.part(which), None if basis is None else basis[which]
+            weights, prior = None if weights is None else weights[which], None if prior is None else prior.part(which)
+            predicted, control = predicted[control.active], control.part(control.active)
+            terms = _Terms(problem, local_size, weights, loss, prior, every)
         trial_cost, trial_equations = terms.at(*trial)
         better = control.accept(_array(trial_cost), predicted)
-        state, new = (shared, local, cost, equations), (*trial, trial_cost, trial_equations)
-        shared, local, cost, equations = select(better, new, state)
+        state = select(better, _State(*trial, trial_cost, trial_equations), state)
         if progress is not None:
-            progress(iteration, cost)
-    ends = control.status.astype(np.int64), control.iterations
-    status, iterations = (torch.from_numpy(end).to(cost.device) for end in ends)
-    return Solution(shared, local, cost, status, iterations, equations)
+            progress(iteration, everyone.whole(everyone.state.cost, state.cost))
+    state, status, iterations = everyone.ends(state, control)
+    ends = (torch.from_numpy(end).to(cost.device) for end in (status.astype(np.int64), iterations))
+    return Solution(*state[:3], *ends, state.equations)
+
+
+class _State(NamedTuple):
+    """Where problems are, what that costs, and the equations there."""
+
+    shared: Tensor
+    local: LocalState
+    cost: Tensor
+    equations: Equations
 
 
 def damped_step(equations: Equations, damping: Float[Tensor, " p"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -256,21 +284,21 @@ def damped_step(equations: Equations, damping: Float[Tensor, " p"]) -> tuple[Ten
         model, `(P,)`. Zero, zero and infinite where the matrices are not positive definite.
     """
     U, E, W, g, h, _ = equations
-    D, D_local = (_damping_scale(M.diagonal(dim1=-2, dim2=-1)) for M in (U, W))
     lam = damping.unsqueeze(-1)
-    L, local_failed = torch.linalg.cholesky_ex(_with_diagonal(W, lam.unsqueeze(-1) * D_local))
-    Y = torch.linalg.solve_triangular(L, torch.cat([E.mT, h.unsqueeze(-1)], dim=-1), upper=False)
-    Y, y = Y[..., :-1], Y[..., -1:]
-    flat = Y.flatten(1, 2)
-    S = torch.baddbmm(_with_diagonal(U, lam * D), flat.mT, flat, alpha=-1)
-    reduced = g - _times(flat.mT, y.flatten(1))
-    L_shared, failed = torch.linalg.cholesky_ex(S)
-    dx = -torch.cholesky_solve(reduced.unsqueeze(-1), L_shared)
-    dz = -torch.linalg.solve_triangular(L.mT, Y @ dx.unsqueeze(1) + y, upper=True).squeeze(-1)
-    dx = dx.squeeze(-1)
-    descent = -(g * dx).sum(-1) - (h * dz).sum((-2, -1))
-    reduction = (descent + damping * ((D * dx.square()).sum(-1) + (D_local * dz.square()).sum((-2, -1)))) / 2
+    D = lam * _damping_scale(U.diagonal(dim1=-2, dim2=-1))
+    D_local = lam.unsqueeze(-1) * _damping_scale(W.diagonal(dim1=-2, dim2=-1))
+    L, local_failed = torch.linalg.cholesky_ex(_with_diagonal(W, D_local))
+    Y = torch.linalg.solve_triangular(L, torch.cat([E.mT, h.unsqueeze(-1)], dim=-1), upper=False).flatten(1, 2)
+    eliminated = Y.mT @ Y
+    L_shared, failed = torch.linalg.cholesky_ex(_with_diagonal(U - eliminated[:, :-1, :-1], D))
+    dx = torch.cholesky_solve((eliminated[:, :-1, -1] - g).unsqueeze(-1), L_shared)
+    y = (Y @ torch.nn.functional.pad(dx, (0, 0, 0, 1), value=1.0)).unflatten(1, h.shape[1:])
+    dx, dz = dx.squeeze(-1), -torch.linalg.solve_triangular(L.mT, y, upper=True).squeeze(-1)
+    slope, local_slope = torch.addcmul(g, D, dx, value=-1), torch.addcmul(h, D_local, dz, value=-1)
+    reduction = ((slope * dx).sum(-1) + (local_slope * dz).sum((-2, -1))) / -2
     sound = (failed == 0) & (local_failed == 0).all(-1) & reduction.isfinite()
+    if bool(sound.all()):
+        return dx, dz, reduction
     return (
         torch.where(sound.unsqueeze(-1), dx, 0.0),
         torch.where(sound[:, None, None], dz, 0.0),
@@ -299,12 +327,13 @@ class _Terms:
     ) -> None:
         self.problem, self.local_size, self.weights, self.loss, self.prior = problem, local_size, weights, loss, prior
         self.border = problem.bordered if every and isinstance(problem, Bordered) else None
+        self.linearise = problem.linearise if isinstance(problem, Problem) else None
 
     def at(self, shared: Tensor, local: LocalState) -> tuple[Tensor, Equations]:
-        if isinstance(self.problem, Problem):
-            cost, equations = self._products(self.problem.linearise(shared, local), local)
+        if self.linearise is not None:
+            cost, equations = self._products(self.linearise(shared, local), local)
         else:
-            cost, equations = self.problem.equations(shared, local, self.loss)
+            cost, equations = self.problem.equations(shared, local, self.loss)  # type: ignore[union-attr]
         if self.prior is not None:
             off = shared - self.prior.mean
             pull = _times(self.prior.precision, off)

@@ -168,7 +168,10 @@ class Straightened:
     def elsewhere(self, task: Task) -> "Straightened":
         """The same with no lens estimated, and with principal point and ratio of focal lengths by Zhang's equations."""
         H = closed_form.homographies(task.points, self.seen, task.used)
-        f, middle, _ = closed_form.intrinsics(H, self.middle, self.longer, task.used.any(-1))
+        seen = task.used.any(-1)
+        f, middle, found = closed_form.intrinsics(H, self.middle, self.longer, seen)
+        square = closed_form.principal_point(H, self.middle, self.longer, seen)
+        middle = torch.where(found.unsqueeze(-1), middle, square)
         return replace(self.without_lens(), middle=middle, aspect=f[:, 1] / f[:, 0])
 
     def rays(self, f: Tensor) -> tuple[Tensor, Tensor]:

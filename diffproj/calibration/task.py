@@ -45,7 +45,9 @@ class Task:
         prior: on the shared parameters.
         basis: of the shared parameters' free directions `(P, s, q)`, or `None` for all.
         pose_known: how many of the six coordinates of each pose are held, or known beforehand.
-        printed: precision of each displacement of free points `(P, 3 N)`, in the unit of the weights; `None` for 0.
+        printed: precision of the displacement of each free point `(P, N, 3, 3)`, in the unit of the weights; `None` for
+            0.
+        surveyed: whether free points are landmarks, of which that says where they are as a whole, too.
     """
 
     points: Tensor
@@ -65,6 +67,7 @@ class Task:
     prior: Prior | None = None
     basis: Tensor | None = None
     printed: Tensor | None = None
+    surveyed: bool = False
     pose_known: int = 0
 
     @property
@@ -102,7 +105,7 @@ class Task:
         """The same for other points of the target `(N, 3)`, differentiable by them."""
         counts = self.pixels.new_ones(self.used.shape) if self.weights is None else self.weights
         counts = counts if self.shares is None else counts * self.shares.unsqueeze(-1)
-        return restraint_of(points, self.pixels, self.used, counts, self.printed)
+        return restraint_of(points, self.pixels, self.used, counts, self.printed, self.surveyed)
 
     @property
     def whole_prior(self) -> Prior | None:
@@ -110,12 +113,13 @@ class Task:
         if self.restraint is None:
             return self.prior
         P, s = len(self.used), len(self.names)
-        few = s - self.restraint.printed.shape[-1]
-        held = torch.nn.functional.pad(self.restraint.alone + self.restraint.printed, (few, 0))
+        few = self.parameters.few
+        held = torch.diag_embed(self.restraint.alone) + self.restraint.measured
+        held = torch.nn.functional.pad(held, (few, 0, few, 0))
         root = torch.nn.functional.pad(self.restraint.root, (0, 0, few, 0))
         if self.prior is None:
-            return Prior(held.new_zeros(P, s), torch.diag_embed(held), root=root)
-        return Prior(self.prior.mean, self.prior.precision + torch.diag_embed(held), root=root)
+            return Prior(held.new_zeros(P, s), held, root=root)
+        return Prior(self.prior.mean, self.prior.precision + held, root=root)
 
     def holding(self, where: list[int]) -> "Task":
         """The same with some of the shared parameters held, by their positions."""

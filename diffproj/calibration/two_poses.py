@@ -252,6 +252,7 @@ def _single(task: Task, shared: Tensor, poses: Pose, p: Tensor, v: Tensor) -> tu
         whitening=None if task.whitening is None else task.whitening[p, v].unsqueeze(1),
         shares=None,
         prior=None,
+        printed=None,
         basis=shared.new_zeros(len(p), shared.shape[-1], 0),
     )
     return single, shared[p], tuple(z[p, v].unsqueeze(1) for z in poses)

@@ -37,6 +37,9 @@ FEWEST_FOR_A_SHAPE = 6
 """Different views that free points take, of which nothing is known beforehand. From fewer the shape takes what is wrong
 in a single view for its own: on real photographs, error bars then were half of what they should be."""
 
+EXPLAINED = 4.0
+"""Mean square of residuals over a noise that is known, up to which they may be nothing else."""
+
 NEARLY_NONE, MOST = 1e-3, 0.9
 """Weight below which a robust loss leaves nearly nothing of a corner, and the share of such corners that is most."""
 
@@ -72,9 +75,11 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     known = found.plain_covariance()
     no_pose = used & known.undetermined_views
     mirrored = ~no_pose & _mirrored(R, t, task.points, used, board)
-    misfits = ~no_pose & used & (_relative_error(found) > MAX_RELATIVE_RESIDUAL)
+    error = _relative_error(found)
+    misfits = ~no_pose & used & (error > MAX_RELATIVE_RESIDUAL)
     unknown = known.undetermined.clone()
-    if task.restraint is not None:  # points that hardly any view shows stay where they are, and say nothing of others
+    # Points that hardly any view shows stay where they are, and say nothing of others.
+    if task.restraint is not None and not task.surveyed:
         unknown[:, task.parameters.few :] &= ~task.restraint.unknown
         size = (task.points - task.points.mean(0)).square().sum(-1).mean().sqrt()
         unsure = known.shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, task.parameters.few :]
@@ -94,7 +99,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     status = solution.status
     wrong_lens = finite & ~folded & gravely_inadequate(found)
     at_fault = (mirrored | misfits | no_pose).any(-1)
-    handed = finite & ~no_pose.any(-1) & left_handed(task, solution, _relative_error(found))
+    handed = finite & ~no_pose.any(-1) & left_handed(task, solution, _unexplained(found, error))
     degenerate = none | handed | at_fault | unknown.any(-1) | ~redundant | alone | folded | wrong_lens
     status = torch.where(degenerate & finite & (status != Status.DIVERGED), Status.DEGENERATE, status)
     causes = [""] * len(status)
@@ -144,7 +149,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
         elif not bool(redundant[p]) or bool(unknown[p].any()):
             few = task.parameters.few_names
             lacking = [name for name, lost in zip(few, unknown[p].tolist(), strict=False) if lost]
-            if task.free:
+            if task.free and not task.surveyed:
                 causes[p] = _shapeless(lacking, bool(unknown[p, len(few) :].any()), int(used[p].sum()))
                 continue
             seen = task.part(slice(p, p + 1))
@@ -173,7 +178,7 @@ def _leans_on_one_view(task: Task) -> Tensor:
         free = (task.basis != 0).any(-1)
     if task.prior is not None:
         free = free & (task.prior.precision.diagonal(dim1=-2, dim2=-1) == 0)
-    more = free[:, 2:].any(-1)
+    more = free[:, 2 : task.parameters.few if task.surveyed else None].any(-1)
     if task.solid:  # points in space tell even in one view
         return torch.zeros_like(more)
     return more & one_view(task.points, task.pixels, task.used) if bool(more.any()) else more
@@ -198,6 +203,14 @@ def _relative_error(found: Fit) -> Tensor:
         size = torch.where(task.used.unsqueeze(2), residual.abs(), torch.nan).flatten(2)
         squares = 2 * (1.4826 * size.nanmedian(-1).values).square()
     return (squares / spread.clamp(min=1e-30)).sqrt().nan_to_num(0.0)
+
+
+def _unexplained(found: Fit, error: Tensor) -> Tensor:
+    """That error where the noise is not known to explain it; 0 where it is."""
+    if not found.knows_noise:
+        return error
+    explained = found.variance_of_residuals() <= EXPLAINED
+    return torch.where(explained.unsqueeze(-1), 0.0, error)
 
 
 def _mirrored(R: Tensor, t: Tensor, points: Tensor, used: Tensor, board: object) -> Tensor:
@@ -266,7 +279,9 @@ def _too_few_for_a_shape(task: Task) -> Tensor:
     """Which cameras have too few different views for free points of which nothing is known beforehand `(P,)`."""
     views = task.used.any(-1).to(task.pixels)
     views = (views if task.shares is None else views * task.shares).sum(-1)
-    free = task.restraint.printed.sum(-1) == 0 if task.restraint is not None else torch.zeros_like(views) > 0
+    free = torch.zeros_like(views) > 0
+    if task.restraint is not None:
+        free = (task.restraint.printed == 0).flatten(1).all(-1)
     return free & (views < FEWEST_FOR_A_SHAPE - 0.5)
 
 

@@ -11,7 +11,7 @@ or not at all.
 | `"json"` | `.json`; `.jsonl` of a fleet | any batch of cameras; whole calibrations and rigs | yes |
 | `"opencv"` | YAML, XML, JSON of OpenCV; plain YAML, JSON | K, lens, size; R and T of a pair | a camera, a pair |
 | `"ros"` | `ost.yaml`, `ost.txt`, `.ini`, `camera_info` | raw camera by K and D; rectified one by P | one camera |
-| `"colmap"` | `cameras`, `images`: `.txt`, `.bin` | lens and size; poses in `images` | `.txt`, `.bin` |
+| `"colmap"` | `cameras`, `images`, `rigs`: `.txt`, `.bin` | lens, size; poses in `images`, a rig in `rigs` | yes |
 | `"nerfstudio"` | `transforms.json`, also of instant-ngp | a camera for each frame | yes |
 | `"kalibr"` | `camchain.yaml`, EuRoC's `sensor.yaml` | a chain of cameras | yes |
 | `"numpy"` | `.npz`, `.npy` | arrays of K, lens, size, R and t | `.npz`, one camera |
@@ -30,7 +30,7 @@ What each says, where it differs from here:
 | `"json"` | | | |
 | `"opencv"` | | first camera to second | 4 are a fisheye's where the file says so |
 | `"ros"` | | none; P: left to right | by `distortion_model`: 5, 8, or 4 of a fisheye |
-| `"colmap"` | first centre at 0.5 | | by the model's name |
+| `"colmap"` | first centre at 0.5 | `rigs`: rig to camera | by the model's name |
 | `"nerfstudio"` | first centre at 0.5; OpenGL's axes | camera to world | by name; k4 is r^8 |
 | `"kalibr"` | | IMU, or the camera before, to camera | `radtan` 4, `equidistant` 4 |
 | `"numpy"` | | | 4 need `camera_model` |

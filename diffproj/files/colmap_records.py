@@ -59,7 +59,7 @@ def cameras_from_text(text: str) -> list[CameraRecord]:
             continue
         if len(words) < 5 or not words[0].isdecimal():
             raise ValueError(f"want CAMERA_ID MODEL WIDTH HEIGHT PARAMS[], got {line[:80]!r}")
-        width, height, *parameters = map(_float, words[2:])
+        width, height, *parameters = map(number_of, words[2:])
         records.append(CameraRecord(words[0], words[1], width, height, parameters))
     return records
 
@@ -77,7 +77,7 @@ def images_from_text(text: str) -> list[ImageRecord]:
             continue
         if len(words) < 10:
             raise ValueError(f"want IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {line[:80]!r}")
-        records.append(ImageRecord(words[9], [_float(word) for word in words[1:8]], words[8]))
+        records.append(ImageRecord(words[9], [number_of(word) for word in words[1:8]], words[8]))
         points = next(lines, "").split()
         if len(points) % 3:
             raise ValueError(f"{words[9]}: want the line of its points below the line of its pose, got another")
@@ -104,7 +104,12 @@ def images_to_text(records: Sequence[ImageRecord]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _float(word: str) -> float:
+def number_of(word: str) -> float:
+    """The number that a word of a text says.
+
+    Raises:
+        ValueError: it says none.
+    """
     try:
         return float(word)
     except ValueError:
@@ -120,7 +125,7 @@ def cameras_from_bytes(data: bytes) -> list[CameraRecord]:
     Raises:
         ValueError: a model of no known number, or fewer or more bytes than the records have.
     """
-    reader, records = _Bytes(data), []
+    reader, records = Bytes(data), []
     for _ in range(reader.count(24)):
         id_, model_number, width, height = reader.take("<IiQQ")
         if not 0 <= model_number < len(MODELS):
@@ -137,7 +142,7 @@ def images_from_bytes(data: bytes) -> list[ImageRecord]:
     Raises:
         ValueError: fewer or more bytes than the records have.
     """
-    reader, records = _Bytes(data), []
+    reader, records = Bytes(data), []
     for _ in range(reader.count(72)):
         _, *pose, id_ = reader.take("<I7dI")
         records.append(ImageRecord(reader.name(), pose, str(id_)))
@@ -164,7 +169,7 @@ def images_to_bytes(records: Sequence[ImageRecord]) -> bytes:
     return b"".join(parts)
 
 
-class _Bytes:
+class Bytes:
     """Little-endian numbers one after the other."""
 
     def __init__(self, data: bytes) -> None:

@@ -2,6 +2,9 @@
 
 * OpenCV's stereo file, for a pair: `M1 D1 M2 D2`, and `R`, `T` from the first camera to the second.
 * Kalibr's `camchain.yaml`: `cam0`, `cam1`, ... in the rig's order, with `T_cn_cnm1` from the camera before.
+* COLMAP's `rigs.txt` or `rigs.bin` (since its version 3.12), with the files beside that make a model which it reads:
+  the cameras, in the rig's order with ids from 1; a frame for each moment, whose world is the target; and the images
+  by their cameras' names, `left/left01.jpg`.
 
 `load_camera(path, camera=...)` reads the cameras of all of them.
 """
@@ -15,16 +18,18 @@ import torch
 
 from diffproj._core.arguments import choice
 from diffproj.calibration.rig_result import RigCalibration
-from diffproj.files import kalibr, own_json
+from diffproj.files import colmap, colmap_records, colmap_rig_records, kalibr, own_json
+from diffproj.files.colmap_records import ImageRecord
+from diffproj.files.colmap_rig_records import FrameRecord, RigRecord, SensorRecord
 from diffproj.files.names import FormatName
 from diffproj.geometry.camera import Camera
 from diffproj.lens.kannala_brandt import KannalaBrandt
 
-WRITTEN = ("json", "opencv", "kalibr")
-SUFFIXES = {".json": "json", ".yaml": "opencv", ".yml": "opencv", ".xml": "opencv"}
+WRITTEN = ("json", "opencv", "kalibr", "colmap")
+SUFFIXES = {".json": "json", ".txt": "colmap", ".bin": "colmap"} | dict.fromkeys((".yaml", ".yml", ".xml"), "opencv")
 
 
-def write(path: Path, rig: RigCalibration, name: FormatName | None) -> dict[Path, str]:
+def write(path: Path, rig: RigCalibration, name: FormatName | None) -> dict[Path, str] | dict[Path, bytes]:
     """The content of each file that is to be written.
 
     Raises:
@@ -37,8 +42,50 @@ def write(path: Path, rig: RigCalibration, name: FormatName | None) -> dict[Path
         raise ValueError(f"format: want {' or '.join(map(repr, WRITTEN))} for a rig, got {name or path.suffix!r}")
     if found == "json":
         return own_json.write(path, rig)
+    if found == "colmap":
+        return _model(path, rig)
     cameras = [camera.detach().to("cpu", torch.float64) for camera in rig.cameras.values()]
     return _stereo(path, cameras) if found == "opencv" else _chain(path, cameras)
+
+
+def _model(path: Path, rig: RigCalibration) -> dict[Path, str] | dict[Path, bytes]:
+    """COLMAP's model: the rig, its frames, and what they refer to."""
+    if path.name not in ("rigs.txt", "rigs.bin"):
+        raise ValueError(f"want rigs.txt or rigs.bin for a rig, as COLMAP calls them, got {path.name}")
+    ids = {name: str(number) for number, name in enumerate(rig.names, 1)}
+    cameras, sensors, taken = [], [], {}
+    images: list[ImageRecord] = []
+    for name, camera in rig.cameras.items():
+        camera = camera.detach().to("cpu", torch.float64)
+        cameras.append(colmap.record_of(camera)._replace(id_=ids[name]))
+        place = None if name == rig.names[0] else colmap.pose_of(camera.R, camera.t)
+        sensors.append(SensorRecord("CAMERA", ids[name], place))
+        one = rig.calibrations[name]
+        posed = one.cameras.detach().to("cpu", torch.float64)
+        for view in one.used.any(-1).nonzero().flatten().tolist():
+            called = f"{name}/{one.views.names[view].removeprefix(f'{name}/')}"
+            if len(called.splitlines()) != 1:
+                raise ValueError(f"want names of images on one line, which COLMAP needs, got {called!r}")
+            images.append(ImageRecord(called, colmap.pose_of(posed.R[view], posed.t[view]), ids[name]))
+            taken.setdefault(int(rig.where[name][view]), []).append((ids[name], str(len(images))))
+    R, t = (part.detach().to("cpu", torch.float64) for part in (rig.R_target, rig.t_target))
+    frames = [FrameRecord("1", colmap.pose_of(R[moment], t[moment]), taken[moment]) for moment in sorted(taken)]
+    rigs = [RigRecord("1", sensors)]
+    if path.suffix == ".txt":
+        return colmap.model_of(
+            path,
+            colmap_records.cameras_to_text(cameras),
+            colmap_rig_records.rigs_to_text(rigs),
+            frames=colmap_rig_records.frames_to_text(frames),
+            images=colmap_records.images_to_text(images),
+        )
+    return colmap.model_of(
+        path,
+        colmap_records.cameras_to_bytes(cameras),
+        colmap_rig_records.rigs_to_bytes(rigs),
+        frames=colmap_rig_records.frames_to_bytes(frames),
+        images=colmap_records.images_to_bytes(images),
+    )
 
 
 def _chain(path: Path, cameras: list[Camera]) -> dict[Path, str]:

@@ -22,7 +22,7 @@ def save_camera(
     last coefficients of a lens. This package's own JSON holds all, and whole calibrations and rigs. Of a calibration,
     the other formats hold the camera alone, without the world's unit and the error bars; OpenCV's also get the poses,
     with the unit as `world_unit`, and the RMS errors, for other programs: `load_camera` reads the camera. Of a rig,
-    OpenCV's formats hold a pair, Kalibr's a chain of cameras.
+    OpenCV's formats hold a pair, Kalibr's a chain of cameras, COLMAP's `rigs.txt` or `rigs.bin` a rig with its frames.
 
     Args:
         path: the file to write; its folder must exist.

@@ -218,7 +218,7 @@ class PlaneMap(MapViews, Copied, Shown):
         """The p of a pinhole or behind a lens, and where the lens has an inverse (`None`: everywhere)."""
         lens = self.camera.distortion
         if lens is None:
-            return pixels - self.camera.K[..., None, :2, 2], None
+            return pixels - self.camera.K.select(-1, 2).narrow(-1, 0, 2).unsqueeze(-2), None
         if not isinstance(lens, BrownConrady):
             return self.camera.directions(pixels)
         xy, finite = self.camera._normalised(pixels)
@@ -348,7 +348,9 @@ def warn_if_rounded(camera: Camera, plane: Plane) -> None:
 def _lacks_pose(to_plane: PlaneMap) -> bool:
     """Whether all cameras are where the world's origin is, in the plane, and look along its axes; false if not told."""
     R, t = to_plane.camera.R, to_plane.camera.t
-    if t.device.type != "cpu" or not has_values(t, to_plane.matrix) or bool(t.any()) or t.numel() == 0:
+    if t.device.type != "cpu" or not has_values(t, to_plane.matrix) or t.numel() == 0:
+        return False
+    if t.numpy(force=True).any():  # in NumPy, for this is asked in each call
         return False
     return not bool(to_plane.matrix[..., 3, :].any()) and description.without_pose(R, t)
 

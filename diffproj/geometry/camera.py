@@ -30,7 +30,6 @@ from diffproj._core.numerics import (
     has_values,
     in_blocks,
     interleaved,
-    least_depth,
     linear,
     transform,
     wants_derivative,
@@ -40,7 +39,7 @@ from diffproj.geometry.changed_images import ChangedImages
 from diffproj.geometry.exchange import Exchange
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounded_pixels
 from diffproj.geometry.grid import checked_size, inside
-from diffproj.geometry.intrinsics import check_intrinsics, pixel_to_normalized
+from diffproj.geometry.intrinsics import check_intrinsics, pixel_to_normalized, through_pinhole
 from diffproj.geometry.placement import Placed
 from diffproj.geometry.rotations import check_pose
 from diffproj.lens.protocol import Lens
@@ -258,17 +257,24 @@ class Camera(
                 points = points.nan_to_num(0.0, 0.0, 0.0)  # the slope by R is the point, and 0 times infinity is NaN
             rotated = linear(entries(self.R), points.unbind(-1))
             direction = [x + shift.unsqueeze(-1) for x, shift in zip(rotated, self.t.unbind(-1), strict=True)]
-            if self.distortion is None:
-                xy, valid = _pinhole(direction, derivative)
-            else:
-                xy_lens, valid = self.distortion.project_direction(torch.stack(direction, dim=-1))
-                xy = list(xy_lens.unbind(-1))
+            uv, valid = self._pixels_along(direction)
             valid = valid & finite
-            uv = linear(entries(self.K[..., :2, :]), [*xy, None])
             return interleaved([torch.where(valid, x, 0.0) for x in uv]), valid
 
         pixels, valid = in_blocks(project, points, *self.tensors())
         return pixels, valid
+
+    def _pixels_along(self, direction: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
+        """Pixels of directions in the camera frame, both by components `(*B, N)`, and which are valid.
+
+        Elsewhere they are finite where a derivative is asked, and anything where none is.
+        """
+        if self.distortion is None:
+            xy, valid = through_pinhole(direction, wants_derivative(*direction, *self.tensors()))
+        else:
+            xy_lens, valid = self.distortion.project_direction(torch.stack(list(direction), dim=-1))
+            xy = list(xy_lens.unbind(-1))
+        return linear(entries(self.K[..., :2, :]), [*xy, None]), valid
 
     def directions(
         self, pixels: Float[Tensor, "*#batch n 2"] | Array
@@ -384,17 +390,3 @@ def check_lens(distortion: object) -> None:
     maps = hasattr(distortion, "project_direction") and hasattr(distortion, "unproject")
     if isinstance(distortion, type) or not maps:
         instance("distortion", distortion, (), "a lens such as dp.BrownConrady(coefficients)")
-
-
-def _pinhole(direction: Sequence[Tensor], derivative: bool) -> tuple[list[Tensor], Tensor]:
-    """Perspective division, valid where the point is finite and in front.
-
-    Elsewhere it gives 0 where a derivative is asked, and anything where none is.
-    """
-    x, y, z = direction
-    reach, limits = x.abs() + y.abs(), torch.finfo(z.dtype)
-    # Derivatives hold 1 / z, which must not overflow; and x / z, not x times 1 / z, whose derivative would sooner.
-    valid = (z > limits.eps * reach + least_depth(z.dtype)) & (reach + z).isfinite()
-    if derivative:
-        x, y, z = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0), torch.where(valid, z, 1.0)
-    return [x / z, y / z], valid

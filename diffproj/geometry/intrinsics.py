@@ -4,12 +4,15 @@
 invertible 2x2 matrix, and the camera model stays exact.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj._core.numerics import arrays_of, in_float64, rounding
+from diffproj._core.numerics import arrays_of, has_values, in_float64, least_depth, rounding, wants_derivative
 
 
 def intrinsic_matrix(
@@ -32,6 +35,20 @@ def pixel_to_normalized(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch
     a, b, c, d = K[..., :2, :2].flatten(-2).unbind(-1)
     determinant = torch.addcmul(a * d, b, c, value=-1)
     return (torch.stack([d, -b, -c, a], dim=-1) / determinant.unsqueeze(-1)).unflatten(-1, (2, 2))
+
+
+def through_pinhole(direction: Sequence[Tensor], derivative: bool) -> tuple[list[Tensor], Tensor]:
+    """Perspective division by components `(*B, N)`, and where the direction is finite and leads forward.
+
+    Elsewhere it gives 0 where a derivative is asked, and anything where none is.
+    """
+    x, y, z = direction
+    reach, limits = x.abs() + y.abs(), torch.finfo(z.dtype)
+    # Derivatives hold 1 / z, which must not overflow; and x / z, not x times 1 / z, whose derivative would sooner.
+    valid = (z > limits.eps * reach + least_depth(z.dtype)) & (reach + z <= limits.max)
+    if derivative:
+        x, y, z = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0), torch.where(valid, z, 1.0)
+    return [x / z, y / z], valid
 
 
 def upright(
@@ -76,20 +93,29 @@ def warped(
     Returns:
         `K'` and `Q`, both `(*B, 3, 3)` in the dtype of K.
     """
-    G = (in_float64(matrix).unsqueeze(-1) * in_float64(K).unsqueeze(-3)).sum(-2)
+    given = K, matrix, ahead
+    if wants_derivative(*given) or not has_values(*given):
+        return tuple(part.to(K.dtype) for part in _warped(torch, *map(in_float64, given)))  # type: ignore[return-value]
+    library, arrays = arrays_of(*given, double=True)
+    upper, Q = _warped(library, *arrays)
+    return torch.as_tensor(upper).to(K), torch.as_tensor(Q).to(K)
+
+
+def _warped(library: Any, K: Any, matrix: Any, ahead: Any) -> tuple[Any, Any]:
+    """The same of arrays, or of tensors."""
+    G = (matrix[..., None] * K[..., None, :, :]).sum(-2)
     w = (matrix[..., 2, :2] * ahead).sum(-1) + matrix[..., 2, 2]
-    G = torch.where((w < 0)[..., None, None], -G, G)
-    length = G[..., 2, :].norm(dim=-1)[..., None, None]
-    x, y, z = (G[..., 2, :] / length.squeeze(-1)).unbind(-1)
-    rows = [
-        [1 - x * x / (1 + z), -x * y / (1 + z), -x],
-        [-x * y / (1 + z), 1 - y * y / (1 + z), -y],
-        [x, y, z],
-    ]
-    Q = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-    upper = (G[..., :2, :].unsqueeze(-2) * Q.unsqueeze(-3)).sum(-1) / length  # G Q^T
-    last = torch.tensor([0.0, 0, 1], dtype=G.dtype, device=G.device).expand(*G.shape[:-2], 1, 3)
-    return torch.cat([upper, last], dim=-2).to(K.dtype), Q.to(K.dtype)
+    G = library.where((w < 0)[..., None, None], -G, G)
+    length = (G[..., 2, :] * G[..., 2, :]).sum(-1)[..., None] ** 0.5
+    last = G[..., 2, :] / length
+    # Rows x and y of Q: the identity's, less last (x, y) / (1 + z), less (x, y) in the third place.
+    x, y, z = (last[..., axis] for axis in range(3))
+    far, both = 1 + z, -x * y / (1 + z)
+    first, second = library.stack((1 - x * x / far, both, -x), -1), library.stack((both, 1 - y * y / far, -y), -1)
+    Q = library.stack((first, second, last), -2)
+    upper = (G[..., :2, None, :] * Q[..., None, :, :]).sum(-1) / length[..., None]  # G Q^T
+    below = library.zeros_like(upper[..., :1, :]) + (upper.new_tensor if library is torch else np.array)([0.0, 0, 1])
+    return library.concatenate((upper, below), -2), Q
 
 
 def check_intrinsics(K: Tensor) -> None:
@@ -102,12 +128,11 @@ def check_intrinsics(K: Tensor) -> None:
     library, (K,) = arrays_of(K)
     if not bool(library.isfinite(K).all()):
         raise ValueError("K: want finite values, got NaN or infinity")
-    if bool((abs(K[..., 2, :2]) > 1e-5).any() or (abs(K[..., 2, 2] - 1) > 1e-5).any()):
+    if bool(((abs(K[..., 2, 0]) > 1e-5) | (abs(K[..., 2, 1]) > 1e-5) | (abs(K[..., 2, 2] - 1) > 1e-5)).any()):
         raise ValueError("K: want the last row (0, 0, 1), got another; divide by K[..., 2, 2]")
     with np.errstate(over="ignore", invalid="ignore"):
-        F = K[..., :2, :2]
-        determinant = F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0]
-        singular = abs(determinant) <= 8 * eps * (F * F).sum((-2, -1))
+        a, b, c, d = (K[..., row, column] for row in (0, 1) for column in (0, 1))
+        singular = abs(a * d - b * c) <= 8 * eps * (a * a + b * b + c * c + d * d)
     if bool(singular.any()):
         raise ValueError("K: want an invertible matrix, got a singular one; are both focal lengths set?")
 
@@ -118,12 +143,16 @@ def check_warp(name: str, matrix: Tensor, K: Tensor, behind_lens: bool) -> None:
     Raises:
         ValueError: not finite, singular, or a projective warp for a camera with a lens.
     """
-    if not bool(matrix.isfinite().all()):
+    least = rounding(matrix.dtype)
+    library, (matrix, K) = arrays_of(matrix, K, double=True)
+    if not bool(library.isfinite(matrix).all()):
         raise ValueError(f"{name}: want finite values, got NaN or infinity")
     # Multiplied by K, the entries of a row have similar magnitudes, whatever the warp's shift and scale.
-    rows = (in_float64(matrix).unsqueeze(-1) * in_float64(K).unsqueeze(-3)).sum(-2)
-    rows = rows / rows.norm(dim=-1, keepdim=True)
-    if not bool((torch.linalg.det(rows).abs() > 8 * torch.finfo(matrix.dtype).eps).all()):
+    with np.errstate(all="ignore"):
+        rows = (matrix[..., None] * K[..., None, :, :]).sum(-2)
+        rows = rows / (rows * rows).sum(-1)[..., None] ** 0.5
+        singular = ~(abs(library.linalg.det(rows)) > least)
+    if bool(singular.any()):
         raise ValueError(f"{name}: want an invertible one, got a singular one")
     if behind_lens and bool((matrix[..., 2, :2] != 0).any()):
         raise ValueError(

@@ -3,6 +3,8 @@
 It stands here twice, for two readers. `recorded` takes steps that every tool of PyTorch can follow: derivatives of any
 order and mode, `vmap`, compilers, export. `direct` takes as few as possible, for short calls cost their number; where a
 gradient is asked, the backward pass is written by hand. A derivative of that gradient is taken through `recorded`.
+
+Of few points on a CPU `direct` takes the same steps in NumPy (`plane_kernel_short.py`): each takes half the time there.
 """
 
 from collections.abc import Sequence
@@ -12,6 +14,7 @@ import torch
 from torch import Tensor
 
 from diffproj._core.numerics import entries, interleaved, linear
+from diffproj.geometry.plane_kernel_short import divided, gradient, is_short
 
 
 def components(p: Tensor) -> list[Tensor | None]:
@@ -72,6 +75,8 @@ def direct(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Tens
 
 def _divided(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """The points, which are valid, `b . p`, and which are not valid (`None`: all are)."""
+    if is_short(p):
+        return divided(p, matrix, seen)
     x, y, *z = p.unsqueeze(-3).unbind(-1)
     products = _times(matrix.narrow(-2, 0, 4), x, y, *z)
     threshold = _times(matrix.narrow(-2, 4, 1), x.abs(), y.abs(), *(part.abs() for part in z))
@@ -113,6 +118,9 @@ class _WithGradient(torch.autograd.Function):
         of_p, of_matrix, _ = ctx.needs_input_grad
         if torch.is_grad_enabled():
             by_p, by_matrix = _recorded_gradient(p, matrix, seen, by_points, (of_p, of_matrix))
+            return by_p, by_matrix, None
+        if is_short(p):
+            by_p, by_matrix = gradient(p, matrix, hidden, denominator, by_points, (of_p, of_matrix))
             return by_p, by_matrix, None
         if hidden is not None:
             p, by_points = (tensor.masked_fill(hidden.unsqueeze(-1), 0.0) for tensor in (p, by_points))

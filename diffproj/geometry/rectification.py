@@ -13,25 +13,21 @@ keep their places at any resolution. Every pixel of the target image is mapped t
 lens included, and sampled there as `resampling.py` says. Both are differentiable in image and camera.
 """
 
-import math
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from diffproj._core.arguments import called, flag, number, numbers, whole_number
-from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor
+from diffproj._core.arguments import Array, called, numbers, whole_number
+from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, entries, in_float64, linear
 from diffproj.geometry.back_projection import PlaneMap, warn_if_rounded
-from diffproj.geometry.camera import Camera, as_camera, meeting_camera
+from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.extents import MOST_PIXELS, cells, shape_of, sides_of
 from diffproj.geometry.grid import checked_size
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.geometry.resampling import MAX_SUPERSAMPLING, Chosen, LookUp, resampled
-
-MOST_PIXELS = 2**31
-"""Of an image to be made: more would not fit into memory, and is a resolution in the wrong unit."""
 
 Axes = tuple[Tensor, Tensor, Tensor]
 """`(origin, axis_s, axis_t)` of a top view, each `(*B, 3)` in the world."""
@@ -69,11 +65,12 @@ def rectify(
     image: Float[Tensor, "*batch c h w"],
     camera: Camera | PinholeCamera,
     plane: Plane,
-    extent: Sequence[float] | Tensor,
-    resolution: float,
+    extent: Sequence[float] | Tensor | Array,
+    resolution: float | None = None,
     axes: Axes | None = None,
     north_up: bool = False,
     samples: int | tuple[int, int] | None = None,
+    size: tuple[int, int] | None = None,
 ) -> tuple[Float[Tensor, "*out c rows columns"], Bool[Tensor, "*out rows columns"]]:
     """The metric top view of a plane.
 
@@ -82,8 +79,8 @@ def rectify(
         camera: with its pose, of batch shape `*B`; the image is its full image. `camera.resized((w, h))` is the camera
             of a feature map of fewer pixels.
         plane: of batch shape `*B`.
-        extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes; `(*B, 4)`, all equally large,
-            where each image has its own.
+        extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes; `(*B, 4)` where each image has
+            its own, with a resolution all equally large.
         resolution: world units per pixel of the top view. Where the extent is no whole multiple of it, the number of
             pixels is rounded, and they fill the extent.
         axes: `(origin, axis_s, axis_t)`, each `(*B, 3)`; those of `plane_axes` if left out.
@@ -91,6 +88,8 @@ def rectify(
         samples: how many samples a pixel takes along each side, or to the right and down; about as many as it covers
             pixels of the image, for each image by itself, if left out. Where it is said, nothing depends on values, as
             `torch.compile(fullgraph=True)` needs; 1 is fastest, and right where pixels are about equally large.
+        size: `(width, height)` of the top view in pixels, in place of the resolution; extents of a compiled or
+            exported graph's input need it.
 
     Returns:
         The top view `(*B, C, rows, columns)`, 0 where not valid; and `valid (*B, rows, columns)`: at least half of the
@@ -98,8 +97,8 @@ def rectify(
 
     Raises:
         TypeError: the image is no floating-point tensor, or another argument is of the wrong kind.
-        ValueError: an empty or infinite extent, a resolution that is not positive or too fine, or shapes or devices
-            that do not fit.
+        ValueError: an empty or infinite extent, a resolution that is not positive or too fine, no resolution and no
+            size, or shapes or devices that do not fit.
 
     Example:
         >>> import diffproj as dp
@@ -109,39 +108,45 @@ def rectify(
         >>> top.shape, bool(valid.all())
         (torch.Size([3, 50, 100]), True)
     """
-    image, camera, plane, (origin, along_s, along_t) = _checked("image", image, camera, plane, axes)
-    extent, moved = _of_each(extent, camera.K)
-    if moved is not None:  # to where the extent of each image begins
-        broadcast_batches(
-            image=image.shape[:-3], camera=camera.batch_shape, plane=plane.batch_shape, extent=moved.shape[:-1]
-        )
-        origin = origin + moved[..., :1] * along_s + moved[..., 1:] * along_t
-        along_s, along_t = along_s.expand_as(origin), along_t.expand_as(origin)
-    rows, columns = _shape(extent, resolution)
+    image, camera, plane, axes = _checked("image", image, camera, plane, axes)
+    shape = shape_of(extent, resolution, size, camera.K)
+    low, unit = cells(extent, shape, camera.K, north_up)
+    shapes = {"plane": axes[0].shape[:-1], "extent": low.shape[:-1]}
+    batch = broadcast_batches(image=image.shape[:-3], camera=camera.batch_shape, **shapes)
     _check_size(image, camera)
     warn_if_rounded(camera, plane)
-    low, unit = _corner_and_pixel(extent, (rows, columns), camera.K, north_up)
+    toward = _toward_cells(camera, axes, low, unit)
 
     def look_up_of(chosen: Chosen) -> LookUp:
-        seen_by, _, (start, s_axis, t_axis) = _of(chosen, camera, plane, (origin, along_s, along_t), image)
+        seen_by, matrix = camera, toward
+        if chosen is not None:
+            seen_by, matrix = camera.expand(*batch)[chosen], toward.expand(*batch, 3, 3)[chosen]
 
-        def look_up(places: Tensor) -> tuple[Tensor, Tensor]:
-            s, t = (places * unit + low).unbind(-1)
-            points = (
-                start.unsqueeze(-2) + s.unsqueeze(-1) * s_axis.unsqueeze(-2) + t.unsqueeze(-1) * t_axis.unsqueeze(-2)
-            )
-            return seen_by._project(meeting_camera(seen_by, "points", points, 3))
+        def look_up(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            (u, v), valid = seen_by._pixels_along(linear(entries(matrix), [x, y, None]))
+            return u, v, valid
 
         return look_up
 
-    return resampled(image, look_up_of, (rows, columns), camera.K, _numbers(samples))
+    return resampled(image, look_up_of, shape, camera.K, _numbers(samples))
+
+
+def _toward_cells(camera: Camera, axes: Axes, low: Tensor, unit: Tensor) -> Tensor:
+    """The matrix `(*B, 3, 3)` from places `(x, y, 1)` in the top view, in its pixels, to directions of the camera."""
+    origin, along_s, along_t = map(in_float64, axes)
+    low, unit = in_float64(low).unsqueeze(-1), in_float64(unit).unsqueeze(-1)
+    start = origin + low[..., 0, :] * along_s + low[..., 1, :] * along_t
+    to_world = torch.stack(torch.broadcast_tensors(unit[..., 0, :] * along_s, unit[..., 1, :] * along_t, start), dim=-1)
+    turned = (in_float64(camera.R).unsqueeze(-1) * to_world.unsqueeze(-3)).sum(-2)
+    shift = torch.nn.functional.pad(in_float64(camera.t).unsqueeze(-1), (2, 0))
+    return (turned + shift).to(camera.dtype)
 
 
 def render(
     texture: Float[Tensor, "*batch c rows columns"],
     camera: Camera | PinholeCamera,
     plane: Plane,
-    extent: Sequence[float],
+    extent: Sequence[float] | Tensor | Array,
     size: tuple[int, int] | None = None,
     axes: Axes | None = None,
     north_up: bool = False,
@@ -153,7 +158,8 @@ def render(
         texture: `(*B, C, rows, columns)`, floating point, filling the extent.
         camera: with its pose, of batch shape `*B`.
         plane: of batch shape `*B`.
-        extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes.
+        extent: `(s_min, t_min, s_max, t_max)` in world units, along the plane's axes; `(*B, 4)` where each texture
+            has its own.
         size: `(width, height)` of the image; the camera's if left out.
         axes: `(origin, axis_s, axis_t)`, each `(*B, 3)`; those of `plane_axes` if left out.
         north_up: whether the texture's first row is at t_max, as in maps; at t_min if not.
@@ -177,26 +183,33 @@ def render(
         >>> image.shape, int(valid.sum())  # 200 x 100 world units at 2 per pixel
         (torch.Size([1, 480, 640]), 5000)
     """
-    texture, camera, plane, (origin, along_s, along_t) = _checked("texture", texture, camera, plane, axes)
+    texture, camera, plane, axes = _checked("texture", texture, camera, plane, axes)
     size = checked_size(size) or camera.size
     if size is None:
         raise ValueError("size: want (width, height), got None, and the camera has none")
-    _checked_extent(extent)
     width, height = size
     if width * height > MOST_PIXELS:
         raise ValueError(f"size: want one that fits into memory, got {width} x {height} px")
-    rows, columns = texture.shape[-2:]
-    low, unit = _corner_and_pixel(extent, (rows, columns), camera.K, north_up)
+    low, unit = cells(extent, texture.shape[-2:], camera.K, north_up)
+    shapes = {"plane": plane.batch_shape, "axes": axes[0].shape[:-1], "extent": low.shape[:-1]}
+    batch = broadcast_batches(texture=texture.shape[:-3], camera=camera.batch_shape, **shapes)
 
     def look_up_of(chosen: Chosen) -> LookUp:
-        seen_by, on, (start, s_axis, t_axis) = _of(chosen, camera, plane, (origin, along_s, along_t), texture)
+        seen_by, on, vectors = camera, plane, [*axes, low, unit]
+        if chosen is not None:
+            seen_by, on = camera.expand(*batch)[chosen], plane.expand(*batch)[chosen]
+            vectors = [vector.expand(*batch, vector.shape[-1])[chosen] for vector in vectors]
+        start, s_axis, t_axis, corner, step = ([*vector.unsqueeze(-2).unbind(-1)] for vector in vectors)
         to_plane = PlaneMap.quietly(seen_by, on)
 
-        def look_up(places: Tensor) -> tuple[Tensor, Tensor]:
-            points, valid = to_plane(places - 0.5)
-            off = points - start.unsqueeze(-2)
-            st = torch.stack([(off * s_axis.unsqueeze(-2)).sum(-1), (off * t_axis.unsqueeze(-2)).sum(-1)], dim=-1)
-            return (st - low) / unit - 0.5, valid
+        def look_up(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            points, valid = to_plane(torch.stack([x - 0.5, y - 0.5], dim=-1))
+            off = [part - first for part, first in zip(points.unbind(-1), start, strict=True)]
+            u, v = (
+                (sum(a * b for a, b in zip(off, axis, strict=True)) - corner[i]) / step[i] - 0.5
+                for i, axis in enumerate((s_axis, t_axis))
+            )
+            return u, v, valid
 
         return look_up
 
@@ -226,21 +239,11 @@ def geotransform(
         >>> geotransform((-20, 0, 20, 30), 0.5, origin=(642700, 8304290))
         (642680.0, 0.5, 0.0, 8304320.0, 0.0, -0.5)
     """
-    rows, columns = _shape(extent, resolution)
+    rows, columns = shape_of(extent, resolution)
     east, north = numbers("origin", origin, "finite (east, north)", 2)
-    width, height = _checked_extent(extent)
+    width, height = sides_of(extent)
     s_min, _, _, t_max = (float(side) for side in extent)
     return east + s_min, width / columns, 0.0, north + t_max, 0.0, -height / rows
-
-
-def _corner_and_pixel(
-    extent: Sequence[float], shape: tuple[int, int], like: Tensor, north_up: bool
-) -> tuple[Tensor, Tensor]:
-    """`(s, t)` of the corner where the first pixel begins, and the steps along s and t from pixel to pixel."""
-    (s_min, t_min, s_max, t_max), (rows, columns) = extent, shape
-    if flag("north_up", north_up):
-        t_min, t_max = t_max, t_min
-    return like.new_tensor([s_min, t_min]), like.new_tensor([(s_max - s_min) / columns, (t_max - t_min) / rows])
 
 
 def _checked(
@@ -302,58 +305,3 @@ def _numbers(samples: int | tuple[int, int] | None) -> tuple[int, int] | None:
     both = samples if isinstance(samples, tuple | list) and len(samples) == 2 else (samples, samples)
     right, down = (whole_number("samples", one, want, least=1, most=MAX_SUPERSAMPLING) for one in both)
     return right, down
-
-
-def _of(chosen: Chosen, camera: Camera, plane: Plane, axes: Axes, image: Tensor) -> tuple[Camera, Plane, Axes]:
-    """Camera, plane and axes of some images of a batch."""
-    if chosen is None:
-        return camera, plane, axes
-    batch = torch.broadcast_shapes(
-        image.shape[:-3], camera.batch_shape, plane.batch_shape, *(axis.shape[:-1] for axis in axes)
-    )
-    origin, along_s, along_t = (axis.expand(*batch, 3)[chosen] for axis in axes)
-    return camera.expand(*batch)[chosen], plane.expand(*batch)[chosen], (origin, along_s, along_t)
-
-
-def _of_each(extent: Sequence[float] | Tensor, like: Tensor) -> tuple[Sequence[float], Tensor | None]:
-    """The first extent, and by how much each image's lies beside it `(*B, 2)`; `None` where there is one for all.
-
-    Raises:
-        TypeError: no numbers.
-        ValueError: extents of different sizes, or that are not finite.
-    """
-    if not isinstance(extent, Tensor | np.ndarray) or extent.ndim < 2:
-        return extent, None  # type: ignore[return-value]
-    each = check_tensor("extent", extent, 4, like=like).to(like)
-    if each.numel() == 0:
-        raise ValueError(f"extent: want one extent, or at least one for each image, got shape {tuple(each.shape)}")
-    first = each.reshape(-1, 4)[0]
-    moved = each[..., :2] - first[:2]
-    sides = each[..., 2:] - each[..., :2]
-    if not bool(each.isfinite().all()):
-        raise ValueError("extent: want finite (s_min, t_min, s_max, t_max), got NaN or infinity")
-    if not bool(((sides - sides.reshape(-1, 2)[0]).abs() <= 1e-5 * sides.abs()).all()):
-        raise ValueError(f"extent: want extents of one size, got {sides.reshape(-1, 2).tolist()}")
-    return first.tolist(), moved
-
-
-def _checked_extent(extent: Sequence[float]) -> tuple[float, float]:
-    """The sides of an extent along s and t, in world units."""
-    want = "finite (s_min, t_min, s_max, t_max) with room between"
-    s_min, t_min, s_max, t_max = numbers("extent", extent, want, 4)
-    if not (s_max > s_min and t_max > t_min and math.isfinite(s_max - s_min) and math.isfinite(t_max - t_min)):
-        raise ValueError(f"extent: want {want}, got {tuple(extent)}")
-    return s_max - s_min, t_max - t_min
-
-
-def _shape(extent: Sequence[float], resolution: float) -> tuple[int, int]:
-    """`(rows, columns)` of the top view whose pixels fill the extent."""
-    width, height = _checked_extent(extent)
-    resolution = number("resolution", resolution, "world units per pixel, above 0", above=0)
-    rows, columns = (max(1.0, side / resolution) for side in (height, width))
-    if rows * columns > MOST_PIXELS:
-        raise ValueError(
-            f"resolution: want world units per pixel that give a top view of an image's size, got {resolution:g}, and "
-            f"{columns:.3g} x {rows:.3g} px for the extent"
-        )
-    return max(1, round(rows)), max(1, round(columns))

@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from diffproj._core.numerics import block_points
-from diffproj.geometry.grid import inside, pixel_grid
+from diffproj.geometry.grid import pixel_grid
 
-LookUp = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Maps places in the target `(N, 2)`, in pixels from its first corner, to positions in the source `(*B, N, 2)`, in
-pixels from the centre of its first pixel, and `valid (*B, N)`."""
+LookUp = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+"""Maps places in the target, `x (N,)` and `y (N,)` in pixels from its first corner, to positions in the source,
+`u (*B, N)` and `v (*B, N)` in pixels from the centre of its first pixel, and `valid (*B, N)`."""
 Chosen = tuple[Tensor, ...] | None
 """Which images of the batch: an index as `Tensor.nonzero(as_tuple=True)` gives it; `None` for all."""
 
@@ -55,14 +55,15 @@ def resampled(
         total, share = _mean(source, look_up_of(None), corners, samples)
         return (total, share > 0) if samples == (1, 1) else _finished(total, share)
     with torch.no_grad():
-        places, valid = look_up_of(None)((corners + 0.5).reshape(-1, 2))
-        if 0 in (*source.shape[:-3], *valid.shape[:-1], *places.shape[:-2]):  # of no images
+        u, v, valid = look_up_of(None)(*_apart(corners + 0.5))
+        if 0 in (*source.shape[:-3], *valid.shape[:-1], *u.shape[:-1]):  # of no images
             return _finished(*_mean(source, look_up_of(None), corners, (1, 1)))
-        shown = (valid & inside(places, _size(source))).unflatten(-1, shape)
+        shown = (valid & _inside(u, v, _size(source))).unflatten(-1, shape)
+        places = torch.stack([u, v], dim=-1)
         footprints = _footprints(look_up_of(None), corners, places.unflatten(-2, shape), shown)
         between = any(bool(((more > 0) & (more < 1)).any()) for _, more in map(_numbers, footprints))
     if between and torch.is_grad_enabled():  # how the weights of two results move with the camera
-        places, _ = look_up_of(None)((corners + 0.5).reshape(-1, 2))
+        places = torch.stack(look_up_of(None)(*_apart(corners + 0.5))[:2], dim=-1)
         footprints = _footprints(look_up_of(None), corners, places.unflatten(-2, shape), shown)
     # A target may reach far beyond the source: only the part about what is shown is sampled.
     (top, bottom), (left, end) = (_range_of(shown.transpose(-1, axis).flatten(0, -2).any(0)) for axis in (-2, -1))
@@ -110,11 +111,12 @@ def _mean(source: Tensor, look_up: LookUp, corners: Tensor, samples: tuple[int, 
     right, down = samples
     rows, columns = corners.shape[:2]
     offsets = ((pixel_grid(down, right, corners) + 0.5) / corners.new_tensor([right, down])).reshape(-1, 2)
-    most = max(1, block_points(corners.device) // max(1, rows * columns * source.shape[:-3].numel()))
+    images = 1 if torch.compiler.is_compiling() else source.shape[:-3].numel()  # a graph is for any number of them
+    most = max(1, block_points(corners.device) // max(1, rows * columns * images))
     total, share = torch.zeros((), dtype=source.dtype, device=source.device), corners.new_zeros(())
     for some in offsets.split(most):
-        places, valid = look_up((corners + some[:, None, None]).reshape(-1, 2))
-        sampled, seen = _sampled(source, places, valid, (len(some) * rows, columns))
+        u, v, valid = look_up(*_apart(corners + some[:, None, None]))
+        sampled, seen = _sampled(source, u, v, valid, (len(some) * rows, columns))
         if len(offsets) == 1:
             return sampled, seen.to(corners.dtype)
         total = total + sampled.unflatten(-2, (len(some), rows)).sum(-3)
@@ -122,19 +124,32 @@ def _mean(source: Tensor, look_up: LookUp, corners: Tensor, samples: tuple[int, 
     return total / len(offsets), share / len(offsets)
 
 
-def _sampled(source: Tensor, places: Tensor, valid: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Bilinear samples `(*B, C, rows, columns)` of the source at `places`, and which are inside it."""
+def _sampled(source: Tensor, u: Tensor, v: Tensor, valid: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Bilinear samples `(*B, C, rows, columns)` of the source at positions `(u, v)`, and which are inside it."""
     width, height = _size(source)
-    seen = valid & inside(places, (width, height))
-    batch = torch.broadcast_shapes(source.shape[:-3], places.shape[:-2])
+    seen = valid & _inside(u, v, (width, height))
+    batch = torch.broadcast_shapes(source.shape[:-3], seen.shape[:-1])
     # An image of one row or column becomes one of two: positions are told by the distance between first and last.
     source = source.expand(*batch, source.shape[-3], max(height, 2), max(width, 2))
-    last = places.new_tensor([max(width, 2) - 1, max(height, 2) - 1])
     # Beyond the outermost centres an image goes on as it is there. What is not seen is far outside, where all is 0.
-    grid = torch.where(seen.unsqueeze(-1), (places * 2 / last - 1).clamp(-1, 1), -3.0).expand(*batch, -1, -1)
-    flat = grid.reshape(-1, *shape, 2).to(source)
+    columns = [
+        torch.where(seen, (part * (2 / (max(side, 2) - 1)) - 1).clamp(-1, 1), -3.0)
+        for part, side in ((u, width), (v, height))
+    ]
+    flat = torch.stack(columns, dim=-1).to(source.dtype).expand(*batch, -1, -1).reshape(-1, *shape, 2)
     sampled = grid_sample(source.reshape(-1, *source.shape[-3:]), flat, align_corners=True)
     return sampled.reshape(*batch, *sampled.shape[1:]), seen.expand(*batch, -1).unflatten(-1, shape)
+
+
+def _apart(places: Tensor) -> tuple[Tensor, Tensor]:
+    """Places `(*shape, 2)` one after the other, x and y by themselves `(N,)`."""
+    x, y = places.reshape(-1, 2).T.contiguous()
+    return x, y
+
+
+def _inside(u: Tensor, v: Tensor, size: tuple[int, int]) -> Tensor:
+    """As `inside`, by components: operations over a last axis of two are slow."""
+    return ((u - (size[0] - 1) / 2).abs() <= size[0] / 2) & ((v - (size[1] - 1) / 2).abs() <= size[1] / 2)
 
 
 def _size(source: Tensor) -> tuple[int, int]:
@@ -174,8 +189,9 @@ def _footprint(look_up: LookUp, corners: Tensor, places: Tensor, shown: Tensor, 
     footprint = _percentile(step.flatten(-2), both.flatten(-2))
     if bool(footprint.isnan().any()):
         half = corners.new_tensor([0.5, 0.0] if axis == -1 else [0.0, 0.5])
-        (first, seen), (last, too) = (look_up((corners + 0.5 + side * half).reshape(-1, 2)) for side in (-1, 1))
-        alone = _percentile((last - first).norm(dim=-1), seen & too & shown.flatten(-2))
+        first, last = (look_up(*_apart(corners + 0.5 + side * half)) for side in (-1, 1))
+        length = torch.stack([last[0] - first[0], last[1] - first[1]], dim=-1).norm(dim=-1)
+        alone = _percentile(length, first[2] & last[2] & shown.flatten(-2))
         footprint = torch.where(footprint.isnan(), alone, footprint)
     return footprint.nan_to_num(1.0)
 

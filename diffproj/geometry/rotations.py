@@ -12,6 +12,8 @@ from diffproj._core.numerics import arrays_of
 ROTATION_TOLERANCE = 1e-5
 """How far `R^T R` may be from the identity, entry by entry, where a user hands a camera in."""
 
+IDENTITY = np.eye(3)
+
 
 def is_rotation(R: Float[Tensor, "*shape 3 3"]) -> Bool[Tensor, "*shape"]:
     """Which matrices are rotations, to `ROTATION_TOLERANCE`."""
@@ -30,7 +32,8 @@ def check_pose(R: Tensor, t: Tensor) -> None:
     Raises:
         ValueError: not finite, or no rotation.
     """
-    library, (R, t, identity) = arrays_of(R, t, torch.eye(3, dtype=R.dtype, device=R.device))
+    library, (R, t) = arrays_of(R, t)
+    identity = IDENTITY if library is np else torch.eye(3, dtype=R.dtype, device=R.device)
     if not bool(library.isfinite(t).all()):
         raise ValueError("t: want finite values, got NaN or infinity")
     with np.errstate(over="ignore", invalid="ignore"):

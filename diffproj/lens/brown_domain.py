@@ -16,12 +16,16 @@ polynomial, whose minimum is found numerically.
 """
 
 import math
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from diffproj._core.numerics import arrays_of, has_values
+from diffproj._core.torch_private import in_forward_mode
 from diffproj.lens.brown_equations import Terms, bend, denominator, radial, radial_slope, term_growth, tilted
-from diffproj.lens.domain import first_failure, radius_grid
+from diffproj.lens.domain import first_failure, library_of, radius_grid
 from diffproj.lens.polynomial import polynomial
 
 MAX_TABLE_FACTOR = 3.0
@@ -50,42 +54,58 @@ RADIUS_POWERS = (2, 4, 1, 1, 6, 2, 4, 6, 1, 3, 1, 3)
 """Power of the radius in each coefficient's term, relative to the point; for all coefficients but the tilt."""
 
 
-def length_scale(coefficients: Tensor) -> Tensor:
+def length_scale(coefficients: Any) -> Any:
     """Smallest radius at which one term is as large as the point itself, `(*B,)`; 1 if all coefficients are 0."""
-    powers = coefficients.new_tensor(RADIUS_POWERS[: coefficients.shape[-1]])
-    strength = coefficients[..., :12].abs() ** (1 / powers)
+    library, size = library_of(coefficients), abs(coefficients)
+    strength = size[..., :12] ** (1 / _powers(coefficients))
     if coefficients.shape[-1] > 12:
-        strength = torch.cat([strength, coefficients[..., 12:].tan().abs()], dim=-1)
-    strongest = strength.amax(-1)
-    return torch.where(strongest == 0, 1, 1 / strongest).clamp_max(1e12)
+        strength = library.concatenate((strength, library.tan(size[..., 12:])), -1)
+    strongest = library.amax(strength, -1)
+    return library.where(strongest == 0, 1.0, 1 / strongest).clip(None, 1e12)
 
 
-def last_crossing(coefficients: Tensor) -> Tensor:
+def last_crossing(coefficients: Any) -> Any:
     """Radius beyond which the term of highest order dominates all others, `(*B,)`; 0 if there is one term or none."""
-    powers = coefficients.new_tensor(RADIUS_POWERS[: coefficients.shape[-1]])
-    size = coefficients[..., : len(powers)].abs().log()
-    steps = powers.unsqueeze(-1) - powers  # from the power of the second term to that of the first
-    crossing = (size.unsqueeze(-2) - size.unsqueeze(-1)) / steps.clamp_min(1)
-    return torch.where((steps > 0) & crossing.isfinite(), crossing, -torch.inf).amax((-2, -1)).exp().clamp_max(1e12)
+    library, powers = library_of(coefficients), _powers(coefficients)
+    size = library.log(abs(coefficients[..., : len(powers)]))
+    steps = powers[:, None] - powers  # from the power of the second term to that of the first
+    crossing = (size[..., None, :] - size[..., :, None]) / steps.clip(1)
+    latest = library.amax(library.where((steps > 0) & library.isfinite(crossing), crossing, -math.inf), (-2, -1))
+    return library.exp(latest).clip(None, 1e12)
+
+
+def _powers(coefficients: Any) -> Any:
+    powers = RADIUS_POWERS[: coefficients.shape[-1]]
+    return coefficients.new_tensor(powers) if isinstance(coefficients, Tensor) else np.array(powers, dtype=np.float64)
 
 
 def domain_radius(coefficients: Tensor) -> Tensor:
     """Radius of the disc `(*B,)` for coefficients `(*B, k)` in float64; 0 where they are not finite."""
-    if coefficients.ndim > 1 and coefficients.shape[-1] > 8:
+    if coefficients.shape[-1] <= 8:
+        plain = has_values(coefficients) and not in_forward_mode()
+        library, (values,) = arrays_of(coefficients) if plain else (torch, (coefficients,))
+        with np.errstate(all="ignore"):
+            scale = length_scale(values)
+            grid = radius_grid(scale, 10 * last_crossing(values))
+            found = _radius(scale, *first_failure(_ClosedForm(values), grid))
+        return torch.as_tensor(found, dtype=coefficients.dtype) if library is np else found
+    if coefficients.ndim > 1:
         blocks = coefficients.flatten(0, -2).split(BLOCK_LENSES)
-        return torch.cat([_domain_radius(block) for block in blocks]).reshape(coefficients.shape[:-1])
-    return _domain_radius(coefficients)
+        return torch.cat([_by_circles(block) for block in blocks]).reshape(coefficients.shape[:-1])
+    return _by_circles(coefficients)
 
 
-def _domain_radius(coefficients: Tensor) -> Tensor:
+def _by_circles(coefficients: Tensor) -> Tensor:
     scale = length_scale(coefficients)
     grid = radius_grid(scale, 10 * last_crossing(coefficients))
-    if coefficients.shape[-1] <= 8:
-        radius, failed = first_failure(_ClosedForm(coefficients), grid)
-    else:
-        radius, failed = first_failure(_Circles(coefficients), grid, nodes=32, rounds=8)
-    radius = torch.where(failed, radius, math.inf)
-    return torch.where(radius > 1e-9 * scale, radius, 0)  # 0 for NaN and where it fails at the centre
+    return _radius(scale, *first_failure(_Circles(coefficients), grid, nodes=32, rounds=8))
+
+
+def _radius(scale: Any, radius: Any, failed: Any) -> Any:
+    """Infinite where nothing failed; 0 for NaN, and where it fails at the centre."""
+    library = library_of(radius)
+    radius = library.where(failed, radius, math.inf)
+    return library.where(radius > 1e-9 * scale, radius, 0.0)
 
 
 def clearly_one_to_one(coefficients: Tensor, radius: Tensor) -> Tensor:
@@ -106,16 +126,19 @@ def clearly_one_to_one(coefficients: Tensor, radius: Tensor) -> Tensor:
 class _ClosedForm:
     """Whether the symmetric part is positive definite on whole circles: closed form, for lenses of 4, 5 or 8."""
 
-    def __init__(self, coefficients: Tensor):
-        self.terms = Terms.of(coefficients)
+    def __init__(self, coefficients: Any):
+        self.library, self.terms = library_of(coefficients), Terms.of(coefficients)
+        self.slant = self.library.hypot(self.terms.two_p1, self.terms.two_p2)
 
-    def __call__(self, radius: Tensor, _number: int) -> Tensor:
+    def __call__(self, radius: Any, _number: int) -> Any:
         s = radius * radius
         factor = radial(self.terms, s)
         along = factor + s * radial_slope(self.terms, s, factor)
-        e = radius * torch.hypot(self.terms.two_p1, self.terms.two_p2)
-        c = -((along + 3 * factor) / (8 * e)).clamp(0, 1).nan_to_num(1.0)
-        determinant = along * factor - e * e + e * (along + 3 * factor) * c + (2 * e * c) ** 2
+        e = radius * self.slant
+        total = along + 3 * factor
+        c = (total / (-8 * e)).clip(-1, 0)
+        c = self.library.where(self.library.isnan(c), -1.0, c)
+        determinant = along * factor - e * e + e * total * c + (2 * e * c) ** 2
         return (along > 0) & (factor > 0) & (determinant > 0) & _away_from_pole(self.terms, s)
 
 
@@ -180,12 +203,12 @@ class _Circles:
         return (polished > 0) & (values > 0).all(-1)
 
 
-def _away_from_pole(terms: Terms, s: Tensor) -> Tensor:
+def _away_from_pole(terms: Terms, s: Any) -> Any:
     """Whether the denominator is positive by a safe margin: more than `MIN_DENOMINATOR` of its terms' magnitudes."""
     below = denominator(terms, s)
     if terms.below is None:
         return below > 0
-    return below > MIN_DENOMINATOR * (1 + s * polynomial(s, [column.abs() for column in terms.below]))
+    return below > MIN_DENOMINATOR * (1 + s * polynomial(s, [abs(column) for column in terms.below]))
 
 
 # -------------------------------------------------------------------------------------- other parts of a lens's plan

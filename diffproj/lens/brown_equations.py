@@ -20,8 +20,9 @@ prism); Louhichi, Fournel, Lavest and Ben Aissia 2007 (tilt). The order of the c
 
 from collections.abc import Iterator
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,7 +30,9 @@ from diffproj.lens.polynomial import minus_product, polynomial
 
 COUNTS = (4, 5, 8, 12, 14)
 """Numbers of coefficients that the model can have."""
-Columns = tuple[Tensor, ...]
+Values = Any
+"""A tensor; or, of a lens without tilt, an array of NumPy, for what is radial."""
+Columns = tuple[Values, ...]
 
 
 class Tilt(NamedTuple):
@@ -80,9 +83,9 @@ class Terms(NamedTuple):
     above_slope: Columns
     below: Columns | None
     below_slope: Columns | None
-    one: Tensor
-    two_p1: Tensor
-    two_p2: Tensor
+    one: Values
+    two_p1: Values
+    two_p2: Values
     sideways_x: Columns
     sideways_y: Columns
     sideways_slope_x: Columns
@@ -90,9 +93,12 @@ class Terms(NamedTuple):
     tilt: Tilt | None
 
     @classmethod
-    def of(cls, coefficients: Tensor) -> "Terms":
+    def of(cls, coefficients: Values) -> "Terms":
         """Group coefficients `(*B, k)`."""
-        k1, k2, p1, p2, *rest = coefficients.unsqueeze(-2).unbind(-1)
+        if isinstance(coefficients, Tensor):
+            k1, k2, p1, p2, *rest = coefficients.unsqueeze(-2).unbind(-1)
+        else:
+            k1, k2, p1, p2, *rest = (coefficients[..., i, None] for i in range(coefficients.shape[-1]))
         above = k1, k2, *rest[:1]
         below = tuple(rest[1:4])
         prism = rest[4:8]
@@ -102,7 +108,7 @@ class Terms(NamedTuple):
             _slope(above),
             below or None,
             _slope(below) if below else None,
-            torch.ones_like(k1),
+            _ones_like(k1),
             2 * p1,
             2 * p2,
             sideways_x,
@@ -111,6 +117,10 @@ class Terms(NamedTuple):
             _slope(sideways_y),
             Tilt(rest[8].cos(), rest[8].sin(), rest[9].cos(), rest[9].sin()) if rest[8:] else None,
         )
+
+
+def _ones_like(values: Values) -> Values:
+    return torch.ones_like(values) if isinstance(values, Tensor) else np.ones_like(values)
 
 
 def _slope(over_s: Columns) -> Columns:
@@ -126,23 +136,23 @@ class Jacobian(NamedTuple):
     yy: Tensor
 
 
-def denominator(terms: Terms, s: Tensor) -> Tensor:
+def denominator(terms: Terms, s: Values) -> Values:
     """Denominator of the radial factor `g`, at squared radii `s`."""
-    return torch.ones_like(s) if terms.below is None else 1 + s * polynomial(s, terms.below)
+    return _ones_like(s) if terms.below is None else 1 + s * polynomial(s, terms.below)
 
 
-def radial(terms: Terms, s: Tensor) -> Tensor:
+def radial(terms: Terms, s: Values) -> Values:
     """The radial factor `g`, at squared radii `s`."""
     return 1 + s * _growth(terms, s)
 
 
-def _growth(terms: Terms, s: Tensor) -> Tensor:
+def _growth(terms: Terms, s: Values) -> Values:
     """`(g - 1) / s`."""
     above = polynomial(s, terms.above)
     return above if terms.below is None else (above - polynomial(s, terms.below)) / denominator(terms, s)
 
 
-def radial_slope(terms: Terms, s: Tensor, factor: Tensor) -> Tensor:
+def radial_slope(terms: Terms, s: Values, factor: Values) -> Values:
     """`2 dg/ds`, where `g` is `factor`."""
     slope = polynomial(s, terms.above_slope)
     if terms.below_slope is None:
@@ -150,7 +160,7 @@ def radial_slope(terms: Terms, s: Tensor, factor: Tensor) -> Tensor:
     return (slope - factor * polynomial(s, terms.below_slope)) / denominator(terms, s)
 
 
-def term_growth(terms: Terms, s: Tensor) -> Tensor:
+def term_growth(terms: Terms, s: Values) -> Values:
     """Sum of the magnitudes of the radial factor's terms over the factor: by this much rounding errors grow."""
     below = denominator(terms, s)
     growth = (1 + s * polynomial(s, [column.abs() for column in terms.above])) / (below * radial(terms, s))

@@ -5,7 +5,9 @@ to rounding. The lower end of the last cell is returned, where the property was 
 """
 
 from collections.abc import Callable
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,24 +19,35 @@ UNIFORM_NODES, GEOMETRIC_NODES = 192, 192
 CELL_NODES, ROUNDS = 128, 6
 """Nodes of the finer grids, and the number of grids in all."""
 
-Property = Callable[[Tensor, int], Tensor]
+Property = Callable[[Any, int], Any]
 
 
-def radius_grid(scale: Tensor, last: Tensor) -> Tensor:
+def library_of(values: Any) -> Any:
+    """The library that an array or tensor is of. What is written in words of both runs in NumPy on a CPU.
+
+    Of the few hundred radii of one lens NumPy's steps take a third of the time of PyTorch's.
+    """
+    return torch if isinstance(values, Tensor) else np
+
+
+def even_steps(count: int, like: Any) -> Any:
+    """`1 / count`, `2 / count`, ... to 1, as an array or as a tensor like another."""
+    if isinstance(like, Tensor):
+        return torch.arange(1, count + 1, dtype=like.dtype, device=like.device) / count
+    return np.arange(1, count + 1) / count
+
+
+def radius_grid(scale: Any, last: Any) -> Any:
     """Radii `(*B, M)` from nearly 0 to `GRID_END` times the length scale `(*B,)`, or to `last` if that is more."""
-    near = torch.linspace(
-        UNIFORM_END / UNIFORM_NODES, UNIFORM_END, UNIFORM_NODES, dtype=scale.dtype, device=scale.device
-    )
-    far = torch.linspace(0, 1, GEOMETRIC_NODES + 1, dtype=scale.dtype, device=scale.device)[1:]
-    end = (last / scale).clamp_min(GRID_END).unsqueeze(-1)
-    far = UNIFORM_END * (end / UNIFORM_END) ** far
-    return scale.unsqueeze(-1) * torch.cat([near.expand(*far.shape[:-1], UNIFORM_NODES), far], dim=-1)
+    library = library_of(scale)
+    near = UNIFORM_END * even_steps(UNIFORM_NODES, scale)
+    end = (last / scale).clip(GRID_END)[..., None]
+    far = UNIFORM_END * (end / UNIFORM_END) ** even_steps(GEOMETRIC_NODES, scale)
+    return scale[..., None] * library.concatenate((near + library.zeros_like(end), far), -1)
 
 
-def first_failure(
-    holds: Property, grid: Tensor, *, nodes: int = CELL_NODES, rounds: int = ROUNDS
-) -> tuple[Tensor, Tensor]:
-    """Find the largest radius up to which a property holds, coarse to fine.
+def first_failure(holds: Property, grid: Any, *, nodes: int = CELL_NODES, rounds: int = ROUNDS) -> tuple[Any, Any]:
+    """Find the largest radius up to which a property holds, coarse to fine. Arrays, or tensors.
 
     Args:
         holds: takes radii `(*B, M)` and the number of the round, and returns where the property holds. It is assumed
@@ -46,20 +59,21 @@ def first_failure(
     Returns:
         The last radius at which the property holds `(*B,)`, and whether it fails anywhere on the grid `(*B,)`.
     """
-    fractions = torch.linspace(0, 1, nodes + 1, dtype=grid.dtype, device=grid.device)[1:]
-    low, high, failed = _first_bad_cell(holds(grid, 0), grid, torch.zeros_like(grid[..., 0]))
+    library, short = library_of(grid), 1 - even_steps(nodes, grid)
+    low, high, failed = _first_bad_cell(library, holds(grid, 0), grid, library.zeros_like(grid[..., 0]))
     for number in range(1, rounds):
-        below = (2 * low - high).clamp_min(0)  # the finer grid may find an earlier failure
-        radii = torch.lerp(below.unsqueeze(-1), high.unsqueeze(-1), fractions)
-        low, high, _ = _first_bad_cell(holds(radii, number), radii, below)
+        below = (2 * low - high).clip(0)  # the finer grid may find an earlier failure
+        radii = high[..., None] - (high - below)[..., None] * short
+        low, high, _ = _first_bad_cell(library, holds(radii, number), radii, below)
     return low, failed
 
 
-def _first_bad_cell(good: Tensor, radii: Tensor, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _first_bad_cell(library: Any, good: Any, radii: Any, start: Any) -> tuple[Any, Any, Any]:
     """The ends of the first cell whose upper end fails (the last cell if none does), and whether any does."""
-    last = radii.shape[-1] - 1
     bad = ~good
     failed = bad.any(-1)
-    index = torch.where(failed, bad.to(torch.uint8).argmax(-1), last).unsqueeze(-1)
-    edges = torch.cat([start.unsqueeze(-1), radii], dim=-1)
-    return edges.gather(-1, index).squeeze(-1), edges.gather(-1, index + 1).squeeze(-1), failed
+    index = library.where(failed, (bad * 1).argmax(-1), radii.shape[-1] - 1)[..., None]
+    edges = library.concatenate((start[..., None], radii), -1)
+    take = np.take_along_axis if library is np else torch.take_along_dim
+    low, high = take(edges, index, -1), take(edges, index + 1, -1)
+    return low[..., 0], high[..., 0], failed

@@ -1,14 +1,22 @@
 """Polynomials by Horner's rule, and `total - a b` in one operation."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 
-def polynomial(x: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
-    """`c0 + c1 x + c2 x^2 + ...` for coefficients that broadcast against `x`; `c0` itself if it is the only one."""
+def polynomial(x: Any, coefficients: Sequence[Any]) -> Any:
+    """`c0 + c1 x + c2 x^2 + ...` for coefficients that broadcast against `x`; `c0` itself if it is the only one.
+
+    Of tensors, or of NumPy's arrays.
+    """
     total = coefficients[-1]
+    if not isinstance(x, Tensor):
+        for coefficient in reversed(coefficients[:-1]):
+            total = total * x + coefficient
+        return total
     for coefficient in reversed(coefficients[:-1]):
         total = torch.addcmul(coefficient, total, x)
     return total

@@ -23,9 +23,10 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from diffproj._core.arguments import flag
-from diffproj._core.numerics import dot, has_values
+from diffproj._core.numerics import dot, has_values, wants_derivative
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.cayley import turned
+from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.models import coefficients_of, model_of
 from diffproj.nn.partial import (
     OF_POSE,
@@ -37,6 +38,7 @@ from diffproj.nn.partial import (
     add_parameter,
     learned,
     learned_parts,
+    same_values,
 )
 
 _PARAMETERS = {
@@ -93,6 +95,7 @@ class LearnableCamera(GeometryModule):
         self, camera: Camera | PinholeCamera, learn: Learn | None = None, tied_intrinsics: bool | None = None
     ) -> None:
         super().__init__()
+        self._kept: CoefficientLens | None = None
         camera = as_camera(camera).detach()
         check_tied(tied_intrinsics)
         self._model = model_of(camera.distortion)
@@ -149,14 +152,27 @@ class LearnableCamera(GeometryModule):
             t = t + dot(self.R_0 - R, center.unsqueeze(-2))
             if "height" in self.learn:
                 t = t - R[..., 2] * self.reach * learned(self, "height")
-        lens = None
-        if self._model.kind is not None:
-            coefficients = self.coefficients_0 + learned(self, "distortion")
-            lens = self._model.kind.unchecked(coefficients).expand(*self.batch_shape)
-        return Camera.unchecked(K, R, t, lens, self.size)
+        return Camera.unchecked(K, R, t, self._lens(), self.size)
 
     if TYPE_CHECKING:  # PyTorch types the call of a module as Any
         __call__ = forward
+
+    def _lens(self) -> CoefficientLens | None:
+        """The lens; where no gradient reaches its coefficients, the same one for as long as their values stay."""
+        kind = self._model.kind
+        if kind is None:
+            return None
+        coefficients = self.coefficients_0 + learned(self, "distortion")
+        if wants_derivative(coefficients) or not has_values(coefficients):
+            return kind.unchecked(coefficients).expand(*self.batch_shape)
+        kept = self._kept
+        if kept is None or not same_values(coefficients, kept.coefficients):
+            with torch.inference_mode(False):
+                kept = self._kept = kind.unchecked(coefficients.detach().clone())
+        return kept.expand(*self.batch_shape)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_kept": None}
 
     def extra_repr(self) -> str:
         """What `print` shows between the brackets."""

@@ -12,6 +12,7 @@ from diffproj.geometry.back_projection import PlaneMap
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
 from diffproj.nn.camera import LearnableCamera
+from diffproj.nn.partial import same_values
 from diffproj.nn.plane import LearnablePlane
 
 
@@ -83,7 +84,7 @@ class LearnableMap(nn.Module):
         if self.device.type != "cpu" or not has_values(*state):
             return None
         kept = self._kept
-        if kept is None or not all(map(_same, state, kept[0])):
+        if kept is None or not all(map(same_values, state, kept[0])):
             with torch.inference_mode(False), torch.no_grad():
                 values = [tensor.detach().clone() for tensor in state]
                 kept = self._kept = values, PlaneMap.quietly(self.camera().detach(), self.plane().detach())
@@ -91,7 +92,3 @@ class LearnableMap(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_kept": None}
-
-
-def _same(now: Tensor, before: Tensor) -> bool:
-    return now.dtype == before.dtype and torch.equal(now, before)

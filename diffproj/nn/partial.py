@@ -165,3 +165,8 @@ def learned(module: GeometryModule, name: str) -> Tensor:
     """The value of what `add_parameter` added, zero for the elements of the batch for which it is not learned."""
     value: Tensor = getattr(module, name)
     return value * getattr(module, f"{name}_learned") if name in module.masked else value
+
+
+def same_values(now: Tensor, before: Tensor) -> bool:
+    """Whether a tensor holds what another does: in whatever way it was written to, of which not all are counted."""
+    return now.dtype == before.dtype and now.device == before.device and torch.equal(now, before)

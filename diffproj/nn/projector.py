@@ -107,7 +107,10 @@ class PlaneProjector(nn.Module):
             TypeError: no floating-point tensors, or others than the camera's dtype.
             ValueError: shapes or devices that do not fit, or a warp that `Camera.warped` refuses.
         """
-        with without_autocast(self.geometry.device):
+        geometry = self.geometry
+        with without_autocast(geometry.device):
+            if warp is None and plane is None and camera is None:
+                return geometry()(pixels)
             return self._map_of(warp, plane, camera)(pixels)
 
     def _map_of(

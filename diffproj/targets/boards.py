@@ -2,8 +2,6 @@
 
 from typing import Any
 
-import numpy as np
-
 from diffproj._core.arguments import called
 from diffproj.targets.april_grid import AprilGrid
 from diffproj.targets.charuco import CharucoBoard
@@ -30,7 +28,7 @@ def as_printed(board: Any, name: str = "board") -> Board:
 def faces_away(board: Board) -> bool:
     """Whether the board's z points into it, away from the camera, as its frame has it."""
     _, right, down = board.artwork.axes
-    return float(np.cross(right, down)[2]) > 0
+    return float(right[0] * down[1] - right[1] * down[0]) > 0
 
 
 def origin_doubt(board: Chessboard | CircleGrid) -> str:

@@ -43,7 +43,8 @@ def find_circles(
 ) -> Float[np.ndarray, "n 2"] | None:
     """The middles of the circles' images in px, in the board's order, NaN where hidden; None where it is not there.
 
-    Of orders that look alike, the one whose first circle is nearest the image's top left.
+    They may be light on dark as well. Of orders that look alike, the one whose first circle is nearest the image's top
+    left.
 
     Args:
         image: `(H, W)`, uint8 or float32.
@@ -52,13 +53,15 @@ def find_circles(
     """
     for small in _copies(grey):
         scale = float(np.mean(np.array(grey.shape) / small.shape))
-        found = dark_ellipses(small)
-        ellipses = Ellipses((found.centres + 0.5) * scale - 0.5, found.axes / scale)
-        if len(ellipses.centres) < WHOLE * len(board):
-            continue
-        numbers = _numbered(ellipses, board)
-        if numbers is not None:
-            return _refined(image, ellipses, numbers, board)
+        for shown, whole in ((small, image), (255 - small, 255 - image)):
+            found = dark_ellipses(shown)
+            ellipses = Ellipses((found.centres + 0.5) * scale - 0.5, found.axes / scale)
+            if len(ellipses.centres) < WHOLE * len(board):
+                continue
+            numbers = _numbered(ellipses, board)
+            middles = None if numbers is None else _refined(whole, ellipses, numbers, board)
+            if middles is not None:
+                return middles
     return None
 
 

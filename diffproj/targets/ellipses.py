@@ -14,6 +14,9 @@ SMALLEST = 2.0
 FLATTEST = 0.2
 """Least ratio of its axes."""
 
+FAINTEST, BESIDE = 4.0, 2.0
+"""Grey values by which a candidate must be darker inside than around it, and how far around, in px."""
+
 STEPS = 12
 """Most steps of the fit."""
 
@@ -22,6 +25,8 @@ CLOSE = 3e-3
 
 WIDE, FAR = 1.3, 3.0
 """How far beyond the ellipse pixels are fitted: relative to its size, and at least so many px."""
+
+_ANGLES = np.arange(16) * (2 * np.pi / 16)
 
 
 class Ellipses(NamedTuple):
@@ -69,7 +74,20 @@ def dark_ellipses(grey: UInt8[np.ndarray, "h w"]) -> Ellipses:
     if not found:
         return Ellipses(np.zeros((0, 2)), np.zeros((0, 2, 2)))
     ellipses = Ellipses(*(np.stack(part) for part in zip(*found, strict=True)))
+    ellipses = ellipses.only(np.flatnonzero(_darkness(smooth, ellipses) > FAINTEST))
     return ellipses.only(_distinct(ellipses))
+
+
+def _darkness(grey: UInt8[np.ndarray, "h w"], ellipses: Ellipses) -> Float[np.ndarray, " n"]:
+    """By how much each ellipse is darker inside than around it: an outline may be that of a halo around white paper."""
+    around = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+    across = np.linalg.inv(ellipses.axes) @ around
+    minor = np.linalg.norm(across, axis=1).min(axis=-1)[:, None, None]
+    mean = []
+    for reach in (0.5, 1 + BESIDE / minor):
+        u, v = np.rint(ellipses.centres[..., None] + reach * across).astype(int).swapaxes(0, 1)
+        mean.append(grey[v.clip(0, grey.shape[0] - 1), u.clip(0, grey.shape[1] - 1)].mean(axis=-1))
+    return mean[1] - mean[0]
 
 
 def _ellipse(contour: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -105,7 +123,7 @@ def _distinct(ellipses: Ellipses) -> np.ndarray:
         offset = (ellipses.centres[kept] - ellipses.centres[k])[:, :, None]
         if not kept or np.linalg.norm(ellipses.axes[kept] @ offset, axis=1).min() > 0.8:
             kept.append(int(k))
-    return np.array(kept)
+    return np.array(kept, dtype=int)
 
 
 def fit_ellipses(image: Shaped[np.ndarray, "h w"], start: Ellipses, room: Float[np.ndarray, " n"]) -> FittedEllipses:

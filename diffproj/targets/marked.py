@@ -19,7 +19,11 @@ from diffproj.targets.pattern_fit import LARGEST, SMALLEST, Patches, fit_patches
 from diffproj.targets.surface import off_surface
 
 MISFIT = 0.30
-"""Misfit from which a corner is not taken: half covered ones, and those of another number, leave more."""
+"""Misfit from which a corner is not taken: covered ones, and those of another number, leave more."""
+
+ORDINARY, UNUSUAL = 0.12, 2.5
+"""Misfit up to which any corner is taken, and the same relative to the view's median, whichever is larger: corners that
+something covers in part, or whose light an edge of shadow parts, leave more than their fellows."""
 
 FAINT = 0.15
 """Least contrast, relative to the median of the view: glare drowns the rest."""
@@ -41,6 +45,10 @@ FEWEST = 6
 
 ENOUGH = 8
 """Markers that agree from which no other copy of the image is searched: corners lead to the rest of the board."""
+
+BEYOND = 2.6
+"""How far around a corner the print is known to its fit, relative to what is looked at: at a slant and blurred, lines
+from farther away reach into it."""
 
 WIDEST = 2400
 """Longer side in px from which markers are sought in a smaller copy first."""
@@ -100,12 +108,12 @@ class _Search:
     def __init__(self, image: Shaped[np.ndarray, "h w"], board: MarkedBoard, border: int) -> None:
         self.image, self.board = image, board
         self.places = board.corners
-        self.patches = patches_of(board._artwork_with(border), self.places, 1.3 * board.reach)
+        self.patches = patches_of(board._artwork_with(border), self.places, BEYOND * board.reach)
 
     def corners(self, markers: list[Marker]) -> Float[np.ndarray, "n 2"] | None:
         """All corners that can be told, from markers that agree."""
         known = np.full(self.places.shape, np.nan)
-        good = np.zeros(len(known), dtype=bool)
+        good, misfit = np.zeros(len(known), dtype=bool), np.full(len(known), np.inf)
         sources = np.concatenate([one.board for one in markers]), np.concatenate([one.quad for one in markers])
         tried = np.zeros(len(known), dtype=bool)
         for round_ in range(8):
@@ -119,6 +127,8 @@ class _Search:
             before = int(good.sum())
             good[todo] = found.good
             known[todo] = np.where(found.good[:, None], found.corners, np.nan)
+            misfit[todo] = found.misfit
+            good &= misfit < max(ORDINARY, UNUSUAL * float(np.median(misfit[good]))) if good.any() else False
             good = self._smooth(known, good)
             known[~good] = np.nan
             if int(good.sum()) <= before or good.sum() < 4:
@@ -139,10 +149,11 @@ class _Search:
         part = which[inside]
         patches = Patches(*(each[part] for each in self.patches))
         fit = fit_patches(self.image, start[inside], jacobians[inside], patches, radius)
-        good, corners = np.zeros(len(which), dtype=bool), np.full((len(which), 2), np.nan)
+        good, misfit = np.zeros(len(which), dtype=bool), np.full(len(which), np.inf)
+        corners = np.full((len(which), 2), np.nan)
         good[inside] = self._taken(fit, start[inside], scale[inside])
-        corners[inside] = fit.corners
-        return _Tried(corners, good)
+        corners[inside], misfit[inside] = fit.corners, fit.misfit
+        return _Tried(corners, good, misfit)
 
     def _taken(self, fit: Fitted, start: np.ndarray, scale: np.ndarray) -> np.ndarray:
         dark = -fit.contrast
@@ -167,6 +178,7 @@ class _Search:
 class _Tried(NamedTuple):
     corners: Float[np.ndarray, "n 2"]
     good: Shaped[np.ndarray, " n"]
+    misfit: Float[np.ndarray, " n"]
 
 
 def _agreeing(grey: UInt8[np.ndarray, "h w"], board: MarkedBoard, border: int) -> list[Marker]:

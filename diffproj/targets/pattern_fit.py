@@ -20,7 +20,7 @@ SMALLEST, LARGEST = 4.0, 12.0
 STEPS = 15
 """Most steps of the fit."""
 
-BEYOND = 8.0
+BEYOND = 6.0
 """Distance in px from the disc up to which lines of the print matter: of large tags most do not."""
 
 BLOCK = 40

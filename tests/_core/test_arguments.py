@@ -2,9 +2,11 @@
 
 import math
 
+import numpy as np
 import pytest
+import torch
 
-from diffproj._core.arguments import numbers
+from diffproj._core.arguments import called, number, numbers
 
 
 @pytest.mark.parametrize(
@@ -17,3 +19,39 @@ def test_one_wrong_number_of_several_is_told_with_what_was_wanted(value: object,
 
 def test_several_numbers() -> None:
     assert numbers("extent", [0, 1.5, 2], "three numbers", 3) == (0.0, 1.5, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "None"),
+        ("x", "'x'"),
+        (2.5, "2.5"),
+        (np.float64(2.5), "2.5"),
+        ("x" * 99, "a long str"),
+        (torch.Tensor, "the class Tensor"),
+        (torch.zeros(2, 3), "Tensor of shape (2, 3)"),
+        (np.zeros(4), "ndarray of shape (4,)"),
+        ([1, 2], "list"),
+        ({}, "dict"),
+    ],
+)
+def test_what_a_message_calls_a_value(value: object, text: str) -> None:
+    assert called(value) == text
+
+
+@pytest.mark.parametrize("value", [2.5, np.float32(2.5), np.array(2.5), torch.tensor(2.5)])
+def test_a_number_comes_in_many_forms(value: object) -> None:
+    assert number("step", value, "a number") == 2.5
+    with pytest.raises(ValueError, match="^step: want a number, got"):
+        number("step", value, "a number", above=2.5)
+    with pytest.raises(ValueError, match="^step: want a number, got"):
+        number("step", value, "a number", most=2.4)
+
+
+@pytest.mark.parametrize(
+    "value", [None, True, "2", [2.5], np.array([2.5]), np.array(True), torch.tensor([2.5]), torch.tensor(True), 1j]
+)
+def test_what_is_no_number_is_named(value: object) -> None:
+    with pytest.raises(TypeError, match="^step: want a number, got"):
+        number("step", value, "a number")

@@ -81,3 +81,36 @@ def test_poses_of_exact_homographies_and_of_none() -> None:
     extent = (BOARD.points - middle).abs().amax()
     torch.testing.assert_close(R[0, 0], torch.eye(3, dtype=D))
     torch.testing.assert_close((R @ middle + t)[0, 0], 10 * extent * torch.tensor([0.0, 0.0, 1.0], dtype=D))
+
+
+def test_boards_that_face_the_camera_are_found_upright() -> None:
+    """Turned within the image, before the camera or seen from behind, with corners hidden: exact."""
+    angles = torch.tensor([0.0, 0.7, 2.5, -1.2], dtype=D)
+    c, s, zero, one = angles.cos(), angles.sin(), torch.zeros(4, dtype=D), torch.ones(4, dtype=D)
+    front = torch.stack([c, -s, zero, s, c, zero, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
+    behind = front @ torch.tensor([1.0, -1, -1], dtype=D).diag()
+    R = torch.stack([front, behind])
+    t = torch.tensor([[30.0, -80, 700], [-200.0, 90, 2000]], dtype=D).unsqueeze(1).expand(2, 4, 3)
+    seen = BOARD.points @ R.mT + t.unsqueeze(-2)
+    used = torch.rand(2, 4, len(BOARD.points), generator=torch.Generator().manual_seed(0)) < 0.7
+    xy = torch.where(used.unsqueeze(-1), seen[..., :2] / seen[..., 2:], torch.nan)
+    found = closed_form.upright_poses(BOARD.points, xy, used)
+    torch.testing.assert_close(found[0], R, rtol=0, atol=1e-12)
+    torch.testing.assert_close(found[1], t, rtol=1e-12, atol=1e-9)
+
+
+def test_few_views_bring_their_homographies_along() -> None:
+    """Interpolated over lambda, they are those that the views give once undistorted."""
+    straight = cameras((600.0, 640.0)).project(BOARD.points)[0][:4].unsqueeze(0)
+    radius = 400.0
+    for lam in (-0.25, -0.15, -0.05):
+        centred = straight - MIDDLE
+        r = centred.norm(dim=-1, keepdim=True) / radius
+        seen = MIDDLE + centred / r * (1 - (1 - 4 * lam * r * r).sqrt()) / (2 * lam * r)
+        used = torch.ones_like(seen[..., 0], dtype=torch.bool)
+        found, H = closed_form.division(BOARD.points, seen, used, MIDDLE.expand(1, 2), radius)
+        back = closed_form.without_division(seen, MIDDLE.expand(1, 2), found, radius)
+        assert H is not None
+        mapped = torch.nn.functional.pad(BOARD.points[:, :2] - BOARD.points[:, :2].mean(0), (0, 1), value=1.0) @ H.mT
+        off = (mapped[..., :2] / mapped[..., 2:] - back).norm(dim=-1)
+        assert float(off.amax()) < 0.1  # px; measured: .027, .065 and .018

@@ -9,8 +9,10 @@ from torch import Tensor
 import diffproj as dp
 from diffproj import synthetic
 from diffproj.calibration.losses import Cauchy, Loss
+from diffproj.calibration.parametrisation import POSE
+from diffproj.calibration.solver import Solution, equations_at
 from diffproj.calibration.task import Task
-from diffproj.calibration.two_poses import posed, predicted_costs, view_costs, weak_perspective
+from diffproj.calibration.two_poses import found_again, posed, predicted_costs, view_costs, weak_perspective
 from diffproj.geometry.cayley import turned
 
 D = torch.float64
@@ -66,3 +68,25 @@ def test_how_far_perspective_tells_does_not_depend_on_where_the_axis_is() -> Non
         told.append(int(found.sum()))
     assert told[0] == 0  # near, perspective tells the poses apart
     assert max(told) == 5  # far off it does not
+
+
+@pytest.mark.parametrize("loss", [None, Cauchy(2.0)])
+def test_lost_views_are_found_again_from_four_corners_on(loss: Loss | None) -> None:
+    task, (R, t) = seen()
+    used = task.used.clone()
+    used[0, 1] = False
+    used[0, 1, [0, 8, 45, 53]] = True
+    used[0, 2, 3:] = False
+    task = replace(task, used=used, loss=loss)
+    away = turned(R, torch.tensor([0.0, 1.5, 0.5], dtype=D).expand(1, 5, 3)), t + 300
+    lost = torch.tensor([[False, True, True, False, True]])
+    which = lost[..., None]
+    moved = torch.where(which[..., None], away[0], R), torch.where(which, away[1], t)
+    none = torch.zeros(1, dtype=torch.int64)
+    equations = equations_at(task.problem, SHARED, moved, POSE, None, loss)
+    found = found_again(task, Solution(SHARED, moved, none.to(D), none, none, equations), lost).local
+    for view in (1, 4):  # as near to the truth as the noise of the corners lets it be
+        assert float((found[0][0, view] - R[0, view]).abs().amax()) < 0.05
+        assert float((found[1][0, view] - t[0, view]).norm() / t[0, view].norm()) < 0.02
+    assert torch.equal(found[0][0, 2], moved[0][0, 2])  # three corners tell no pose
+    assert torch.equal(found[1][0, [0, 2, 3]], moved[1][0, [0, 2, 3]])

@@ -114,6 +114,13 @@ def _spoilt_tensor(tensor: Tensor, draw: random.Random) -> Any:
     return draw.choice(ways)()
 
 
+def _objects(items: Sequence[Any]) -> np.ndarray:
+    array = np.empty(len(items), dtype=object)
+    for place, item in enumerate(items):
+        array[place] = item
+    return array
+
+
 def _spoilt_sequence(value: Any, draw: random.Random, strangers: Sequence[Any]) -> Any:
     kind, items = type(value), list(value)
     ways: list[Callable[[], Any]] = [
@@ -123,7 +130,7 @@ def _spoilt_sequence(value: Any, draw: random.Random, strangers: Sequence[Any]) 
         lambda: [items],
         lambda: None,
         lambda: iter(items),
-        lambda: np.array(items, dtype=object),
+        lambda: _objects(items),
         lambda: kind(),
     ]
     if items and all(isinstance(item, int | float) and not isinstance(item, bool) for item in items):

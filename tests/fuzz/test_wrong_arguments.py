@@ -592,6 +592,15 @@ def _uses(t: Things) -> dict[str, Call]:
             dp.LearnableCamera,
             {"camera": t.cameras, "learn": {"focal": True, "pose": [True, False, True, True]}, "tied_intrinsics": True},
         ),
+        "LearnableRig": Call(
+            dp.LearnableRig,
+            {
+                "rig": {"one": c, "two": c},
+                "learn": ("focal", "two.pose", "moments"),
+                "moments": [t.cameras.R, t.cameras.t],
+            },
+        ),
+        "LearnableRig[]": Call(dp.LearnableRig({"one": c, "two": c}).__getitem__, {"name": "one"}),
         "LearnablePlane": Call(dp.LearnablePlane, {"plane": t.planes, "scale": 2.0, "learn": [True, False]}),
         "PlaneLoss": Call(dp.PlaneLoss, {"loss": dp.Huber(1.0), "pull": 2.0}),
         "PlaneLoss()": Call(
@@ -723,6 +732,7 @@ NOT_CALLED = {
     "PlaneMap.unchecked",
     "PlaneMap.quietly",  # as the constructor
     "Camera.warped_by",
+    "torchvision_warp",  # which needs torchvision, and has a test of its own
     "Covariance.from_fields",  # of files
     "RigCalibration.from_fields",
     "SoftL1.value",  # as Huber's and Cauchy's

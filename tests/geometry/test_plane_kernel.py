@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from diffproj.geometry import plane_kernel_short
 from diffproj.geometry.plane_kernel import direct, recorded
 
 BATCHES = [((), ()), ((3,), (3,)), ((3,), ()), ((2, 3), (3,))]
@@ -20,9 +21,17 @@ def example(components: int, points: tuple[int, ...], maps: tuple[int, ...]) -> 
 @pytest.mark.parametrize("components", [2, 3])
 @pytest.mark.parametrize(("points", "maps"), BATCHES)
 @pytest.mark.parametrize("lens", [False, True])
+@pytest.mark.parametrize("short", [False, True])
 def test_the_short_way_gives_the_same(
-    components: int, points: tuple[int, ...], maps: tuple[int, ...], lens: bool
+    components: int,
+    points: tuple[int, ...],
+    maps: tuple[int, ...],
+    lens: bool,
+    short: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    if not short:  # as of many points
+        monkeypatch.setattr(plane_kernel_short, "SHORT", 0)
     p, matrix, seen = example(components, points, maps)
     seen = seen if lens else None
     (slow, valid), (fast, too) = recorded(p, matrix, seen), direct(p, matrix, seen)
@@ -66,3 +75,17 @@ def test_points_may_be_changed_in_place_before_the_gradient() -> None:
     points -= 1.0
     valid &= False
     torch.testing.assert_close(torch.autograd.grad(points.sum(), p)[0], expected)
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+@pytest.mark.parametrize("components", [2, 3])
+def test_a_point_is_the_same_to_rounding_however_many_there_are(
+    components: int, kind: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    p, matrix, seen = (part.detach() for part in example(components, (3,), (3,)))
+    p, matrix = p.to(kind), matrix.to(kind)
+    few = direct(p, matrix, seen)
+    monkeypatch.setattr(plane_kernel_short, "SHORT", 0)
+    many = direct(p, matrix, seen)
+    torch.testing.assert_close(few[0], many[0])
+    assert torch.equal(few[1], many[1])

@@ -407,3 +407,45 @@ def test_an_image_of_another_size_than_the_camera_is_refused() -> None:
     both = valid & too
     assert both.float().mean() > 0.5
     assert float((top - full).abs()[both.unsqueeze(1)].mean()) < 0.02
+
+
+def two_extents() -> tuple[torch.Tensor, torch.Tensor, dp.Camera]:
+    """Images of a camera at two poses, and extents of different sizes."""
+    camera = dp.stack([above(), above().shifted(torch.tensor([15.0, -10, 0], dtype=D))])
+    extents = torch.tensor([[-20.0, -20, 220, 140], [10, 5, 90, 65]], dtype=D)
+    return torch.stack([smooth(480, 640), smooth(480, 640)]), extents, camera
+
+
+@pytest.mark.parametrize("north_up", [False, True])
+def test_extents_of_different_sizes_fill_a_size_that_is_said(north_up: bool) -> None:
+    images, extents, camera = two_extents()
+    top, valid = dp.rectify(images, camera, dp.Plane.z(0.0), extents, size=(60, 40), north_up=north_up)
+    assert top.shape == (2, 1, 40, 60)
+    for i, extent in enumerate(extents.tolist()):
+        want, seen = dp.rectify(images[i], camera[i], dp.Plane.z(0.0), extent, size=(60, 40), north_up=north_up)
+        torch.testing.assert_close(top[i], want, rtol=0, atol=1e-9)
+        assert torch.equal(valid[i], seen)
+        again, _ = dp.rectify(images[i], camera[i], dp.Plane.z(0.0), extent, (4.0, 80 / 60)[i], north_up=north_up)
+        if i == 0:  # 240 x 160 at 4: the same pixels
+            torch.testing.assert_close(again, want, rtol=0, atol=1e-9)
+    back, shown = dp.render(top, camera, dp.Plane.z(0.0), extents, north_up=north_up)
+    for i, extent in enumerate(extents.tolist()):
+        want, seen = dp.render(top[i], camera[i], dp.Plane.z(0.0), extent, north_up=north_up)
+        torch.testing.assert_close(back[i], want, rtol=0, atol=1e-9)
+        assert torch.equal(shown[i], seen)
+
+
+@pytest.mark.plain
+def test_a_resolution_or_a_size() -> None:
+    images, extents, camera = two_extents()
+    for given, message in (
+        ({}, "resolution: want it, or the size .* got neither"),
+        ({"resolution": 2.0, "size": (60, 40)}, "got both"),
+        ({"resolution": 2.0}, "extent: want extents of one size, .* with size="),
+        ({"size": (0, 40)}, "size: want a positive"),
+        ({"size": (10**6, 10**6)}, "size: want one that fits into memory"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            dp.rectify(images, camera, dp.Plane.z(0.0), extents, **given)
+    with pytest.raises(ValueError, match="extent: want finite"):
+        dp.rectify(images, camera, dp.Plane.z(0.0), extents.flip(-1), size=(60, 40))

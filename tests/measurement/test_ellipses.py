@@ -90,6 +90,19 @@ def test_noise_that_cannot_be() -> None:
             dp.measure(FOOT, street(), dp.Plane.z(0.0), pixel_sigma=sigma)
 
 
+def test_each_pixels_covariance_is_judged_by_its_own_size() -> None:
+    pixels = FOOT.reshape(-1, 2)[:1].expand(3, 2)
+    good = T([[[4.0, 1], [1, 2]], [[1e-8, 2e-9], [2e-9, 3e-8]], [[1.0, 0], [0, 1e-12]]])
+    found = dp.measure(pixels, street(), dp.Plane.z(0.0), pixel_sigma=good)
+    alone = [dp.measure(pixels[:1], street(), dp.Plane.z(0.0), pixel_sigma=C.unsqueeze(0)) for C in good]
+    for each, one in zip(found.covariance, alone, strict=True):
+        torch.testing.assert_close(each, one.covariance[0], rtol=1e-9, atol=0)
+    uneven = good.clone()
+    uneven[1, 0, 1] = 3e-9
+    with pytest.raises(ValueError, match="want symmetric covariances"):
+        dp.measure(pixels, street(), dp.Plane.z(0.0), pixel_sigma=uneven)
+
+
 def test_a_camera_that_saw_nothing_does_not_stop_the_others() -> None:
     """Its points are not valid; theirs are what they are alone."""
     views, board = dp.example_views("left"), dp.Chessboard()

@@ -146,3 +146,15 @@ def test_the_command_says_so(tmp_path, capsys: pytest.CaptureFixture[str]) -> No
     points = json.loads(capsys.readouterr().out)["points"]
     assert [point["extrapolated"] for point in points] == [False, True, True]
     assert [len(point["interval_95"]) for point in points] == [3, 3, 3]
+
+
+def test_each_camera_of_a_batch_has_its_own_extrapolated_points() -> None:
+    calibration = dp.calibrate(dp.example_views("left"), BOARD, "brown4")
+    inside, outside = [330.0, 240.0], [8.0, 470.0]
+    places = torch.tensor([[inside, outside], [outside, inside]], dtype=D)
+    together = dp.measure(places, calibration, Z, pixel_sigma=0.0, view=0)
+    assert together.extrapolated is not None
+    assert together.extrapolated.tolist() == [[False, True], [True, False]]
+    for each in range(2):
+        alone = dp.measure(places[each, each : each + 1], calibration, Z, pixel_sigma=0.0, view=0)
+        torch.testing.assert_close(together.deviations[each, each], alone.deviations[0], rtol=1e-9, atol=0)

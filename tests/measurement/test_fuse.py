@@ -8,6 +8,7 @@ import torch
 
 import diffproj as dp
 from diffproj.measurement.agreement import _tail as tail
+from diffproj.measurement.fuse import MOST_POINTS
 
 D = torch.float64
 K = torch.tensor([[900.0, 0, 640], [0, 900, 480], [0, 0, 1]], dtype=D)
@@ -182,6 +183,9 @@ def test_it_refuses_what_cannot_be_joined() -> None:
         dp.fuse([first, exact])
     with pytest.raises(TypeError, match="got fused ones for camera 0; fuse all cameras at once"):
         dp.fuse([dp.fuse([first, second]), second])
+    many = dp.measure(pixels[:1].expand(MOST_POINTS + 1, 2), camera(PLACES[1]), GROUND, pixel_sigma=1.0)
+    with pytest.raises(ValueError, match=f"want at most {MOST_POINTS} points at once, got {MOST_POINTS + 1}"):
+        dp.fuse([many, many])
 
 
 @pytest.mark.plain

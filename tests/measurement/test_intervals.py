@@ -294,3 +294,42 @@ def test_nothing_measured() -> None:
     measured = dp.measure(torch.zeros(0, 2, dtype=D), FRONTAL, Z, pixel_sigma=SIGMA)
     assert measured.interval()[0].shape == (0, 3)
     assert measured.nonlinear.shape == (0,)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_the_worlds_unit_changes_nothing(unit: float) -> None:
+    pixels = torch.tensor([[320.0, 250], [300, 260]], dtype=D)
+    usual, other = (
+        dp.measure(pixels, LEVEL, dp.Plane([0.0, 1.0, 0.0], scale * 1500.0), pixel_sigma=1.0) for scale in (1.0, unit)
+    )
+    for first, second in (
+        (usual.lengths(), other.lengths()),
+        (usual.quantity(lambda p: p[1, 2], [[0, 1]]), other.quantity(lambda p: p[1, 2], [[0, 1]])),
+    ):
+        assert first.nonlinear.all()
+        for bound, there in zip(first.interval(), second.interval(), strict=True):
+            torch.testing.assert_close(there / unit, bound, rtol=1e-9, atol=0)
+
+
+def test_without_a_slope_no_direction_is_better_than_another() -> None:
+    """A square at its smallest value: both sides of the interval are those of the mean square of what noise does."""
+    measured = dp.measure(torch.tensor([[320.0, 240]], dtype=D), FRONTAL, Z, pixel_sigma=SIGMA)
+    square = measured.quantity(lambda p: p[0, 0].square(), [[0]])
+    # Along x the point is known to 1 mm, and across it the square stays.
+    assert [float(value) for value in (square.value, square.deviation)] == pytest.approx([0, 1])
+    assert [float(bound) for bound in square.interval()] == pytest.approx([-1.959964, 1.959964])
+
+
+def test_degrees_of_freedom_of_what_is_known_in_part() -> None:
+    """Welch and Satterthwaite: those of the estimated part over the square of its share of the variance."""
+    views, board = dp.example_views("left"), dp.Chessboard()
+    located = dp.locate(views[3], board, dp.calibrate(views, board).camera)
+    assert located.degrees_of_freedom is not None
+    pixels = views.pixels[3, [0, 8]]
+    estimated, both = (dp.measure(pixels, located, Z, pixel_sigma=sigma).lengths() for sigma in (0.0, 0.02))
+    share = (estimated.deviation / both.deviation).square()
+    assert 0.5 < float(share) < 0.95
+    assert estimated.degrees_of_freedom is not None
+    assert both.degrees_of_freedom is not None
+    torch.testing.assert_close(estimated.degrees_of_freedom, located.degrees_of_freedom.reshape(1))
+    torch.testing.assert_close(both.degrees_of_freedom, located.degrees_of_freedom / share.square())

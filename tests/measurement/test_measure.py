@@ -369,3 +369,12 @@ def test_many_plane_covariances() -> None:
         one = dp.measure(pixels, calibration, plane, view=0, plane_covariance=covariance)
         torch.testing.assert_close(found, one.deviations, rtol=1e-12, atol=0)
     assert many.lengths().interval()[0].shape == (2, 2)
+
+
+def test_joint_covariance_of_many_is_that_of_each(calibration: dp.Calibration) -> None:
+    pixels = calibration.views.pixels[:2, [0, 8, 45, 53, 20]]
+    together = dp.measure(pixels, calibration, Z, view=0, pixel_sigma=0.5)
+    assert together.joint().shape == (2, 15, 15)
+    for each in range(2):
+        alone = dp.measure(pixels[each], calibration, Z, view=0, pixel_sigma=0.5)
+        torch.testing.assert_close(together.joint()[each], alone.joint(), rtol=1e-9, atol=1e-15)

@@ -1,5 +1,5 @@
 # pyright: strict
-"""What a user writes, for type checkers in their strict mode: `test_typing.py` runs them, nobody runs this."""
+"""What a user writes, for type checkers in their strict mode (`test_style.py`, `test_typing.py`): nobody runs this."""
 
 from collections.abc import Sequence
 
@@ -42,6 +42,14 @@ def straightened(camera: dp.Camera, pixels: Tensor) -> Tensor:
     return undistorted
 
 
+def rigs(pair: dict[str, dp.Views]) -> list[float]:
+    board = dp.Chessboard()
+    one = dp.calibrate_rig(pair, board, shape="free", priors={"points": 0.1})
+    many = dp.calibrate_rig([pair, pair], board, shape="bow")
+    print(one.summary(), one.points_deviation.amax())
+    return [float(rig.baseline("left", "right").length) for rig in many if isinstance(rig, dp.RigCalibration)]
+
+
 class Network(nn.Module):
     def __init__(self, camera: dp.Camera) -> None:
         super().__init__()
@@ -60,6 +68,11 @@ def trained(camera: dp.Camera, calibration: dp.Calibration, features: Tensor, ta
     moved: dp.Camera = learnable()
     plane: dp.Plane = dp.LearnablePlane(dp.Plane.z(0.0))()
     print(moved.size, plane.offset)
+    moving = dp.LearnableRig(
+        {"left": camera, "right": camera}, ("focal", "right.pose", "moments"), (camera.R, camera.t)
+    )
+    placed: dict[str, dp.Camera] = moving()
+    print(placed["left"].center, moving["right"].rotation, moving.names)
     total = loss(points, target) + prior(learnable())
     (slope,) = torch.autograd.grad(total, [network.heads.weight])
     return slope

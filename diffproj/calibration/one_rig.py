@@ -1,0 +1,116 @@
+"""One rig: each camera on its own, the best-connected pairs chained, all refined together, and the target's shape."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from diffproj.calibration.options import Options
+from diffproj.calibration.parametrisation import Parametrisation
+from diffproj.calibration.result import CalibrationError
+from diffproj.calibration.rig_alone import Alone, Asked, alone, checked_cameras, lenses
+from diffproj.calibration.rig_fit import rig_fit
+from diffproj.calibration.rig_options import held, held_places, held_points
+from diffproj.calibration.rig_outcome import rig_outcome
+from diffproj.calibration.rig_problem import RigParameters
+from diffproj.calibration.rig_result import RigCalibration
+from diffproj.calibration.rig_shape import with_bow, with_known_points, with_points
+from diffproj.calibration.rig_start import rig_start
+from diffproj.calibration.rig_views import Moments, rig_views
+from diffproj.calibration.solver import Status
+from diffproj.lens.models import LensModel
+from diffproj.targets.target import Target
+from diffproj.targets.views import Views
+
+
+@dataclass(frozen=True, eq=False)
+class RigTask:
+    """What is asked of a rig, checked.
+
+    Attributes:
+        asked: of its cameras, each on its own.
+        parameters: the shared unknowns.
+        positions: of those that are held.
+        held_points: coordinates of free points that are, numbers from 0.
+        moved: how far the target's points are known to lie from where it has them `(N, 3)`, if they do.
+    """
+
+    asked: Asked
+    parameters: RigParameters
+    positions: list[int]
+    held_points: list[int]
+    moved: Tensor | None = None
+
+
+def rig_calibrated(
+    views_by_camera: Mapping[str, Views],
+    target: Target,
+    distortion: LensModel | Mapping[str, LensModel],
+    moments: Moments | None,
+    cameras: Any,
+    chosen: Options,
+    who: str,
+    moved: Tensor | None = None,
+) -> RigCalibration:
+    """What `calibrate_rig` promises, for checked options; errors name `who` was asked.
+
+    With `moved (N, 3)` the target's points are known to lie so far from where it has them.
+    """
+    task = rig_task(views_by_camera, target, distortion, moments, cameras, chosen, who, moved)
+    return finished(task, alone(task.asked))
+
+
+def rig_task(
+    views_by_camera: Mapping[str, Views],
+    target: Target,
+    distortion: LensModel | Mapping[str, LensModel],
+    moments: Moments | None,
+    cameras: Any,
+    chosen: Options,
+    who: str,
+    moved: Tensor | None = None,
+) -> RigTask:
+    """What is asked, looked at; nothing is computed yet."""
+    views = rig_views(views_by_camera, target, moments, chosen.weights, who)
+    known = checked_cameras(cameras, views.names)
+    lens = lenses(distortion, views.names)
+    # What is held has to be known by camera before each is calibrated on its own; a known camera brings its lens.
+    kinds = {name: Parametrisation.of(known[name]) if name in known else Parametrisation(lens[name]) for name in lens}
+    parameters = RigParameters(views.names, tuple(kinds.values()))
+    shaped = chosen.shape != "flat" or moved is not None
+    if shaped and bool((views.data[views.names[0]].given_points.detach()[:, 2] != 0).any()):
+        raise ValueError(f"shape: want 'flat' for points that are not all on z = 0, got {chosen.shape!r}")
+    fixed, points = held_points(chosen.fixed, len(views.points))
+    names, positions = held(parameters, fixed)
+    return RigTask(Asked(views, target, lens, known, names, chosen, who), parameters, positions, points, moved)
+
+
+def finished(task: RigTask, own: Mapping[str, Alone]) -> RigCalibration:
+    """The rig, from its cameras on their own.
+
+    Raises:
+        CalibrationError: there is none, or it did not converge, if that is to be raised.
+    """
+    views, chosen, who = task.asked.views, task.asked.options, task.asked.who
+    seen = {name: one.seen for name, one in own.items()}
+    start = rig_start(views, seen, held_places(task.parameters, task.positions, task.asked.known), who)
+    found = rig_fit(
+        views,
+        task.parameters,
+        {name: one.shared for name, one in seen.items()},
+        start,
+        {name: one.used for name, one in seen.items()},
+        task.positions,
+        chosen,
+    )
+    if task.moved is not None:
+        found = with_known_points(found, task.moved, chosen)
+    elif chosen.shape == "bow":
+        found = with_bow(found, chosen)
+    elif chosen.shape == "free":
+        found = with_points(found, task.held_points, chosen)
+    rig = rig_outcome(found, own)
+    if chosen.throw and rig.status != Status.CONVERGED:
+        raise CalibrationError(f"{who}: {rig.message}", rig)
+    return rig

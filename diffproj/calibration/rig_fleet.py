@@ -1,0 +1,86 @@
+"""Many rigs: their cameras on their own are calibrated side by side, then each rig is refined together, one by one.
+
+Half of a rig's time goes into its cameras on their own, which a batch has cheaper; a rig's own minimum is one problem
+of many unknowns, which another rig's does not make cheaper.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from diffproj._core.arguments import called
+from diffproj.calibration.one_rig import RigTask, finished, rig_task
+from diffproj.calibration.options import Options
+from diffproj.calibration.result import CalibrationError
+from diffproj.calibration.rig_alone import alone_together
+from diffproj.calibration.rig_result import RigCalibration
+from diffproj.targets.target import Target
+
+
+def each_rig(
+    rigs: Sequence[Any], target: Target, distortion: Any, moments: Any, cameras: Any, chosen: Options, who: str
+) -> list[RigCalibration | CalibrationError]:
+    """Each rig, or why there is none, in their order.
+
+    Args:
+        rigs: the views by camera of each.
+        target: what they all show.
+        distortion: the lens, or one by camera, for all rigs.
+        moments: of the views of all rigs, or a list with those of each.
+        cameras: known beforehand in all rigs, or a list with those of each.
+        chosen: the options; the weights may be a list, too.
+        who: was asked, for messages.
+
+    Raises:
+        TypeError: an element is no mapping, or something in it is of another type.
+        ValueError: a list of another length, or no rig fits together.
+    """
+    for number, views in enumerate(rigs):
+        if not isinstance(views, Mapping):
+            raise TypeError(
+                f"views_by_camera[{number}]: want a mapping from names of cameras to dp.Views, got {called(views)}"
+            )
+    own = {
+        "moments": _of_each("moments", moments, len(rigs)),
+        "cameras": _of_each("cameras", cameras, len(rigs)),
+        "weights": _of_each("weights", chosen.weights, len(rigs)),
+    }
+    tasks: dict[int, RigTask] = {}
+    found: dict[int, RigCalibration | CalibrationError] = {}
+    mistakes: list[ValueError] = []
+
+    def refused(number: int, error: ValueError) -> None:
+        mistakes.append(error)
+        found[number] = CalibrationError(f"{who}: of rig {number}, {error}")
+
+    for number, views in enumerate(rigs):
+        mine = chosen.but(weights=own["weights"][number], progress=None)
+        try:
+            tasks[number] = rig_task(
+                views, target, distortion, own["moments"][number], own["cameras"][number], mine, who
+            )
+        except ValueError as error:
+            refused(number, error)
+    together = alone_together([task.asked for task in tasks.values()])
+    for (number, task), cameras_alone in zip(tasks.items(), together, strict=True):
+        try:
+            if isinstance(cameras_alone, Exception):
+                raise cameras_alone
+            found[number] = finished(task, cameras_alone)
+        except CalibrationError as error:
+            found[number] = error
+        except ValueError as error:
+            refused(number, error)
+        if chosen.progress is not None:
+            chosen.progress(len(found), len(rigs))
+    if rigs and len(mistakes) == len(rigs):
+        raise mistakes[0]
+    return [found[number] for number in range(len(rigs))]
+
+
+def _of_each(argument: str, given: Any, count: int) -> list[Any]:
+    """One for each rig: of a list its elements, of anything else itself."""
+    if not isinstance(given, list | tuple):
+        return [given] * count
+    if len(given) != count:
+        raise ValueError(f"{argument}: want a list of {count}, one for each rig, got {len(given)}")
+    return list(given)

@@ -1,0 +1,66 @@
+"""How starts are compared, and of two fits that reject different corners the lower one is kept."""
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffproj as dp
+from diffproj import synthetic
+from diffproj.calibration.fit import Fit
+from diffproj.calibration.parametrisation import POSE
+from diffproj.calibration.second_look import ALIKE, BEST, _first_of_alike, lower_fit, lowest
+from diffproj.calibration.solver import Solution, equations_at
+from diffproj.calibration.task import Task
+
+D = torch.float64
+BOARD = dp.Chessboard()
+SHARED = torch.tensor([[600.0, 640.0, 310.0, 250.0]], dtype=D)
+
+
+def test_of_starts_that_lead_to_one_place_the_first_goes_on() -> None:
+    low, alike, high = 2.0, 2.0 * (1 + ALIKE / 2), 2.0 * (1 + 3 * ALIKE)
+    costs = torch.tensor([[low, high], [alike, low], [high, alike], [low, high]], dtype=D)
+    assert _first_of_alike(costs).tolist() == [[True, True], [False, True], [True, False], [False, False]]
+
+
+def test_the_lowest_places_of_a_grid_are_its_valleys() -> None:
+    """Then the lowest of the other nodes."""
+    costs = torch.tensor([5.0, 3.0, 4.0, 1.0, 2.0, torch.nan, 6.0], dtype=D).unsqueeze(-1)
+    assert lowest(costs).squeeze(-1).tolist() == [3, 1, 4, 2, 0, 6, 5][:BEST]
+
+
+def fit_of(task: Task, shared: Tensor, poses: tuple[Tensor, Tensor], left_out: Tensor) -> Fit:
+    """As if it had ended there, without those corners `(P, V, N)`."""
+    problem = task.problem
+    P = len(shared)
+    seen = task.used & ~left_out
+    residual = problem.linearise(shared, poses)[:, :, -1].square().sum(2)
+    cost = torch.where(seen, residual, 0.0).sum((-2, -1)) / 2
+    none = torch.zeros(P, dtype=torch.int64)
+    solution = Solution(shared, poses, cost, none, none, equations_at(problem, shared, poses, POSE, None, None))
+    cut = Task(task.points, task.pixels, seen, task.lens)
+    return Fit(cut, solution, left_out)
+
+
+@pytest.mark.parametrize("reject", [None, 3.0])
+def test_a_fit_is_no_better_for_the_corners_it_rejects(reject: float | None) -> None:
+    """Of two cameras the second is better off with the other fit; of the first that is wrong, and rejects what tells."""
+    f_x, f_y, c_x, c_y = SHARED[0].tolist()
+    K = torch.tensor([[f_x, 0, c_x], [0, f_y, c_y], [0, 0, 1]], dtype=D)
+    cameras = synthetic.random_cameras(dp.Camera(K, size=(640, 480)), BOARD, 3, seed=2)
+    views = synthetic.corner_views(cameras, BOARD, noise_px=0.2, seed=2)
+    poses = cameras.R.expand(2, 3, 3, 3), cameras.t.expand(2, 3, 3)
+    task = Task(BOARD.points, views.pixels.expand(2, 3, -1, 2), views.visible.expand(2, 3, -1), "none")
+    shared, wrong = SHARED.expand(2, 4).clone(), SHARED.expand(2, 4) * torch.tensor([1.003, 1.003, 1, 1], dtype=D)
+    none = torch.zeros_like(task.used)
+    many = none.clone()
+    many[:, :, 6:] = True
+    found = fit_of(task, torch.stack([shared[0], wrong[1]]), poses, none)
+    other = fit_of(task, torch.stack([wrong[0], shared[1]]), poses, torch.stack([many[0], none[1]]))
+    assert float(other.solution.cost[0]) < float(found.solution.cost[0])
+    kept = lower_fit(found, other, torch.arange(2), reject)
+    torch.testing.assert_close(kept.solution.shared[1], shared[1])
+    assert torch.equal(kept.rejected[1], none[1])
+    first, rejected = (wrong, many) if reject is None else (shared, none)
+    torch.testing.assert_close(kept.solution.shared[0], first[0])
+    assert torch.equal(kept.rejected[0], rejected[0])
