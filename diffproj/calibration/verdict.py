@@ -51,7 +51,8 @@ LANDMARKS_REMEDY = (
 )
 LEFT_HANDED = (
     "the corners fit the mirror image of the landmarks and not the landmarks: their coordinates are left-handed; "
-    "exchange x and y, or change the sign of one of them (with z up, x east and y north are right-handed)"
+    "exchange x and y, or change the sign of one of them (with z up, x east and y north are right-handed); or are u "
+    "and v exchanged?"
 )
 
 ONE_VIEW = (
