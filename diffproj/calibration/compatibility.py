@@ -21,7 +21,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from diffproj.calibration.covariance import local_inverse, zero_where_infinite
+from diffproj.calibration.covariance import zero_where_infinite
+from diffproj.calibration.eliminated import local_inverse
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.leftover import f_deviations
 from diffproj.calibration.mismatch import Mismatch, none_at_all

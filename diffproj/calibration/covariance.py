@@ -32,12 +32,10 @@ from diffproj._core.arguments import instance, position
 from diffproj._core.copying import Copied
 from diffproj._core.numerics import broadcast_batches
 from diffproj._core.shown import Shown, counted, number
+from diffproj.calibration.eliminated import inverse, reduced
 from diffproj.calibration.fields import mask, tensor
 from diffproj.calibration.shape import AXES, names_of
 from diffproj.calibration.solver import Equations
-
-SINGULAR = 2e-15
-"""Eigenvalue of S, scaled by the diagonal of U, at and below which it is rounding error."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -328,7 +326,7 @@ def covariance(
         if scores is not None:
             scores = Scores(T.unsqueeze(1) @ scores.U @ basis.unsqueeze(1), T.unsqueeze(1) @ scores.E, scores.W)
     share = torch.ones_like(F[..., :1, :1]) if shares is None else shares[..., None, None]
-    inverse_S, unknown = _inverse(S, size)
+    inverse_S, unknown = inverse(S, size)
     prior = torch.zeros_like(S) if precision is None else precision
     if scores is None:
         v = variance[:, None, None] * phi
@@ -358,21 +356,6 @@ def covariance(
     return Covariance(tuple(names), shared, unknown, unknown_views, dispersion, follow, mixed, (alone + alone.mT) / 2)
 
 
-def reduced(equations: Equations, basis: Tensor | None, shares: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The normal matrix S of the free shared parameters `(P, q, q)` with all poses eliminated.
-
-    With it F `(P, V, q, 6)`, the inverses of the poses' blocks, and which of these are singular.
-    """
-    U, E, W = equations.U, equations.E, equations.W
-    if basis is not None:
-        U, E = basis.mT @ U @ basis, basis.mT.unsqueeze(1) @ E
-    inverse_W, unknown_views = local_inverse(W)
-    F = E @ inverse_W
-    counted = F if shares is None else F * shares[..., None, None]
-    S = U - counted.movedim(1, 2).flatten(2) @ E.movedim(1, 2).flatten(2).mT
-    return S, F, inverse_W, unknown_views
-
-
 def reshaped(covariance: Covariance, batch: Sequence[int]) -> Covariance:
     """The covariance of `(P, ...)` problems with the batch shape `*B` in the place of P."""
     parts = {
@@ -380,31 +363,3 @@ def reshaped(covariance: Covariance, batch: Sequence[int]) -> Covariance:
         for name in ("shared", "undetermined", "undetermined_views", "dispersion", "_follow", "_mixed", "_alone")
     }
     return Covariance(covariance.names, **parts)
-
-
-def _inverse(S: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """The (pseudo-)inverse `(P, q, q)`, and which unknowns are undetermined `(P, q)`; `size` scales the unknowns."""
-    sound = S.isfinite().all(-1).all(-1)
-    S = torch.where(sound[:, None, None], S, torch.eye(S.shape[-1], dtype=S.dtype, device=S.device))
-    scale = torch.where((size > 0) & size.isfinite(), size, 1.0).rsqrt()
-    values, vectors = torch.linalg.eigh(S * scale.unsqueeze(-1) * scale.unsqueeze(-2))
-    lost = values <= SINGULAR
-    inverse = (
-        vectors @ torch.diag_embed(torch.where(lost, 0.0, torch.where(lost, 1.0, values).reciprocal())) @ vectors.mT
-    )
-    unknown = ((vectors.square() * lost.unsqueeze(-2)).sum(-1) > 1e-6) | ~sound.unsqueeze(-1)
-    return inverse * scale.unsqueeze(-1) * scale.unsqueeze(-2), unknown
-
-
-def local_inverse(W: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverses of the poses' blocks `(P, V, 6, 6)`, 0 for a singular block, and which blocks are singular."""
-    size = W.diagonal(dim1=-2, dim2=-1)
-    scale = torch.where((size > 0) & size.isfinite(), size, 1.0).rsqrt()
-    scaled = W * scale.unsqueeze(-1) * scale.unsqueeze(-2)
-    L, failed = torch.linalg.cholesky_ex(torch.where(scaled.isfinite(), scaled, 0.0))
-    # With a unit diagonal, a pivot of the size of rounding errors means that the pose is not determined.
-    unknown = (failed > 0) | (L.diagonal(dim1=-2, dim2=-1).square() <= 1e-13).any(-1)
-    identity = torch.eye(W.shape[-1], dtype=W.dtype, device=W.device)
-    L = torch.where(unknown[..., None, None], identity, L)
-    inverse = torch.cholesky_inverse(L) * scale.unsqueeze(-1) * scale.unsqueeze(-2)
-    return torch.where(unknown[..., None, None], 0.0, inverse), unknown

@@ -30,7 +30,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffproj.calibration.covariance import local_inverse, reduced
+from diffproj.calibration.eliminated import local_inverse, reduced
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.losses import slope_and_bend
 from diffproj.calibration.parametrisation import INTRINSICS

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from diffproj.calibration import covariance as covariances
 from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.eliminated import reduced
 from diffproj.calibration.options import Progress
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.solver import Solution, select
@@ -136,7 +137,7 @@ class Fit:
         Of a coordinate that both tell, the part that the prior does: the trace of its precision over all precision.
         """
         few, basis, restraint = self.task.parameters.few, self.task.basis, self.task.restraint
-        S = covariances.reduced(self.solution.equations, basis, self.task.shares)[0]
+        S = reduced(self.solution.equations, basis, self.task.shares)[0]
         if restraint is None:
             return torch.zeros_like(S[:, 0, 0])
         told = torch.nn.functional.pad(restraint.precision, (few, 0, few, 0))

@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffproj.calibration.covariance import Covariance, Scores, covariance, local_inverse, reduced, reshaped
+from diffproj.calibration.covariance import Covariance, Scores, covariance, reshaped
 from diffproj.calibration.dispersion import FEW_VIEWS, FEW_VIEWS_OF_A_SHAPE, believed, contradiction
+from diffproj.calibration.eliminated import local_inverse, reduced
 from diffproj.calibration.losses import slope_and_bend
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.rig_fit import RigFit
