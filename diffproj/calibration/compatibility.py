@@ -7,13 +7,10 @@ Two tests of the residuals of each view, whose pose was free, by the covariance 
 * Those that other intrinsics would explain: their pull `u = J^T r` has the covariance `phi v S + S Sigma S`, with
   `S = J^T J` and phi the dispersion, by which views of one camera contradict each other. Noise that is larger in this
   photograph than in the calibration's counts as noise: it is taken from what other intrinsics would not explain.
-  Another camera adds `S T S`, with T how far two of them differ. So the pull is taken apart into independent directions
-  in which that is lambda times the covariance, and each weighs `lambda / (1 + lambda)`: one in which another camera
-  would hardly be seen only adds noise. (Of a Gaussian difference, this is the test of the likelihood ratio.)
 
 The second is sharp: of 13 photographs by the other camera of a stereo pair, whose focal length differs by 1 %, it knows
-every one, by 3.3 deviations and more, and none of the camera's own 13, each left out of the calibration, by up to 2.4.
-Their residuals alone overlap: 1.35 to 3.2 times those of the calibration against up to 1.43.
+every one, and none of the camera's own 13, each left out of the calibration. Their residuals alone overlap: 1.35 to 3.2
+times those of the calibration against up to 1.43.
 """
 
 from collections.abc import Sequence
@@ -38,11 +35,8 @@ LARGE, VARIED = 1.7, 1.4
 which the noise of photographs by one camera varies, so that chance alone has to be beyond that."""
 NOTABLE = 1.25
 """The same for residuals that other intrinsics would explain."""
-CHANCE, SELDOM, RARE = 2.33, 2.58, 3.09
-"""Standard deviations that a normal variable exceeds by chance in 1 %, in 0.5 % and in 0.1 % of all cases."""
-ZOOM, ASPECT, OFF = 0.02, 0.005, 0.02
-"""How far the intrinsics of two cameras of one make differ, as standard deviations in parts of the focal length: both
-focal lengths alike, each by itself, and the principal point. Their lenses are as alike as these."""
+CHANCE, RARE = 2.33, 3.09
+"""Standard deviations that a normal variable exceeds by chance in 1 % and in 0.1 % of all cases."""
 FEWEST_VIEWS = 3
 """Views of a calibration below which nothing is known of how far views contradict each other."""
 SINGULAR = 1e-9
@@ -84,14 +78,14 @@ def _compared(found: Fit, known: Calibration, usual: Noise, batch: tuple[int, ..
         s = rows.shape[2]
         Sigma, phi = of_each(covariance.shared[..., :s, :s], 2), of_each(covariance.dispersion)
         Sigma = zero_where_infinite(Sigma)
-        pulls, open_, rank, other = _pulls(rows, pose, residual, variance, Sigma, _differences(found))
-        squares = pulls.square()
-        beside = total - (squares - squares / (1 + open_)).sum(-1)
-        noise = ((total - squares.sum(-1)) / (spare - rank).clamp(min=1)).clamp(min=1)
-        pull, directions = _weighed(pulls, (phi.unsqueeze(-1) + open_) * noise.unsqueeze(-1), other)
+        pulls, open_, rank = _pulls(rows, pose, residual, variance, Sigma)
+        beside = total - (pulls - pulls / (1 + open_)).sum(-1)
+        noise = ((total - pulls.sum(-1)) / (spare - rank).clamp(min=1)).clamp(min=1)
+        pulls, open_ = (part / phi.unsqueeze(-1) for part in (pulls, open_))
+        pull = (pulls / (1 + open_)).sum(-1) / (rank.clamp(min=1) * noise)
         views = of_each(known.used.any(-1).sum(-1))
         contradictions = ((views - 1) * (Sigma.diagonal(dim1=-2, dim2=-1) > 0).sum(-1)).clamp(min=1)
-        elsewhere = f_deviations(pull, directions, contradictions) > SELDOM
+        elsewhere = f_deviations(pull, rank.clamp(min=1).to(pull), contradictions) > CHANCE
         elsewhere &= (notable > NOTABLE**2) & (f_deviations(notable, spare, freedom) > RARE)
         elsewhere &= (rank > 0) & (views >= FEWEST_VIEWS)
         scale = scale.maximum((pull * noise).sqrt())
@@ -115,25 +109,12 @@ def _derivatives(found: Fit) -> tuple[Tensor, Tensor, Tensor]:
     return panel[:, :, :s], panel[:, :, s:-1], panel[:, :, -1:]
 
 
-def _differences(found: Fit) -> Tensor:
-    """The covariance of what the intrinsics of two cameras differ by, `(P, 1, s, s)`: T above."""
-    shared, s = found.solution.shared.detach(), found.task.parameters.few
-    f = shared[:, :2]
-    T = shared.new_zeros(len(shared), s, s)
-    T[:, :2, :2] = (ZOOM * f).unsqueeze(-1) * (ZOOM * f).unsqueeze(-2)
-    apart = torch.cat([ASPECT * f, OFF * f, torch.zeros_like(shared[:, 4:s])], dim=-1)
-    return (T + torch.diag_embed(apart.square())).unsqueeze(1)
-
-
-def _pulls(
-    A: Tensor, Z: Tensor, r: Tensor, variance: Tensor, Sigma: Tensor, T: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _pulls(A: Tensor, Z: Tensor, r: Tensor, variance: Tensor, Sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The pull of each view on the intrinsics, in independent directions.
 
     Returns:
-        It `(P, V, s)` in units of the noise's deviation; how many times its variance the calibration leaves open
-        there `(P, V, s)`; how many directions the view tells anything of `(P, V)`; and the covariance that another
-        camera would add `(P, V, s, s)`.
+        Its squares `(P, V, s)` in units of the noise's variance; how many times that variance the calibration leaves
+        open there `(P, V, s)`; and how many directions the view tells anything of `(P, V)`.
     """
     eliminated = A @ Z.mT @ local_inverse(Z @ Z.mT)[0]
     S = A @ A.mT - eliminated @ (Z @ A.mT)
@@ -142,23 +123,8 @@ def _pulls(
     values, vectors = torch.linalg.eigh((S * size * size.mT).nan_to_num(0.0, 0.0, 0.0))
     told = values > SINGULAR * values[..., -1:].clamp(min=1e-300)
     white = torch.where(told, values.clamp(min=1e-300).rsqrt(), 0.0).unsqueeze(-1) * (vectors * size).mT
-    through = white @ S
-    open_, turn = torch.linalg.eigh((through @ Sigma @ through.mT).nan_to_num(0.0, 0.0, 0.0))
-    noise, along = variance.unsqueeze(-1), turn.mT @ through
-    other = (along @ T @ along.mT).nan_to_num(0.0, 0.0, 0.0) / noise.unsqueeze(-1)
-    return (turn.mT @ (white @ u)).squeeze(-1) / noise.sqrt(), open_.clamp(min=0) / noise, told.sum(-1), other
-
-
-def _weighed(pulls: Tensor, usual: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-    """The pulls' mean square over their usual variances, weighed by what another camera would add to these.
-
-    Returns:
-        It `(P, V)`, and of how many directions it is a mean (Satterthwaite 1946).
-    """
-    deviation = usual.sqrt()
-    values, turn = torch.linalg.eigh(other / deviation.unsqueeze(-1) / deviation.unsqueeze(-2))
-    squares = (turn.mT @ (pulls / deviation).unsqueeze(-1)).squeeze(-1).square()
-    weight = values.clamp(min=0) / (1 + values.clamp(min=0))
-    total = weight.sum(-1).clamp(min=1e-300)
-    directions = total.square() / weight.square().sum(-1).clamp(min=1e-300)
-    return (weight * squares).sum(-1) / total, directions.clamp(min=1)
+    spread = white @ S @ Sigma @ S @ white.mT
+    open_, turn = torch.linalg.eigh(spread.nan_to_num(0.0, 0.0, 0.0))
+    squares = (turn.mT @ (white @ u)).squeeze(-1).square()
+    noise = variance.unsqueeze(-1)
+    return squares / noise, open_.clamp(min=0) / noise, told.sum(-1)

@@ -90,7 +90,7 @@ def told_of_shape(found: RigFit) -> float:
     over all precision.
     """
     if found.parameters.bow:
-        free = torch.ones(2) if found.basis is None else found.basis[0, -2:].abs().sum(-1)
+        free = found.shared.new_ones(2) if found.basis is None else found.basis[0, -2:].abs().sum(-1)
         return float(free.sum())
     if found.restraint is None:
         return 0.0

@@ -97,8 +97,8 @@ def warped(
     if wants_derivative(*given) or not has_values(*given):
         return tuple(part.to(K.dtype) for part in _warped(torch, *map(in_float64, given)))  # type: ignore[return-value]
     library, arrays = arrays_of(*given, double=True)
-    upper, Q = _warped(library, *arrays)
-    return torch.as_tensor(upper).to(K), torch.as_tensor(Q).to(K)
+    upper, Q = (torch.as_tensor(part, dtype=K.dtype, device=K.device) for part in _warped(library, *arrays))
+    return upper, Q
 
 
 def _warped(library: Any, K: Any, matrix: Any, ahead: Any) -> tuple[Any, Any]:

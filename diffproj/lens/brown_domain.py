@@ -88,7 +88,7 @@ def domain_radius(coefficients: Tensor) -> Tensor:
             scale = length_scale(values)
             grid = radius_grid(scale, 10 * last_crossing(values))
             found = _radius(scale, *first_failure(_ClosedForm(values), grid))
-        return torch.as_tensor(found, dtype=coefficients.dtype) if library is np else found
+        return torch.as_tensor(found, dtype=coefficients.dtype, device=coefficients.device) if library is np else found
     if coefficients.ndim > 1:
         blocks = coefficients.flatten(0, -2).split(BLOCK_LENSES)
         return torch.cat([_by_circles(block) for block in blocks]).reshape(coefficients.shape[:-1])

@@ -48,14 +48,10 @@ def test_every_photograph_of_the_other_camera_is_warned_of(calibration: dp.Calib
         assert "another camera" in found.message
 
 
-def test_the_other_camera_is_told_by_its_focal_length_and_axis(calibration: dp.Calibration) -> None:
-    """What the two differ by weighs most. Measured: 10 of 13 the other way round; 9 if all weighed alike."""
-    crossed, warned = located(LEFT, BOARD, dp.calibrate(RIGHT, BOARD))
-    assert warned == 1
-    assert int(crossed.mismatch.doubtful.sum()) >= 10
-    for zoom in (1.05, 1 / 1.05):  # measured: 12 and 10; a view from straight ahead tells little of it
-        assert int(located(changed(calibration, zoom=zoom), BOARD, calibration)[0].mismatch.doubtful.sum()) >= 9
-    assert not located(changed(calibration, zoom=1.003), BOARD, calibration)[1]
+def test_few_views_of_a_calibration_raise_no_alarm() -> None:
+    """Of the bundled views the eighth contradicts the others most; it is their camera's all the same."""
+    for count in (5, 6):
+        assert not located(LEFT[count:], BOARD, dp.calibrate(LEFT[:count], BOARD, "brown4"))[1]
 
 
 def test_wrong_corners_are_weighed_as_the_loss_weighs_them(calibration: dp.Calibration) -> None:
