@@ -107,9 +107,9 @@ def _located(
         if of_pose and (free or count < FEWEST):
             found = _adjusted(options, camera, calibration, surveyed, views, sigma, free, tied)
         elif of_pose:
-            start: Camera | Calibration = camera if calibration is None else calibration
             held = tuple(one.name for one in options.fixed)
-            found = locate(views, target, posed(start, options.fixed), fixed=held, priors=priors or None, **steps)
+            start = posed(camera, options.fixed) if calibration is None else posed(calibration, options.fixed)
+            found = locate(views, target, start, fixed=held, priors=priors or None, **steps)
         elif free:
             held = tuple(name for name in Parametrisation.of(camera).names if name not in free)
             steps |= {"fixed": held, "tied_focal": tied, "priors": priors or None}
