@@ -117,8 +117,6 @@ def judged(seen: Evidence) -> Judgement:
     covered = _covered(seen)
     faults, remedies = _faults(seen, tilt, covered), []
     one_axis = tilt >= LOW_TILT and seen.different >= 2 and _second_spread(normals) < ONE_AXIS
-    if seen.other_lens:
-        remedies.append("no photograph yet, but the lens model that the remark on the residuals names")
     more = ENOUGH_VIEWS - round(seen.different) if seen.different < FEW_VIEWS else 0
     if more:
         remedies.append(f"{more} more photographs, the board at other places, distances and tilts")
@@ -135,6 +133,9 @@ def judged(seen: Evidence) -> Judgement:
     odd = _odd(seen)
     if odd:
         remedies.append(f"another look at {_listed(odd)}, whose corners fit far worse than the others'")
+    if seen.other_lens:
+        first = "first" if remedies else "no photograph yet, but"
+        remedies.insert(0, f"{first} the lens model that the remark on the residuals names")
     word, reasons = ("Weak", faults) if faults else ("Good", _praise(seen, tilt, covered))
     return Judgement(word, tuple(reasons), tuple(remedies), tuple(bare), tilted or one_axis, more)
 

@@ -31,7 +31,7 @@ POWERS = {"k1": 2, "k2": 4, "k3": 6, "k4": 2, "k5": 4, "k6": 6, "p1": 1, "p2": 1
 
 
 def far_out(found: Fit, straight: Straightened) -> Tensor:
-    """Which cameras have their principal point far from the image's middle, as found or by Zhang's equations `(P,)`."""
+    """Which cameras have their principal point far from the image's middle `(P,)`, as found or by Zhang's equations."""
     middles = found.solution.shared[:, 2:4], straight.elsewhere(found.task).middle
     off = torch.stack([(middle - straight.middle).abs().amax(-1) for middle in middles]).amax(0)
     return ~(off <= OUTSIDE * straight.longer)

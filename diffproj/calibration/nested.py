@@ -19,6 +19,7 @@ from diffproj.calibration.fit import Fit
 from diffproj.calibration.options import Options
 from diffproj.calibration.outcome import minimised
 from diffproj.calibration.parametrisation import SKEW, Parametrisation, Pose
+from diffproj.calibration.positive_focal import with_positive_focal_lengths
 from diffproj.calibration.restraint import restrained
 from diffproj.calibration.second_look import second_look
 from diffproj.calibration.start import Straightened
@@ -105,4 +106,5 @@ class Nested:
         # The valleys of a prism alone and of a denominator are long; many steps to a tilt may lead to a side one.
         long_valley = inside == (PRISM,) or DENOMINATOR in inside
         found = second_look(found, self.straight, reject=limit, long_valley=long_valley, **steps)
+        found = with_positive_focal_lengths(found, **steps)
         return restrained(found, *start, self.size, reject=limit, **steps) if DENOMINATOR in inside else found

@@ -80,13 +80,13 @@ def remarks(found: Fit, status: Tensor, doubt: Entangled, of_landmarks: bool = F
 
 def _unsure_focal(found: Fit) -> Tensor:
     """Which cameras have a focal length that is known roughly `(P,)`, as one view may leave it."""
-    variance = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, :2].amax(-1)
-    return variance.sqrt() > UNSURE * found.solution.shared[:, 0].detach().abs()
+    variance = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, :2]
+    return (variance.sqrt() > UNSURE * found.solution.shared[:, :2].detach().abs()).any(-1)
 
 
 def _unsure(found: Fit, p: int) -> str:
-    variance = found.plain_covariance().shared[p].diagonal()[:2].amax()
-    part = 100 * float(variance.sqrt() / found.solution.shared[p, 0].abs())
+    variance = found.plain_covariance().shared[p].diagonal()[:2]
+    part = 100 * float((variance.sqrt() / found.solution.shared[p, :2].abs()).amax())
     return (
         f"the focal length is known only to {part:.0f} %: points put back near the target are as good as their error "
         'bars say, others follow it; priors={"focal": (value, deviation)} or other views tilted differently tell more'

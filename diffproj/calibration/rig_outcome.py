@@ -170,7 +170,7 @@ def _verdict(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone]) -> t
         unknown = unknown[:few]
     for c in range(len(found.views.names)):
         own = found.parameters.intrinsics(c)
-        f = found.shared[0, own.start].abs()
+        f = found.shared[0, own.start : own.start + 2].abs().repeat(2)  # along the same axis
         unknown[own.start : own.start + 4] |= ~(deviation[own.start : own.start + 4] <= MAX_RELATIVE_STD * f)
     if bool(unknown.any()):
         lacking = [name for name, lost in zip(found.parameters.names, unknown.tolist(), strict=False) if lost]

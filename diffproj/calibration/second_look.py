@@ -8,8 +8,9 @@ lens that stands for what the poses should explain. A camera is looked at again 
 
 Then starts compete. For focal lengths on a grid each view takes the better of its two poses, as a Gauss-Newton step
 predicts their costs; the grid's best focal lengths, with and without the lens's first estimate, are solved side
-by side, and what ends lowest is kept, or what is reached from it with the principal point on the other side of the
-image's middle, or with one view turned over. A minimum is only ever replaced by a lower one.
+by side, and what ends lowest is kept, or what is reached from it with the principal point on another side of the
+image's middle, or with views turned over (`turned_views`). Who is still lost then, with the principal point far outside
+the image, climbs a ladder of focal lengths (`focal_ladder`). A minimum is only ever replaced by a lower one.
 """
 
 import math
@@ -22,13 +23,7 @@ from torch import Tensor
 from diffproj._core.numerics import spread_evenly
 from diffproj.calibration import closed_form
 from diffproj.calibration.fit import Fit, fit
-from diffproj.calibration.focal_ladder import (
-    LADDER,
-    climbed,
-    far_out,
-    moves_focal_length,
-    moves_principal_point,
-)
+from diffproj.calibration.focal_ladder import LADDER, climbed, far_out, moves_focal_length, moves_principal_point
 from diffproj.calibration.parametrisation import INTRINSICS, Parametrisation, Pose
 from diffproj.calibration.solver import Status
 from diffproj.calibration.start import Straightened
@@ -157,8 +152,9 @@ def _along_focal_lengths(
     part = Fit(replace(part.task, used=part.task.used | part.rejected), part.solution, part.rejected)
     if not moves_focal_length(part.task) or not moves_principal_point(part.task):
         return found
-    lost = (part.solution.status != Status.CONVERGED) | ~(correlation(part) <= CORRELATED)
-    rows = (lost & far_out(part, straight.part(which))).nonzero().flatten()
+    rows = ((part.solution.status != Status.CONVERGED) | ~(correlation(part) <= CORRELATED)).nonzero().flatten()
+    if len(rows) > 0:
+        rows = rows[far_out(part.part(rows), straight.part(which[rows]))]
     if len(rows) == 0:
         return found
     which, task = which[rows], part.task.part(rows)
@@ -268,7 +264,7 @@ def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Ten
 def _start_at(task: Task, first: Tensor, straight: Straightened, f: Tensor | float) -> tuple[Tensor, Pose]:
     """Shared parameters `(P, s)` and poses at focal lengths `(P,)`; what is held, or tied, stays as first `(P, s)`."""
     P, V = task.used.shape[:2]
-    f = first.new_tensor(f).expand(P) if isinstance(f, float) else f
+    f = f if isinstance(f, Tensor) else first.new_tensor(f).expand(P)
     every = torch.arange(V, device=f.device).expand(P, V)
     _, poses = _both_poses(task, straight, f, every)
     shared = straight.shared(f, first.shape[-1])

@@ -234,7 +234,7 @@ def solve(
         q, dz, reduction = damped_step(along, torch.from_numpy(control.damping).to(cost))
         predicted = _array(reduction)
         dx = q if basis is None else _times(basis, q)
-        trial = state.shared + dx, problem.retract(state.local, dz)
+        trial: tuple[Tensor, LocalState] = (state.shared + dx, problem.retract(state.local, dz))
         # Heavy damping makes every predicted reduction small: convergence is then judged by the gradient.
         heavy = control.damping > HEAVY_DAMPING
         expected = np.where(heavy, _array(_decoupled_reduction(along)), predicted) if heavy.any() else predicted
@@ -242,13 +242,14 @@ def solve(
         if done.any():
             # The final step still improves the unknowns, but its reduction is negligible: apply without evaluating it.
             last = done & (predicted <= FINAL_STEP_REDUCTION * control.cost)
-            state = _State(*select(last, trial, state[:2]), *state[2:])
+            x, z = select(last, trial, (state.shared, state.local))
+            state = state._replace(shared=x, local=z)
         if not control.active.any():
             break
         if pays_to_part(control) and isinstance(problem, Parted):
             which = torch.from_numpy(np.flatnonzero(control.active)).to(cost.device)
             everyone.keep(state, control, which)
-            state, trial = (rows(part, which) for part in (state, trial))
+            state, trial = rows(state, which), rows(trial, which)
             problem, basis = problem.part(which), None if basis is None else basis[which]
             weights, prior = None if weights is None else weights[which], None if prior is None else prior.part(which)
             predicted, control = predicted[control.active], control.part(control.active)
@@ -259,8 +260,8 @@ def solve(
         if progress is not None:
             progress(iteration, everyone.whole(everyone.state.cost, state.cost))
     state, status, iterations = everyone.ends(state, control)
-    ends = (torch.from_numpy(end).to(cost.device) for end in (status.astype(np.int64), iterations))
-    return Solution(*state[:3], *ends, state.equations)
+    status, iterations = (torch.from_numpy(end).to(cost.device) for end in (status.astype(np.int64), iterations))
+    return Solution(state.shared, state.local, state.cost, status, iterations, state.equations)
 
 
 class _State(NamedTuple):

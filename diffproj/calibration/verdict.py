@@ -19,8 +19,8 @@ from diffproj.targets.boards import Board, faces_away
 from diffproj.targets.landmarks import Landmarks
 
 MAX_RELATIVE_STD = 0.1
-"""Standard deviation of a focal length or principal point, relative to the focal length, above which it counts as
-undetermined."""
+"""Standard deviation of a focal length or principal point, relative to the focal length along its axis, above which it
+counts as undetermined."""
 MAX_OF_ONE_VIEW = 0.3
 """The same where all views show the target alike: then it is told with its deviation, for points near the target are
 put back no worse for it, and further off the error bars hold it."""
@@ -51,7 +51,8 @@ LANDMARKS_REMEDY = (
 )
 LEFT_HANDED = (
     "the corners fit the mirror image of the landmarks and not the landmarks: their coordinates are left-handed; "
-    "exchange x and y, or change the sign of one of them (with z up, x east and y north are right-handed)"
+    "exchange x and y, or change the sign of one of them (with z up, x east and y north are right-handed); or are u "
+    "and v exchanged?"
 )
 
 ONE_VIEW = (
@@ -87,7 +88,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
         shapeless = _too_few_for_a_shape(task)
         unknown[:, -1] |= shapeless
     std = known.shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, :4]
-    unknown[:, :4] |= _hardly_known(task, std / solution.shared[:, :1].abs())
+    unknown[:, :4] |= _hardly_known(task, std / solution.shared[:, (0, 1, 0, 1)].abs())
     none = ~used.any(-1)
     finite = solution.cost.isfinite()
     folded = finite & ~no_pose.any(-1) & folds_at_corners(task, solution.shared, solution.local)

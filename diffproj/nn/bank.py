@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from diffproj._core.arguments import Array, listing
-from diffproj._core.numerics import check_tensor
+from diffproj._core.numerics import check_tensor, has_values
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.collating import stack
 from diffproj.geometry.plane import Plane
@@ -21,7 +21,8 @@ class ProjectorBank(nn.Module):
     """Pixels to points on a plane, each sample by one of several cameras, which may have different lenses and sizes.
 
     Cameras of one lens model and size are one `PlaneProjector`, so that a batch of samples takes as many calls as there
-    are kinds of cameras in it. Cameras that are all of one kind need no bank: `PlaneProjector(dp.stack(cameras), ...)`.
+    are kinds of cameras in it; in a compiled or exported graph, which is made for any samples, each kind takes all.
+    Cameras that are all of one kind need no bank: `PlaneProjector(dp.stack(cameras), ...)`.
 
     Args:
         cameras: at least one, each a single camera at its pose, all of one dtype on one device.
@@ -109,7 +110,13 @@ class ProjectorBank(nn.Module):
         points = pixels.new_zeros(*pixels.shape[:2], 3)
         valid = torch.zeros(pixels.shape[:2], dtype=torch.bool, device=pixels.device)
         for kind, projector in enumerate(self.projectors):
-            (samples,) = (self.kind_of[chosen] == kind).nonzero(as_tuple=True)
+            own = self.kind_of[chosen] == kind
+            if not has_values(chosen, pixels):  # in a graph each kind takes all samples, and gives its own
+                found, seen = projector(pixels, camera=torch.where(own, self.place_of[chosen], 0))
+                points = torch.where(own[:, None, None], found, points.to(found))
+                valid = torch.where(own[:, None], seen, valid)
+                continue
+            (samples,) = own.nonzero(as_tuple=True)
             if len(samples):
                 found, seen = projector(pixels[samples], camera=self.place_of[chosen[samples]])
                 points, valid = points.to(found).index_put((samples,), found), valid.index_put((samples,), seen)

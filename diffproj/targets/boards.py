@@ -1,5 +1,6 @@
 """The boards: flat targets that photographs are searched for, and that can be printed."""
 
+from functools import lru_cache
 from typing import Any
 
 from diffproj._core.arguments import called
@@ -25,6 +26,7 @@ def as_printed(board: Any, name: str = "board") -> Board:
     return board
 
 
+@lru_cache(maxsize=64)  # the artwork is a whole picture
 def faces_away(board: Board) -> bool:
     """Whether the board's z points into it, away from the camera, as its frame has it."""
     _, right, down = board.artwork.axes

@@ -1,4 +1,4 @@
-"""Find a circle grid in a photograph: dark ellipses that lie on a lattice, counted as the grid's circles."""
+"""Find a circle grid in a photograph: dark ellipses, or light ones, that lie on a lattice, counted as its circles."""
 
 import itertools
 from collections import Counter
@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, Shaped, UInt8
 
 from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.ellipses import Ellipses, dark_ellipses, fit_ellipses
-from diffproj.targets.surface import off_surface
+from diffproj.targets.surface import Limits, off_surface
 
 WHOLE, FULL = 0.75, 0.5
 """Shares of all circles, and of those along each side, that a board must show, as chessboards do."""
@@ -26,6 +26,13 @@ SEEDS = 12
 
 MISFIT, VAGUE = 0.25, 0.20
 """Misfit, and standard deviation in px, from which a circle is not taken."""
+
+ORDINARY, UNUSUAL = 0.12, 2.5
+"""Misfit up to which any circle is taken, and the same relative to the view's median, whichever is larger."""
+
+LIMITS = Limits(deviations=4.0, loose=0.01, least=0.15)
+"""How far off its neighbours' surface a circle may lie: glare and the edge of a shadow draw a middle aside, and misfit
+little. Of 800 circles in plain light none was farther."""
 
 LONGEST = 1600
 """Longer side in px of the copy in which circles are sought first."""
@@ -230,7 +237,8 @@ def _refined(
     room = apart.min(axis=1) - 1.15 * major[nearest] - 1
     fit = fit_ellipses(image, start, room)
     dark = fit.contrast
-    good = (fit.misfit < MISFIT) & (fit.sigma < VAGUE) & (dark > 0.2 * np.median(dark)) & (dark > 2)
+    worst = min(MISFIT, max(ORDINARY, UNUSUAL * float(np.median(fit.misfit))))
+    good = (fit.misfit < worst) & (fit.sigma < VAGUE) & (dark > 0.2 * np.median(dark)) & (dark > 2)
     good &= np.linalg.norm(fit.ellipses.centres - start.centres, axis=-1) < 0.3 * major + 1
     height, width = image.shape
     reach = np.sqrt(np.linalg.inv(fit.ellipses.axes @ fit.ellipses.axes).diagonal(axis1=1, axis2=2)) + 1
@@ -240,7 +248,7 @@ def _refined(
     known[there[good]] = fit.ellipses.centres[good]
     seen = np.isfinite(known[:, 0])
     for _ in range(3):
-        off, limit = off_surface(board.places * board.spacing, known, seen, board.apart)
+        off, limit = off_surface(board.places * board.spacing, known, seen, board.apart, LIMITS)
         wrong = seen & (off > limit)
         if not wrong.any():
             break

@@ -62,9 +62,9 @@ def detect(
     hidden (`Views.visible`). At least 6 must be visible, on two rows and two columns, or all of a board of 4. Each is
     known by itself, however the board is turned.
 
-    A `CircleGrid` is found as dark ellipses on a lattice, of which up to a quarter may be hidden. The pixels are the
-    middles of the ellipses; `calibrate` knows that a centre is seen elsewhere. Its order is never mirrored, and where
-    the board looks the same when turned (`CircleGrid.turns`), the rule for chessboards holds.
+    A `CircleGrid` is found as dark ellipses on a lattice, or light ones on dark, of which up to a quarter may be
+    hidden. The pixels are the middles of the ellipses; `calibrate` knows that a centre is seen elsewhere. Its order is
+    never mirrored, and where the board looks the same when turned (`CircleGrid.turns`), the rule for chessboards holds.
 
     A `Chessboard` is found as a pattern of saddle points of brightness, in copies of several sizes, and where only a
     part of it is found so, by OpenCV's detectors. Its dark and light may be exchanged, as in thermal images. Each
@@ -228,7 +228,6 @@ _CHECKS: dict[type, str] = {
     AprilGrid: "the numbers count tags, columns first, that the tags are of the family 36h11 and begin with number 0, "
     "and that the photographs are sharp and evenly lit, with tags of 25 px or more",
     CircleGrid: "the numbers count circles, columns first, that every second line is shifted where asymmetric says so, "
-    "that the circles are dark on light, that the whole board is in view, and that the photographs are sharp and "
-    "evenly lit, with circles of 6 px or more",
+    "that the whole board is in view, and that the photographs are sharp and evenly lit, with circles of 6 px or more",
 }
 """What may be wrong where a target is in no photograph."""

@@ -16,7 +16,7 @@ from diffproj.targets.charuco import CharucoBoard
 from diffproj.targets.corner_fit import Fitted
 from diffproj.targets.dictionaries import dictionary_named
 from diffproj.targets.pattern_fit import LARGEST, SMALLEST, Patches, fit_patches, patches_of
-from diffproj.targets.surface import off_surface
+from diffproj.targets.surface import Limits, off_surface
 
 MISFIT = 0.30
 """Misfit from which a corner is not taken: covered ones, and those of another number, leave more."""
@@ -24,6 +24,9 @@ MISFIT = 0.30
 ORDINARY, UNUSUAL = 0.12, 2.5
 """Misfit up to which any corner is taken, and the same relative to the view's median, whichever is larger: corners that
 something covers in part, or whose light an edge of shadow parts, leave more than their fellows."""
+
+LIMITS = Limits(deviations=6.0, loose=0.015, least=0.2)
+"""How far off its neighbours' surface a corner may lie."""
 
 FAINT = 0.15
 """Least contrast, relative to the median of the view: glare drowns the rest."""
@@ -167,7 +170,7 @@ class _Search:
         """Those that lie where their neighbours put them."""
         good = good.copy()
         for _ in range(3):
-            off, limit = off_surface(self.places, known, good, self.board.pitch)
+            off, limit = off_surface(self.places, known, good, self.board.pitch, LIMITS)
             wrong = good & (off > limit)
             if not wrong.any():
                 break

@@ -1,5 +1,7 @@
 """Where its neighbours put each point of a board, whatever the board's layout."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -9,12 +11,27 @@ NEIGHBOURS = 24
 ENOUGH = 10
 """Neighbours below which nothing is said."""
 
-DEVIATIONS, LOOSE, LEAST = 8.0, 0.03, 0.3
-"""Distances from where neighbours put a point up to which it is taken: in the view's median, in pitches, and in px."""
+
+class Limits(NamedTuple):
+    """Distances from where neighbours put a point up to which it is taken, the largest of these.
+
+    Attributes:
+        deviations: in terms of the view's median.
+        loose: in pitches, to which `least` is added.
+        least: in px.
+    """
+
+    deviations: float
+    loose: float
+    least: float
 
 
 def off_surface(
-    places: Float[np.ndarray, "n 2"], seen: Float[np.ndarray, "n 2"], known: Bool[np.ndarray, " n"], pitch: float
+    places: Float[np.ndarray, "n 2"],
+    seen: Float[np.ndarray, "n 2"],
+    known: Bool[np.ndarray, " n"],
+    pitch: float,
+    limits: Limits,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """How far each known point lies from a smooth surface through its neighbours, and how far it may, in px.
 
@@ -25,6 +42,7 @@ def off_surface(
         seen: of all points, in px; what is not known does not matter.
         known: which are known.
         pitch: the distance between neighbours on the board.
+        limits: how far they may be.
     """
     off, limit = np.zeros(len(places)), np.full(len(places), np.inf)
     which = np.flatnonzero(known)
@@ -48,5 +66,5 @@ def off_surface(
         np.linalg.norm(seen[which][nearest[:, 0]] - seen[which], axis=-1) / apart[np.arange(len(which)), nearest[:, 0]]
     )
     off[which] = distance
-    limit[which] = np.maximum(DEVIATIONS * np.median(distance), LOOSE * step * pitch + LEAST)
+    limit[which] = np.maximum(limits.deviations * np.median(distance), limits.loose * step * pitch + limits.least)
     return off, limit

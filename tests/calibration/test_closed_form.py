@@ -1,6 +1,8 @@
 """The closed-form starts against the cameras that made the views: exact where the views are, and one by one alike."""
 
+import pytest
 import torch
+from kornia.geometry.homography import find_homography_dlt
 from torch import Tensor
 
 import diffproj as dp
@@ -20,6 +22,37 @@ def cameras(f: tuple[float, float], c: tuple[float, float] = (320.0, 240.0), see
 def homographies(pixels: Tensor) -> Tensor:
     """Of views `(P, V, N, 2)` that show every corner."""
     return closed_form.homographies(BOARD.points, pixels, torch.ones_like(pixels[..., 0], dtype=torch.bool))
+
+
+def test_homographies_of_exact_views_and_of_parts_of_them() -> None:
+    exact = cameras((600.0, 640.0))
+    seen = exact.project(BOARD.points)[0].unsqueeze(0)
+    board = torch.nn.functional.pad(BOARD.points[:, :2] - BOARD.points[:, :2].mean(0), (0, 1), value=1.0)
+    few = torch.zeros(1, len(seen[0]), len(BOARD), dtype=torch.bool)
+    few[..., [0, 8, 45, 53]] = True
+    some = torch.rand(few.shape) > 0.6
+    for used in (torch.ones_like(few), some, few):
+        H = closed_form.homographies(BOARD.points, torch.where(used.unsqueeze(-1), seen, torch.nan), used)
+        mapped = board @ H.mT
+        torch.testing.assert_close(mapped[..., :2] / mapped[..., 2:], seen, rtol=0, atol=1e-7)
+        assert (H[..., 2, 2] == 1).all()
+    # A view gives the same to the bit beside one that misses corners.
+    mixed = torch.cat([torch.ones_like(few[:, :1]), some[:, 1:]], dim=1)
+    assert torch.equal(closed_form.homographies(BOARD.points, seen, mixed)[:, 0], homographies(seen[:, :1])[:, 0])
+    line = torch.arange(len(BOARD)) < BOARD.columns
+    assert not closed_form.homographies(BOARD.points, seen, line.expand_as(few)).isfinite().any()
+
+
+def test_homographies_are_those_of_the_normal_equations() -> None:
+    seen = cameras((600.0, 640.0)).project(BOARD.points)[0]
+    seen = (seen + 0.2 * torch.randn(seen.shape, dtype=D))[:, :20]
+    board = BOARD.points[:20, :2]
+    H = closed_form.homographies(BOARD.points[:20], seen.unsqueeze(0), torch.ones(1, len(seen), 20) > 0)[0]
+    want = find_homography_dlt((board - board.mean(0)).expand_as(seen), seen)
+    corners = torch.nn.functional.pad(board - board.mean(0), (0, 1), value=1.0)
+    for one, other in zip(H, want, strict=True):
+        a, b = corners @ one.mT, corners @ other.mT
+        torch.testing.assert_close(a[:, :2] / a[:, 2:], b[:, :2] / b[:, 2:], rtol=0, atol=0.05)
 
 
 def test_focal_lengths_of_exact_views_whatever_else_is_in_the_batch() -> None:
@@ -114,3 +147,15 @@ def test_few_views_bring_their_homographies_along() -> None:
         mapped = torch.nn.functional.pad(BOARD.points[:, :2] - BOARD.points[:, :2].mean(0), (0, 1), value=1.0) @ H.mT
         off = (mapped[..., :2] / mapped[..., 2:] - back).norm(dim=-1)
         assert float(off.amax()) < 0.1  # px; measured: .027, .065 and .018
+
+
+def test_a_board_that_would_reach_behind_the_camera_is_moved_before_it() -> None:
+    middle, tilt = BOARD.points.mean(0), torch.tensor(1.4, dtype=D)
+    R = dp.rotation_from_euler(tilt, torch.zeros_like(tilt), torch.zeros_like(tilt))
+    t = torch.tensor([5.0, -3, 20], dtype=D)
+    H = torch.cat([R[:, :2], t.unsqueeze(-1)], dim=-1).expand(1, 1, 3, 3)  # the board's centre is at t
+    found_R, found_t = closed_form.poses(H, BOARD.points)
+    torch.testing.assert_close(found_R[0, 0], R)
+    placed = BOARD.points @ R.mT + found_t[0, 0]
+    torch.testing.assert_close(placed.mean(0)[:2], t[:2])
+    assert float(placed[:, 2].amin()) == pytest.approx(0.2 * float((BOARD.points - middle).abs().amax()))

@@ -29,6 +29,7 @@ def problems(
     focal: float,
     aspect: float = 1.0,
     at: tuple[float, float] | None = None,
+    lens: tuple[float, ...] | None = None,
 ) -> tuple[dp.Views, dp.Camera]:
     """Views with noise of 0.2 px of boards that face the line of sight, tilted, and the true cameras `(count, views)`."""
     generator = torch.Generator().manual_seed(0)
@@ -39,7 +40,8 @@ def problems(
     last = torch.tensor(size, dtype=D) - 1
     K = torch.tensor([[focal, 0, 0], [0, focal * aspect, 0], [0, 0, 1]], dtype=D)
     K[:2, 2] = last / 2 if at is None else torch.tensor(at, dtype=D)
-    camera, points = dp.Camera(K, size=size), BOARD.points.to(D)
+    distortion = None if lens is None else dp.BrownConrady(torch.tensor(lens, dtype=D))
+    camera, points = dp.Camera(K, distortion=distortion, size=size), BOARD.points.to(D)
     middle, shape = points.mean(0), (count, views)
     R, t = torch.zeros(*shape, 3, 3, dtype=D), torch.zeros(*shape, 3, dtype=D)
     missing = torch.ones(shape, dtype=torch.bool)
@@ -85,3 +87,42 @@ def test_the_minimum_with_a_lens(family: str) -> None:
     found, best = dp.calibrate(views, BOARD, throw=False), dp.refine(views, BOARD, start, throw=False)
     assert bool((found.converged | ~best.converged).all()), found.message
     assert not bool((found.converged & (found.rms > best.rms * (1 + 1e-6))).any())
+
+
+@pytest.mark.slow
+def test_a_crop_far_from_the_axis_of_a_distorted_lens() -> None:
+    """The focal length makes up for the lens: of 100 such, 74 did not come to an end, and 3 ended far too high."""
+    settings: dict[str, Any] = {"size": (640, 480), "focal": 700.0, "at": (1500.0, 1200.0)}
+    lens = (-0.1, 0.03, 0.0, 0.0, 0.0)
+    views, truth = problems(4, 10, **settings, lens=lens)
+    found, best = dp.calibrate(views, BOARD, throw=False), dp.refine(views, BOARD, truth, throw=False)
+    assert bool(best.converged.all())
+    assert bool(found.converged.all()), found.message
+    assert bool((found.rms <= best.rms * (1 + 1e-6)).all())
+
+
+def tall_pixels(noise: float) -> dp.Views:
+    """Three cameras with four views each."""
+    views, _ = problems(3, 4, size=(640, 480), focal=600.0, aspect=4.0)
+    generator = torch.Generator().manual_seed(1)
+    more = torch.randn(3, *views.pixels.shape, generator=generator, dtype=D)
+    return dp.Views(views.pixels + noise * more[{0.5: 0, 1.0: 1, 2.0: 2}[noise]], views.visible, size=views.size)
+
+
+@pytest.mark.slow
+def test_each_focal_length_is_judged_by_itself() -> None:
+    """Of tall pixels f_y has a large deviation in px, and is known as well as f_x."""
+    found = dp.calibrate(tall_pixels(1.0), BOARD, "none", throw=False, fixed=("principal_point",))
+    f_x, f_y = found.camera.K[:, 0, 0], found.camera.K[:, 1, 1]
+    deviation = found.covariance.deviations["f_y"]
+    assert bool((deviation > 0.1 * f_x).any())
+    assert bool((deviation < 0.1 * f_y).all())
+    assert bool(found.converged.all()), found.message
+
+
+@pytest.mark.slow
+def test_no_focal_length_ends_below_zero() -> None:
+    """The first camera's f_x came out negative, and its boards were said to be mirrored."""
+    found = dp.calibrate(tall_pixels(2.0), BOARD, "none", throw=False, fixed=("principal_point",))
+    assert bool((found.camera.K[:, [0, 1], [0, 1]] > 0).all())
+    assert not any("mirrored" in cause for cause in found.causes)

@@ -123,6 +123,57 @@ def test_a_batch_gives_what_a_loop_gives() -> None:
         assert alone.iterations[0] == together.iterations[p]
 
 
+def test_those_still_moving_go_on_alone_and_all_end_as_they_would() -> None:
+    sizes = []
+
+    @dataclass
+    class Parted(Curves):
+        def linearise(self, shared: torch.Tensor, local: tuple[torch.Tensor, ...]) -> torch.Tensor:
+            sizes.append(len(shared))
+            return super().linearise(shared, local)
+
+        def part(self, which: torch.Tensor) -> "Parted":
+            return Parted(self.x, self.seen[which])
+
+    problem, shared, local = curves(P=20)
+    weights = torch.rand(20, 7, 20, dtype=D) + 0.5
+    prior = Prior(shared + 0.01, torch.diag_embed(torch.full_like(shared, 5.0)))
+    basis = torch.eye(2, dtype=D).repeat(20, 1, 1)
+    start, z = rough(shared, local)
+    start = torch.where((torch.arange(20) % 7 == 3).unsqueeze(-1), start, shared)  # three are far off
+    costs: list[torch.Tensor] = []
+    options = {"local_size": 2, "loss": Huber(0.05)}
+    found = solve(
+        Parted(problem.x, problem.seen),
+        start,
+        z,
+        weights=weights,
+        prior=prior,
+        basis=basis,
+        progress=lambda _, cost: costs.append(cost.clone()),
+        **options,  # type: ignore[arg-type]
+    )
+    assert sizes[0] == 20
+    assert sizes[-1] <= 7
+    assert {len(cost) for cost in costs} == {20}
+    assert (costs[-1] <= costs[0]).all()
+    for p in range(20):
+        one = slice(p, p + 1)
+        alone = solve(
+            Curves(problem.x, problem.seen[one]),
+            start[one],
+            tuple(part[one] for part in z),
+            weights=weights[one],
+            prior=prior.part(one),
+            basis=basis[one],
+            **options,  # type: ignore[arg-type]
+        )
+        torch.testing.assert_close(found.shared[p], alone.shared[0], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(found.local[0][p], alone.local[0][0], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(found.equations.U[p], alone.equations.U[0], rtol=1e-6, atol=1e-6)
+        assert (found.iterations[p], found.status[p]) == (alone.iterations[0], alone.status[0])
+
+
 def test_a_hopeless_neighbour_changes_no_bit() -> None:
     problem, shared, local = curves()
     good = run(problem, shared, local)

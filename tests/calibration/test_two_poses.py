@@ -8,11 +8,19 @@ from torch import Tensor
 
 import diffproj as dp
 from diffproj import synthetic
+from diffproj.calibration.closed_form import other_pose
 from diffproj.calibration.losses import Cauchy, Loss
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.solver import Solution, equations_at
 from diffproj.calibration.task import Task
-from diffproj.calibration.two_poses import found_again, posed, predicted_costs, view_costs, weak_perspective
+from diffproj.calibration.two_poses import (
+    better_poses,
+    found_again,
+    posed,
+    predicted_costs,
+    view_costs,
+    weak_perspective,
+)
 from diffproj.geometry.cayley import turned
 
 D = torch.float64
@@ -90,3 +98,24 @@ def test_lost_views_are_found_again_from_four_corners_on(loss: Loss | None) -> N
         assert float((found[1][0, view] - t[0, view]).norm() / t[0, view].norm()) < 0.02
     assert torch.equal(found[0][0, 2], moved[0][0, 2])  # three corners tell no pose
     assert torch.equal(found[1][0, [0, 2, 3]], moved[1][0, [0, 2, 3]])
+
+
+def test_a_view_in_the_worse_of_its_poses_is_turned_over() -> None:
+    task, (R, t) = seen()
+    far = torch.tensor([0.0, 0.0, 4000.0], dtype=D)
+    f_x, f_y, c_x, c_y = SHARED[0].tolist()
+    K = torch.tensor([[f_x, 0, c_x], [0, f_y, c_y], [0, 0, 1]], dtype=D)
+    pixels, _ = dp.Camera(K, R, t + far).project(BOARD.points)
+    task = replace(task, pixels=pixels + 0.02 * torch.randn(pixels.shape, dtype=D))
+    wrong = tuple(z.clone() for z in (R, t + far))
+    for part, other in zip(wrong, other_pose(R, t + far, BOARD.points), strict=True):
+        part[0, 3] = other[0, 3]
+    none = torch.zeros(1, dtype=torch.int64)
+    equations = equations_at(task.problem, SHARED, wrong, POSE, None, None)
+    solution = Solution(SHARED, wrong, none.to(D), none, none, equations)
+    poses, changed = better_poses(task, solution, torch.ones(1, dtype=torch.bool))
+    assert changed.tolist() == [True]
+    assert float((poses[0][0, 3] - R[0, 3]).abs().amax()) < 0.1 < float((wrong[0][0, 3] - R[0, 3]).abs().amax())
+    again, changed = better_poses(task, solution, torch.zeros(1, dtype=torch.bool))
+    assert changed.tolist() == [False]
+    assert all(torch.equal(z, new) for z, new in zip(wrong, again, strict=True))

@@ -1,6 +1,7 @@
 """Error bars: against refits, real and simulated, for each kind of fit; and the factor for errors that views share."""
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -233,3 +234,16 @@ def test_few_degrees_of_freedom_do_not_blow_error_bars_up() -> None:
     found = dp.calibrate(dp.Views(noisy, size=(640, 480)), BOARD, "none")
     assert float(found.covariance.dispersion.mean()) < 1.2  # without this 1.8, and up to 18
     assert float(found.covariance.dispersion.amax()) < 6
+
+
+def test_a_file_holds_0_for_a_variance_that_nothing_tells() -> None:
+    """JSON has no infinity; which they are, the mask says."""
+    known = dp.calibrate(dp.example_views("left"), dp.Chessboard(), "brown4").covariance
+    shared, lost = known.shared.clone(), known.undetermined.clone()
+    shared[2], shared[:, 2], lost[2] = 0.0, 0.0, True
+    shared[2, 2] = torch.inf
+    fields = replace(known, shared=shared, undetermined=lost).to_fields()
+    assert fields["shared"][2] == [0.0] * len(known.names)
+    again = dp.Covariance.from_fields(fields)
+    assert torch.equal(again.shared, shared)
+    assert again.deviations["c_x"].isinf()

@@ -18,7 +18,10 @@ TO_PLANE = dp.PlaneMap(CAMERA, PLANE)
 FROZEN = dp.PlaneProjector(CAMERA, PLANE)
 LEARNED = dp.PlaneProjector(CAMERA, PLANE, ("focal", "distortion", "pose", "plane"))
 BANK = dp.PlaneProjector(dp.stack([CAMERA, CAMERA.shifted([5.0, 0, 0])]), PLANE)
+FISHEYE = dp.Camera(K, R, CAMERA.t, dp.KannalaBrandt(torch.tensor([0.05, -0.01, 0.002, 0.0])), (640, 480))
+LENSES = dp.ProjectorBank([CAMERA, FISHEYE], PLANE)
 EXTENT = (-100.0, -100.0, 100.0, 100.0)
+EXTENTS = torch.tensor([[-100.0, -100, 100, 100], [-50, 0, 150, 90]])
 
 Map = Callable[[Tensor], tuple[Tensor, ...]]
 
@@ -42,6 +45,19 @@ MAPS: dict[str, tuple[str, Map]] = {
     "learned projector": ("pixels", lambda x: LEARNED(x)),
     "projector of a bank": ("pixels", lambda x: BANK(x, camera=torch.tensor([1, 0]))),
     "loss": ("pixels", lost),
+    "projector, warped image": (
+        "pixels",
+        lambda x: FROZEN(x, warp=torch.tensor([[0.0, -1, 479], [1, 0, 0], [0, 0, 1]])),
+    ),
+    "projector, other plane": ("pixels", lambda x: FROZEN(x, plane=dp.Plane.z(7.0))),
+    "bank of lenses": ("pixels", lambda x: LENSES(x, camera=torch.tensor([1, 0]))),
+    "fisheye": ("pixels", lambda x: dp.back_project(x, FISHEYE, PLANE)),
+    "undistort": ("pixels", lambda x: LENS.undistort(x / 1000 - 0.3)),
+    "distort": ("pixels", lambda x: LENS.distort(x / 1000 - 0.3)),
+    "map's resolution": ("pixels", lambda x: TO_PLANE.resolution(x)),
+    "with reach": ("pixels", lambda x: TO_PLANE.with_reach(x)),
+    "in image": ("pixels", lambda x: (CAMERA.in_image(x),)),
+    "rectify by extents": ("image", lambda x: dp.rectify(x, SMALL, PLANE, EXTENTS, size=(20, 16), samples=1)),
     "rectify": ("image", lambda x: dp.rectify(x, SMALL, PLANE, EXTENT, 10.0, samples=1)),
     "render": ("image", lambda x: dp.render(x, SMALL, PLANE, EXTENT, size=(16, 12), samples=2)),
 }
@@ -50,7 +66,7 @@ INPUTS = {
     "points": torch.rand(2, 6, 3, generator=torch.Generator().manual_seed(1)) * 100,
     "image": torch.rand(2, 1, 48, 64, generator=torch.Generator().manual_seed(1)),
 }
-OF_IMAGES = {"rectify", "render"}
+OF_IMAGES = {"rectify", "rectify by extents", "render"}
 
 
 @pytest.fixture(autouse=True)

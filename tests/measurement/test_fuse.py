@@ -155,10 +155,13 @@ def test_batches_heights_and_gradients() -> None:
 
 
 def test_the_tail_of_the_f_distribution() -> None:
-    # scipy.stats.f.sf(2.5, 8, 18), chi2.sf(20, 8), f.sf(6, 2, 5)
-    chi2, count, freedom = (torch.tensor(x, dtype=D) for x in ([20.0, 20, 12], [8, 8, 2], [18.0, math.inf, 5]))
+    # scipy.stats.f.sf(2.5, 8, 18), chi2.sf(20, 8), f.sf(6, 2, 5), chi2.sf(4, 1), and nothing that could be unlike
+    chi2, count, freedom = (
+        torch.tensor(x, dtype=D)
+        for x in ([20.0, 20, 12, 4, 0], [8, 8, 2, 1, 0], [18.0, math.inf, 5, math.inf, math.inf])
+    )
     torch.testing.assert_close(
-        tail(chi2, count, freedom), torch.tensor([0.0513, 0.0103, 0.0471], dtype=D), rtol=0.06, atol=0
+        tail(chi2, count, freedom), torch.tensor([0.0513, 0.0103, 0.0471, 0.0455, 1], dtype=D), rtol=0.06, atol=0
     )
 
 
@@ -183,7 +186,7 @@ def test_it_refuses_what_cannot_be_joined() -> None:
         dp.fuse([first, exact])
     with pytest.raises(TypeError, match="got fused ones for camera 0; fuse all cameras at once"):
         dp.fuse([dp.fuse([first, second]), second])
-    many = dp.measure(pixels[:1].expand(MOST_POINTS + 1, 2), camera(PLACES[1]), GROUND, pixel_sigma=1.0)
+    many = dp.measure(pixels[:1].expand(2, MOST_POINTS + 1, 2), camera(PLACES[1]), GROUND, pixel_sigma=1.0)
     with pytest.raises(ValueError, match=f"want at most {MOST_POINTS} points at once, got {MOST_POINTS + 1}"):
         dp.fuse([many, many])
 

@@ -11,6 +11,7 @@ import torch
 
 import diffproj as dp
 from diffproj import synthetic
+from diffproj.lens import coefficients
 
 D = torch.float64
 BOARD = dp.Chessboard()
@@ -370,3 +371,24 @@ def test_bad_input_is_refused_by_name(camera: dp.Camera) -> None:
     for residuals in (dp.image_residuals, dp.plane_residuals):
         with pytest.raises(ValueError, match="camera: want a pose for each of the 13 views"):
             residuals(camera, views, BOARD)
+
+
+def test_a_lens_that_is_not_learned_keeps_its_plan(lens_camera: dp.Camera, monkeypatch: pytest.MonkeyPatch) -> None:
+    worked_out = []
+    whole = coefficients.plan_of
+    monkeypatch.setattr(coefficients, "plan_of", lambda *parts: worked_out.append(1) or whole(*parts))
+    projector = dp.PlaneProjector(lens_camera, dp.Plane.z(0.0), "pose")
+    pixels = torch.tensor([[100.0, 80], [500, 400]], dtype=D)
+    with torch.inference_mode():
+        projector(pixels)
+    for _ in range(3):
+        points, _ = projector(pixels)
+        points.sum().backward()
+    assert len(worked_out) == 1
+    assert all(parameter.grad is not None for parameter in projector.parameters())
+    projector.geometry.camera.coefficients_0.data[0] = -0.2  # which PyTorch does not count as writing
+    changed, _ = projector(pixels)
+    assert len(worked_out) == 2
+    lens = dp.BrownConrady(projector.geometry.camera.coefficients_0)
+    want, _ = dp.back_project(pixels, dp.Camera(lens_camera.K, lens_camera.R, lens_camera.t, lens), dp.Plane.z(0.0))
+    torch.testing.assert_close(changed, want)

@@ -180,7 +180,7 @@ def test_numbers_are_the_calibration_s(calibration: dp.Calibration, page: str) -
 
 def test_what_is_not_trusted_are_the_remarks(calibration: dp.Calibration, page: str) -> None:
     assert "repeat on the board" in calibration.remarks[0]
-    told = calibration.remarks[0].replace("world units", "mm")
+    told = Facts(calibration, (640, 480)).in_words(calibration.remarks[0]).replace("world units", "mm")
     assert told[1:] in words(page)
     assert "nothing speaks against" not in page
 

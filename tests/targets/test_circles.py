@@ -1,5 +1,7 @@
 """Circle grids: their points are OpenCV's, and their images' middles are found, with some of them hidden."""
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
@@ -59,6 +61,29 @@ def test_hidden_circles_are_told():
     found = dp.detect(image, LYING)
     assert not bool(found.visible[0, 16])
     assert int(found.visible.sum()) >= 40
+
+
+@pytest.mark.parametrize("board", [PLAIN, LYING], ids=["plain", "asymmetric"])
+def test_light_circles_on_dark_are_found_as_dark_ones_on_light(board):
+    image = photographed(camera_before(board, 3, 18, tilt_deg=25), board)
+    found, inverted = dp.detect(image, board), dp.detect(255 - image, board)
+    assert bool((inverted.visible == found.visible).all())
+    assert float((inverted.pixels - found.pixels).abs().max()) < 1e-6
+
+
+def test_a_paper_that_looks_like_an_ellipse_hides_no_circle():
+    """The dark halo that a threshold sees around white paper is as round as some ellipses are, and holds all circles."""
+    board = dp.CircleGrid(7, 5, spacing=20.0, diameter=9.0)
+    x, y = np.meshgrid(np.arange(480.0), np.arange(360.0))
+    image = np.where(np.hypot((x - 240) / 1.06, y - 180) < 100, 225.0, 140.0)
+    centres = 240 + 16 * (np.arange(7) - 3.0), 180 + 16 * (np.arange(5) - 2.0)
+    for u, v in itertools.product(*centres):
+        image -= 190 * np.clip(0.5 + 4.5 - np.hypot(x - u, y - v), 0, 1)
+    found = dp.detect(cv2.GaussianBlur(np.uint8(image), (0, 0), 0.9), board)
+    assert bool(found.visible.all())
+    truth = np.stack(np.meshgrid(*centres), axis=-1).reshape(-1, 2)
+    off = [np.linalg.norm(found.pixels[0].numpy() - order, axis=-1).max() for order in (truth, truth[::-1])]
+    assert min(off) < 0.05
 
 
 def test_words_and_numbers_that_cannot_be():

@@ -101,25 +101,6 @@ def test_half_a_board_is_enough(board, side):
     assert seen
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["charuco", "april"])
-def test_no_corner_has_the_number_of_another(kind):
-    """Boards of random sizes and poses, half of them partly outside the image."""
-    for seed in range(40):
-        draw = np.random.default_rng(seed)
-        columns, rows = int(draw.integers(5, 9)), int(draw.integers(4, 7))
-        board = dp.AprilGrid(columns - 2, rows - 1, 20.0, 0.3)
-        if kind == "charuco":
-            board = dp.CharucoBoard(columns, rows, 20.0, draw.uniform(13, 16), "4X4_1000", bool(draw.integers(2)))
-        camera = camera_before(board, seed, 24, whole=seed % 2 == 0)
-        image = photographed(camera, board, seed, blur_px=draw.uniform(0.6, 1.2))
-        try:
-            found = dp.detect(image, board)
-        except dp.BoardNotFoundError:
-            continue
-        assert errors(found, camera, board)[0].max() < 1.0, seed
-
-
 def test_a_hand_before_the_board_hides_what_it_covers():
     camera = camera_before(CHARUCO, 3, 22)
     image = photographed(camera, CHARUCO)

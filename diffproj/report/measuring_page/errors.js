@@ -377,7 +377,8 @@ function isBent(scene, point) {
 
 function deviationsOf({ shared, own, lost, nowhere }) {
   const steps = [...shared, ...own];
-  const isLost = (axis) => nowhere || lost.some((step) => step[axis] !== 0);
+  // A coordinate that the plane fixes is known, wherever the point may be on it.
+  const isLost = (axis) => (nowhere && own.some((step) => step[axis] !== 0)) || lost.some((step) => step[axis] !== 0);
   return [0, 1, 2].map((axis) => (isLost(axis) ? Infinity : Math.sqrt(sum(steps.map((step) => step[axis] ** 2)))));
 }
 
