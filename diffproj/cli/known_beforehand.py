@@ -90,9 +90,11 @@ def check_together(priors: Sequence[Known], held: Sequence[Known], camera: Camer
         raise ValueError("--prior: want either 'focal' or 'f_x' and 'f_y', got both")
 
 
-def one_focal_length(names: Sequence[str]) -> bool:
-    """Whether `f_x : f_y` is to keep the camera's ratio: not where both were spoken of."""
-    return any(name in names for name in FOCAL) and not {"f_x", "f_y"} <= set(names)
+def one_focal_length(free: Sequence[str], priors: Sequence[Known]) -> bool:
+    """Whether `f_x : f_y` is to keep the camera's ratio: of `focal`, and where a prior speaks of but one of the two."""
+    known = {one.name for one in priors}
+    alone = len(known & {*FOCAL[1:]}) == 1 and not {*FOCAL[1:]} & {*free}
+    return "focal" in free or "focal" in known or alone
 
 
 def posed(camera: Calibrated, known: Sequence[Known]) -> Calibrated:

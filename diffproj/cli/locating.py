@@ -97,8 +97,7 @@ def _located(
         )
     steps: dict[str, Any] = {"reject_outliers": options.reject_outliers, "pixel_sigma": sigma}
     free = _free(options, camera)
-    named = [*options.free, *(one.name for one in options.prior)]
-    tied = one_focal_length(named)
+    tied = one_focal_length(options.free, options.prior)
     priors = {one.name: (one.value, one.deviation) for one in options.prior}
     of_pose = [one for one in (*options.prior, *options.fixed) if one.name in POSE]
     target = surveyed.landmarks
@@ -107,9 +106,9 @@ def _located(
         if of_pose and (free or count < FEWEST):
             found = _adjusted(options, camera, calibration, surveyed, views, sigma, free, tied)
         elif of_pose:
-            start: Camera | Calibration = camera if calibration is None else calibration
             held = tuple(one.name for one in options.fixed)
-            found = locate(views, target, posed(start, options.fixed), fixed=held, priors=priors or None, **steps)
+            start = posed(camera, options.fixed) if calibration is None else posed(calibration, options.fixed)
+            found = locate(views, target, start, fixed=held, priors=priors or None, **steps)
         elif free:
             held = tuple(name for name in Parametrisation.of(camera).names if name not in free)
             steps |= {"fixed": held, "tied_focal": tied, "priors": priors or None}
@@ -196,7 +195,7 @@ def _free(options: argparse.Namespace, camera: Camera) -> tuple[str, ...]:
     """The names of the intrinsics that are found along with the pose."""
     parameters = Parametrisation.of(camera)
     named = [*options.free, *(one.name for one in options.prior if one.name not in POSE)]
-    named += ["focal"] if one_focal_length(named) else []
+    named += ["focal"] if one_focal_length(options.free, options.prior) else []
     places = {place for name in named for place in parameters.positions("--free", name)}
     return tuple(parameters.names[place] for place in sorted(places))
 
