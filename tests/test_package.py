@@ -47,7 +47,7 @@ def test_every_requirement_has_a_tested_version() -> None:
 
 def test_lower_bounds_are_those_of_the_oldest_run() -> None:
     """Of the formatter and the type checker it is the tested version: their judgement changes with each release."""
-    run = pinned("oldest.txt") | {name: pinned("constraints.txt")[name] for name in ("pyright", "ruff")}
+    run = pinned("oldest.txt") | {name: pinned("constraints.txt")[name] for name in ("mypy", "pyright", "ruff")}
     for requirement in requirements(PROJECT["dependencies"], EXTRAS["cli"], EXTRAS["notebooks"], EXTRAS["test"]):
         bounds = [Version(part.version) for part in requirement.specifier if part.operator == ">="]
         assert bounds == [run[requirement.name]], requirement.name

@@ -28,6 +28,11 @@ def has_no_values(tensor: torch.Tensor) -> bool:
     return tensor.is_meta or type(tensor).__name__ == "FakeTensor"
 
 
+def has_storage(tensor: torch.Tensor) -> bool:
+    """Whether there are numbers behind it; not where it stands for a batch, as under `vmap` and `is_grads_batched`."""
+    return bool(torch._C._has_storage(tensor))  # type: ignore[attr-defined]
+
+
 def constant_in_graphs(function: F) -> F:
     """Mark a function that `torch.compile` is to call once, while it traces, and whose result is a constant.
 

@@ -17,7 +17,8 @@ from diffproj.calibration.refine import refine
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
 from diffproj.cli.inputs import check_not_the_same, check_writable, writing
-from diffproj.cli.known_beforehand import FOCAL, POSE, check_together, one_focal_length, posed, standing_near
+from diffproj.cli.known_beforehand import FOCAL, POSE
+from diffproj.cli.known_camera import check_together, one_focal_length, posed, standing_near
 from diffproj.cli.landmarks_file import Surveyed, read_landmarks
 from diffproj.cli.locate_document import document, say
 from diffproj.cli.photographs import one_photograph

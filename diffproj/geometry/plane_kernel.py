@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from diffproj._core.numerics import entries, interleaved, linear
+from diffproj._core.torch_private import has_storage
 from diffproj.geometry.plane_kernel_short import divided, gradient, is_short
 
 
@@ -119,7 +120,7 @@ class _WithGradient(torch.autograd.Function):
         if torch.is_grad_enabled():
             by_p, by_matrix = _recorded_gradient(p, matrix, seen, by_points, (of_p, of_matrix))
             return by_p, by_matrix, None
-        if is_short(p):
+        if is_short(p) and has_storage(by_points):
             by_p, by_matrix = gradient(p, matrix, hidden, denominator, by_points, (of_p, of_matrix))
             return by_p, by_matrix, None
         if hidden is not None:

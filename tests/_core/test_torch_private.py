@@ -1,9 +1,11 @@
 """What the package uses of PyTorch beyond its promises still does what it is used for."""
 
+from typing import Any
+
 import torch
 from torch.autograd import forward_ad
 
-from diffproj._core.torch_private import constant_in_graphs, in_forward_mode, in_functional_transform
+from diffproj._core.torch_private import constant_in_graphs, has_storage, in_forward_mode, in_functional_transform
 
 
 def test_functional_transforms_are_seen() -> None:
@@ -20,6 +22,27 @@ def test_functional_transforms_are_seen() -> None:
     torch.func.jvp(function, (x,), (x,))
     function(x)
     assert seen == [False, True, True, True, False]
+
+
+def test_what_stands_for_a_batch_has_no_storage() -> None:
+    seen = []
+
+    class Looking(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
+            return x.clone()
+
+        @staticmethod
+        def backward(ctx: Any, *grad_outputs: torch.Tensor) -> torch.Tensor:
+            seen.append(has_storage(grad_outputs[0]))
+            return grad_outputs[0]
+
+    x = torch.ones(2, requires_grad=True)
+    y = Looking.apply(x)
+    torch.autograd.grad(y, x, torch.eye(2), is_grads_batched=True, retain_graph=True)
+    torch.func.vmap(lambda v: torch.autograd.grad(y, x, v, retain_graph=True)[0])(torch.eye(2))
+    torch.autograd.grad(y, x, torch.ones(2))
+    assert seen == [False, False, True]
 
 
 def test_forward_mode_is_seen() -> None:

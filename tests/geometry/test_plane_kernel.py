@@ -89,3 +89,18 @@ def test_a_point_is_the_same_to_rounding_however_many_there_are(
     many = direct(p, matrix, seen)
     torch.testing.assert_close(few[0], many[0])
     assert torch.equal(few[1], many[1])
+
+
+@pytest.mark.filterwarnings("ignore:There is a performance drop")
+def test_gradients_in_a_batch_are_those_one_by_one() -> None:
+    p, matrix, _ = example(2, (), ())
+    points, _ = direct(p, matrix, None)
+    each = torch.eye(points.numel(), dtype=points.dtype).reshape(-1, *points.shape)
+
+    def gradient(v: torch.Tensor) -> torch.Tensor:
+        return torch.autograd.grad(points, p, v, retain_graph=True)[0]
+
+    expected = torch.stack([gradient(v) for v in each])
+    (batched,) = torch.autograd.grad(points, p, each, is_grads_batched=True, retain_graph=True)
+    torch.testing.assert_close(batched, expected)
+    torch.testing.assert_close(torch.func.vmap(gradient)(each), expected)
