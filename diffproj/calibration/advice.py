@@ -37,6 +37,8 @@ ODD = 3.0
 """Times the median RMS of all views from which on a view is named."""
 OTHER_LENS = "another lens"
 """What a remark says of residuals that another lens would explain."""
+TWO_CAMERAS = "want another camera than"
+"""What a remark says of views that fall into two groups."""
 CONTRADICTED = re.compile(r"[^;:,]*times what[^;:,]*")
 """What a remark says where residuals contradict the deviations that were given."""
 POSES_ONLY = "Poses only, the camera was given"
@@ -74,6 +76,11 @@ class Evidence:
     def other_lens(self) -> bool:
         """Whether the residuals are those of another lens."""
         return OTHER_LENS in self.remarks
+
+    @property
+    def two_cameras(self) -> bool:
+        """Whether they fall into two groups that want different cameras."""
+        return TWO_CAMERAS in self.remarks
 
 
 @dataclass(frozen=True)
@@ -136,6 +143,11 @@ def judged(seen: Evidence) -> Judgement:
     if seen.other_lens:
         first = "first" if remedies else "no photograph yet, but"
         remedies.insert(0, f"{first} the lens model that the remark on the residuals names")
+    if seen.two_cameras:
+        remedies.insert(
+            0,
+            "first another look at the views that the remark names, for one camera with one zoom must have taken all",
+        )
     word, reasons = ("Weak", faults) if faults else ("Good", _praise(seen, tilt, covered))
     return Judgement(word, tuple(reasons), tuple(remedies), tuple(bare), tilted or one_axis, more)
 
@@ -197,6 +209,8 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
         faults.append(
             f"the corners scatter by {seen.sigma:.2g} px in each coordinate, in sharp photographs by 0.05 to 0.3"
         )
+    if seen.two_cameras:
+        faults.append("its views fall into two groups that want different cameras")
     if seen.other_lens:
         faults.append("this lens model does not fit the lens")
     return faults

@@ -138,19 +138,6 @@ class Covariance(Copied, Shown):
         cross, pose = self.cross(view), self.between(view, view)
         return torch.cat([torch.cat([self.shared, cross.mT], dim=-1), torch.cat([cross, pose], dim=-1)], dim=-2)
 
-    def with_points_turned(self, turn: Float[Tensor, "3 3"], few: int) -> "Covariance":
-        """The same with the coordinates of free points, behind `few` other parameters, along other axes `turn x`.
-
-        Those of a point count as undetermined together, or not at all.
-        """
-        s = self.shared.shape[-1]
-        if s == few:
-            return self
-        J = torch.block_diag(torch.eye(few, dtype=turn.dtype, device=turn.device), *[turn] * ((s - few) // 3))
-        infinite = torch.diag_embed(torch.where(self.undetermined, torch.inf, 0.0).to(self.shared))
-        shared = _without_negative(J @ zero_where_infinite(self.shared) @ J.mT) + infinite
-        return replace(self, shared=shared, _follow=self._follow @ J.mT, _mixed=self._mixed @ J.mT)
-
     def following(self, known: "Covariance") -> "Covariance":
         """The covariance of these poses together with shared parameters from another calibration, `known`.
 
@@ -354,6 +341,20 @@ def covariance(
     shared = torch.where(unknown.unsqueeze(-1) | unknown.unsqueeze(-2), 0.0, shared)
     shared = shared + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(shared))
     return Covariance(tuple(names), shared, unknown, unknown_views, dispersion, follow, mixed, (alone + alone.mT) / 2)
+
+
+def points_turned(covariance: Covariance, turn: Float[Tensor, "3 3"], few: int) -> Covariance:
+    """The same with the coordinates of free points, behind `few` other parameters, along other axes `turn x`.
+
+    Those of a point count as undetermined together, or not at all.
+    """
+    s = covariance.shared.shape[-1]
+    if s == few:
+        return covariance
+    J = torch.block_diag(torch.eye(few, dtype=turn.dtype, device=turn.device), *[turn] * ((s - few) // 3))
+    infinite = torch.diag_embed(torch.where(covariance.undetermined, torch.inf, 0.0).to(covariance.shared))
+    shared = _without_negative(J @ zero_where_infinite(covariance.shared) @ J.mT) + infinite
+    return replace(covariance, shared=shared, _follow=covariance._follow @ J.mT, _mixed=covariance._mixed @ J.mT)
 
 
 def reshaped(covariance: Covariance, batch: Sequence[int]) -> Covariance:

@@ -9,7 +9,7 @@ from torch import Tensor
 from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.compatibility import mismatch
 from diffproj.calibration.constraints import free_basis, held_at, make_prior, of_camera, of_points
-from diffproj.calibration.covariance import Covariance, reshaped
+from diffproj.calibration.covariance import Covariance, points_turned, reshaped
 from diffproj.calibration.data import Data
 from diffproj.calibration.entangled import Entangled
 from diffproj.calibration.fit import Fit, fit
@@ -121,7 +121,7 @@ def outcome(
         rig=None if known is None else known.rig,
         _covariance=partial(_covariance, found, data, before, known, doubt),
         _others=partial(_others, found, data, before),
-        _remarks=partial(remarks, found, status, doubt, of_landmarks=landmarks is not None),
+        _remarks=partial(remarks, found, status, doubt, data.views.names, landmarks is not None),
         landmarks=landmarks,
         _mismatch=None if known is None else partial(mismatch, found, known, tuple(batch)),
     )
@@ -135,7 +135,7 @@ def _covariance(found: Fit, data: Data, noise: Noise | None, known: Calibration 
     before = None if known is None or not known.has_covariance else known.covariance_of_kept_poses
     own = covariance_of(found, noise, None if before is None else before.dispersion.expand(batch).reshape(-1))
     own = doubt.widened(own)
-    own = own if data.frame.axes is None else own.with_points_turned(data.frame.axes.mT, found.task.parameters.few)
+    own = own if data.frame.axes is None else points_turned(own, data.frame.axes.mT, found.task.parameters.few)
     R, _ = data.frame.world_pose(*(z.detach() for z in found.solution.local))
     own = replace(reshaped(own, batch), middle=data.middle, _arm=(R @ data.middle).reshape(*batch, -1, 3))
     return own if before is None else own.following(before)

@@ -1,5 +1,7 @@
 """The remarks on a calibration that converged: what is to be known of it, in one text a camera."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -23,6 +25,7 @@ from diffproj.calibration.fit import Fit
 from diffproj.calibration.leftover import Leftover, leftover
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
+from diffproj.calibration.two_groups import TwoGroups, two_groups
 
 UNSURE = 0.1
 """Deviation of a focal length, relative to it, from which on it is known roughly."""
@@ -30,17 +33,26 @@ CONTRADICTION = 1e-4
 """Chance of the residuals under the noise that was given below which they contradict it."""
 NOTABLE = 1.25
 """Times that noise that residuals must be for a word."""
+ANOTHER_CAMERA = "want another camera than"
+"""What a remark says where the views fall into two groups."""
+BETTER = 0.8
+"""Part of what another lens would explain that two groups must save to be named in its place."""
+MOST_NAMED = 5
+"""Views that are named."""
 NO_DENOMINATOR = {"brown8": "'brown5'"} | dict.fromkeys(("brown12", "brown14"), "fixed=('k4', 'k5', 'k6')")
 """What a lens with a denominator is without it."""
 
 
-def remarks(found: Fit, status: Tensor, doubt: Entangled, of_landmarks: bool = False) -> tuple[str, ...]:
+def remarks(
+    found: Fit, status: Tensor, doubt: Entangled, names: Sequence[str], of_landmarks: bool = False
+) -> tuple[str, ...]:
     """The remarks on each of P cameras, in one text; empty where there are none, or it did not converge.
 
     Args:
         found: the fit.
         status: of each camera `(P,)`.
         doubt: what the views hardly tell apart.
+        names: of the views.
         of_landmarks: whether the corners are landmarks, which people click and survey.
     """
     task = found.task
@@ -72,9 +84,13 @@ def remarks(found: Fit, status: Tensor, doubt: Entangled, of_landmarks: bool = F
     sigma = found.pixel_sigma().detach()
     which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
     if len(which):
-        left = leftover(found, which, SIGNIFICANT)
+        left, groups = leftover(found, which, SIGNIFICANT), two_groups(found, which)
         for i, p in enumerate(which.tolist()):
-            texts[p].extend(filter(None, [_left_over(task, left, i, p, 0.0 if of_landmarks else float(sigma[p]))]))
+            sentence = _left_over(task, left, i, p, 0.0 if of_landmarks else float(sigma[p]))
+            if p in groups and groups[p].saved > BETTER * float(left.smooth.share[i]):
+                texts[p].append(_two_cameras(names, groups[p]))
+                sentence = "" if LENS_WORDS in sentence else sentence
+            texts[p].extend(filter(None, [sentence]))
     return tuple("; ".join(text) for text in texts)
 
 
@@ -101,6 +117,16 @@ def _contradicts_noise(found: Fit) -> Tensor:
     squares = found.variance_of_residuals().detach().nan_to_num(0.0) * spare
     rare = torch.special.gammaincc(spare.clamp(min=1) / 2, squares / 2) < CONTRADICTION
     return rare & (squares > NOTABLE**2 * spare)
+
+
+def _two_cameras(names: Sequence[str], group: TwoGroups) -> str:
+    named = [names[view] for view in group.smaller]
+    named = named if len(named) <= MOST_NAMED else [*named[:MOST_NAMED], f"{len(named) - MOST_NAMED} more"]
+    return (
+        f"{', '.join(named[:-1])} and {named[-1]} {ANOTHER_CAMERA} the other views (with one for each group the "
+        f"residuals' sum of squares is {100 * group.saved:.0f} % smaller): was it one camera with one zoom and focus, "
+        "no photograph turned, cropped or resized, and one flat board? Else calibrate the groups by themselves"
+    )
 
 
 def _not_told(other: Simpler) -> str:

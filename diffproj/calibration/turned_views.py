@@ -9,12 +9,11 @@ known least. From each choice, parameters and poses are improved in turn, by the
 handed on.
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
-from diffproj.calibration.parametrisation import POSE, Pose
+from diffproj.calibration.bowls import Bowls, bowls, of_prior
+from diffproj.calibration.parametrisation import Pose
 from diffproj.calibration.solver import Solution
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_poses import mean_squares, near_rivals, view_costs
@@ -31,14 +30,6 @@ TURNS = 6
 """How often parameters and poses are improved in turn."""
 
 
-class Bowls(NamedTuple):
-    """Costs of views by q shared parameters, `c + g x + x H x / 2`: `(P, V, q, q)`, `(P, V, q)` and `(P, V)`."""
-
-    H: Tensor
-    g: Tensor
-    c: Tensor
-
-
 def choices(task: Task, solution: Solution) -> tuple[Tensor, Pose]:
     """Cameras `(n,)` in their order, some more than once, and poses `(n, V, ...)` from which each may end lower."""
     p, v, other = near_rivals(task, solution)
@@ -47,7 +38,7 @@ def choices(task: Task, solution: Solution) -> tuple[Tensor, Pose]:
         return p, tuple(z[:0] for z in solution.local)
     rival[p, v] = True
     turned = tuple(z.index_put((p, v), new) for z, new in zip(solution.local, other, strict=True))
-    here, there = (_bowls(task, solution.shared, poses) for poses in (solution.local, turned))
+    here, there = (bowls(task, solution.shared, poses) for poses in (solution.local, turned))
     rival &= there.c.isfinite() & here.c.isfinite()
     there = Bowls(
         *(
@@ -55,7 +46,7 @@ def choices(task: Task, solution: Solution) -> tuple[Tensor, Pose]:
             for a, b in zip(there, here, strict=True)
         )
     )
-    pulled = _prior(task, solution.shared)
+    pulled = of_prior(task, solution.shared)
 
     used = task.used.any(-1)
     variance = torch.where(used, mean_squares(task, view_costs(task, solution.shared, solution.local)), torch.nan)
@@ -94,47 +85,6 @@ def _alone(rival: Tensor, more: Tensor) -> Tensor:
     first = torch.where(rival, more, torch.inf).topk(count, largest=False).indices
     one = torch.zeros(count, *rival.shape, dtype=torch.bool, device=rival.device)
     return one.scatter(2, first.mT.unsqueeze(-1), value=True) & rival
-
-
-def _bowls(task: Task, shared: Tensor, poses: Pose) -> Bowls:
-    panel = task.problem.linearise(shared, poses)
-    squared = panel[:, :, -1].square().sum(2)
-    weights = torch.ones_like(squared) if task.weights is None else task.weights
-    value = squared if task.loss is None else task.loss.value(squared)
-    cost = (value * weights).sum(-1) / 2
-    if task.loss is not None:
-        weights = weights * task.loss.weight(squared)
-    rows = (panel * weights.sqrt()[:, :, None, None]).flatten(-2)
-    gram = rows @ rows.mT
-    s = gram.shape[-1] - POSE - 1
-    U, E, W = gram[..., :s, :s], gram[..., :s, s:-1], gram[..., s:-1, s:-1]
-    L, failed = torch.linalg.cholesky_ex(W.nan_to_num())
-    Y = torch.linalg.solve_triangular(L, torch.cat([E.mT, gram[..., s:-1, -1:]], dim=-1), upper=False)
-    Y, y = Y[..., :-1], Y[..., -1:]
-    H, g = U - Y.mT @ Y, (gram[..., :s, -1:] - Y.mT @ y).squeeze(-1)
-    c = cost - y.square().sum((-2, -1)) / 2
-    if task.basis is not None:
-        T = task.basis.unsqueeze(1)
-        H, g = T.mT @ H @ T, (T.mT @ g.unsqueeze(-1)).squeeze(-1)
-    sound = (failed == 0) & c.isfinite() & g.isfinite().all(-1)
-    idle = ~task.used.any(-1)
-    shares = torch.ones_like(c) if task.shares is None else task.shares
-    shares = torch.where(sound & ~idle, shares, 0.0)
-    H, g = (torch.where(sound[..., None], part.flatten(2), 0.0).reshape(part.shape) for part in (H, g))
-    c = torch.where(idle, 0.0, torch.where(sound, c * shares, torch.inf))
-    return Bowls(H * shares[..., None, None], g * shares.unsqueeze(-1), c)
-
-
-def _prior(task: Task, shared: Tensor) -> tuple[Tensor, Tensor]:
-    """What the prior adds to the sums of H `(P, q, q)` and g `(P, q)`."""
-    s = shared.shape[-1]
-    T = torch.eye(s, dtype=shared.dtype, device=shared.device) if task.basis is None else task.basis
-    if task.prior is None:
-        Q, pull = shared.new_zeros(len(shared), s, s), torch.zeros_like(shared)
-    else:
-        Q = task.prior.whole
-        pull = (Q @ (shared - task.prior.mean).unsqueeze(-1)).squeeze(-1)
-    return T.mT @ Q @ T, (T.mT @ pull.unsqueeze(-1)).squeeze(-1)
 
 
 def _soft(here: Bowls, prior: tuple[Tensor, Tensor], variance: Tensor) -> Tensor:

@@ -27,7 +27,9 @@ def check_like_alone(
     assert (one.shares is None) == (alone.shares is None)
     assert torch.allclose(one.shared, alone.shared, rtol=accuracy, atol=accuracy)
     scale = alone.covariance.shared.abs().max()
-    assert (one.covariance.shared - alone.covariance.shared).abs().max() < max(1e-6, accuracy) * scale
+    assert (
+        one.covariance.shared - alone.covariance.shared
+    ).abs().max() < 1e-5 * scale  # hardly known coefficients follow rounding
     assert one.verdict == alone.verdict
 
 

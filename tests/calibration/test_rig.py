@@ -280,7 +280,7 @@ def test_wrong_arguments_are_named(three: Scene, pair: dict[str, dp.Views]) -> N
     views, board = three.views, three.board
     one, many = views["cam0"], dp.Views.stack([views["cam0"], views["cam0"]])
     cases = [
-        (TypeError, "views_by_camera: want a mapping", lambda: dp.calibrate_rig([one, one], board)),  # type: ignore
+        (TypeError, r"views_by_camera\[0\]: want a mapping", lambda: dp.calibrate_rig([one, one], board)),  # type: ignore
         (ValueError, "at least two cameras, got 1", lambda: dp.calibrate_rig({"a": one}, board)),
         (TypeError, r"views_by_camera\['b'\]", lambda: dp.calibrate_rig({"a": one, "b": 3}, board)),  # type: ignore
         (ValueError, r"views_by_camera\['b'\]: want those of one", lambda: dp.calibrate_rig({"a": one, "b": many}, board)),

@@ -62,6 +62,11 @@ def test_what_fails_stands_in_its_place(scenes: list[Scene]) -> None:
     assert str(found[2]).startswith("calibrate_rig: camera 'cam2' on its own: ")
     with pytest.raises(ValueError, match="the names of the views tell no moment"):
         dp.calibrate_rig([unconnected, unconnected], scenes[0].board)
+
+
+@pytest.mark.plain
+def test_what_is_no_rig_is_named(scenes: list[Scene]) -> None:
+    first = scenes[0].views
     with pytest.raises(TypeError, match=r"views_by_camera\[1\]: want a mapping from names of cameras to dp.Views, got"):
         dp.calibrate_rig([first, first["cam0"]], scenes[0].board)  # type: ignore[list-item]
 
