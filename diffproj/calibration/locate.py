@@ -112,6 +112,8 @@ def locate(
     if bool(found.ambiguous.any()):
         warnings.warn(f"locate: {found.ambiguity}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
     if text := described(found.mismatch, views.names):
+        if found.landmarks is not None:
+            text += " Pixels that were picked by hand are less exact than a detector's: pixel_sigma=0.5 says so"
         warn_caller(f"locate: {text}", CameraMismatchWarning)
     return found
 

@@ -184,3 +184,16 @@ def test_a_file_keeps_the_doubt(calibration: dp.Calibration, tmp_path: Path) -> 
     again = dp.load_calibration(tmp_path / "located.json")
     assert again.doubts == found.doubts
     assert torch.equal(again.mismatch.scale, found.mismatch.scale)
+
+
+def test_landmarks_that_a_hand_picked_are_thought_of(calibration: dp.Calibration) -> None:
+    generator = torch.Generator().manual_seed(0)
+    points = BOARD.points[::5].to(D) + torch.tensor([0.0, 0.0, -40.0], dtype=D) * (torch.arange(11) % 2)[:, None]
+    seen, _ = calibration.cameras[0].project(points)
+    picked = seen + 0.6 * torch.randn(seen.shape, generator=generator, dtype=D)
+    views = dp.Views(picked.unsqueeze(0), size=LEFT.size)
+    with pytest.warns(dp.CameraMismatchWarning, match="picked by hand .* pixel_sigma=0.5"):
+        dp.locate(views, dp.Landmarks(points), calibration)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", dp.CameraMismatchWarning)
+        dp.locate(views, dp.Landmarks(points), calibration, pixel_sigma=0.6)
