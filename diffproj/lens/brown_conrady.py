@@ -198,6 +198,6 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
     def _tabulate(coefficients: Tensor, domain: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         terms = Terms.of(torch.where((domain > 0).unsqueeze(-1), coefficients, 0))
         end = brown_domain.table_radius(terms, domain)
-        table = inverse_table(lambda r: r * radial(terms, r * r), end, brown_domain.sway(terms, end))
+        table = inverse_table(lambda r: r * radial(terms, r * r), end)
         reach, noise = brown_domain.reach(terms, domain), brown_domain.cancellation(terms, end)
         return reach, noise, table.rho_max, table.ratio
