@@ -3,7 +3,7 @@
 `distort` evaluates the equations of `brown_equations`. `undistort` inverts them by Newton's method (the tilt, a
 homography, is inverted in closed form first), in three stages:
 
-1. an initial estimate from a table of the inverse along the radius;
+1. an initial estimate from a table of the inverse along the radius, with tangential and prism terms to first order;
 2. a fixed number of Newton steps without autograd, then a globally convergent search, with a maximum number of steps,
    for the few points that have not converged;
 3. where a derivative is wanted, what `brown_gradient` adds.
