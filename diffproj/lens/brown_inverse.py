@@ -17,6 +17,8 @@ NEWTON_STEPS = {torch.float32: 1, torch.float64: 2}
 """Newton steps from the start to full precision, except for points next to a fold and strong tangential terms."""
 MOST_OUTWARD = 0.5
 """Largest share of the squared radius by which the start takes the tangential and prism terms to move a point."""
+MOST_STRETCHED = 4.0
+"""Largest factor that the start takes from the squared radius to the undistorted one to find these terms."""
 MANY = 0.125
 """Share of all points above which those that have not converged are many."""
 TOLERANCE = {torch.float32: 1.0, torch.float64: 2.0}
@@ -90,6 +92,8 @@ def _start(terms: Terms, target: Pair, rho_squared: Tensor, table: InverseTable)
     along = torch.addcmul(x * terms.two_p2, y, terms.two_p1)
     aside_x, aside_y = (polynomial(rho_squared, part) for part in (terms.sideways_x, terms.sideways_y))
     outward = torch.addcmul(torch.addcmul(along, x, aside_x), y, aside_y)
+    bent = rho_squared * (terms.above[0] - terms.below[0] if terms.below else terms.above[0])
+    outward = outward * ((1 - bent) / (1 + bent)).clamp(0, MOST_STRETCHED)  # where the terms act, farther out or in
     inner = minus_product(rho_squared, rho_squared, (2 * outward).clamp(-MOST_OUTWARD, MOST_OUTWARD))
     ratio = table.ratio_at(inner)
     square = ratio * ratio
