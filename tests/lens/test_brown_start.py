@@ -44,12 +44,11 @@ def share_left(lens: BrownConrady, xy_distorted: Tensor, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("name", ORDINARY)
-@pytest.mark.parametrize(("dtype", "radius"), [(torch.float32, 0.8), (torch.float64, 0.6)])
-def test_the_fixed_steps_are_enough(
-    name: str, dtype: torch.dtype, radius: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_fixed_steps_are_enough(name: str, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for a few points that rounding keeps from a residual as small as asked."""
     lens = BrownConrady(torch.tensor(ORDINARY[name], dtype=dtype))
-    assert share_left(lens, seen(lens, radius)[1], monkeypatch) < 0.03
+    assert share_left(lens, seen(lens, 0.8)[1], monkeypatch) < 0.05
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
