@@ -14,7 +14,7 @@ from diffproj.lens.polynomial import minus_product, polynomial
 from diffproj.lens.table import InverseTable
 
 NEWTON_STEPS = {torch.float32: 1, torch.float64: 2}
-"""Newton steps from the start to full precision, except for points next to a fold and strong tangential terms."""
+"""Newton steps from the start to full precision, except next to a fold or where tangential terms are strong."""
 MOST_OUTWARD = 0.5
 """Largest share of the squared radius by which the start takes the tangential and prism terms to move a point."""
 MOST_STRETCHED = 4.0

@@ -37,11 +37,9 @@ def coordinates(points: Tensor) -> tuple[Tensor, Tensor]:
     if compiling and points.device.type == "cpu" and not _transforming():
         points = _deinterleaved(points).movedim(0, -1)
     x, y = points.unbind(-1)
-    return (
-        (x.contiguous(), y.contiguous())
-        if points.device.type == "cpu" and not torch.compiler.is_compiling()
-        else (x, y)
-    )
+    if points.device.type == "cpu" and not torch.compiler.is_compiling():
+        x, y = x.contiguous(), y.contiguous()
+    return x, y
 
 
 def length_of(x: Tensor, y: Tensor) -> Tensor:
