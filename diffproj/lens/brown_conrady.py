@@ -3,7 +3,7 @@
 `distort` evaluates the equations of `brown_equations`. `undistort` inverts them by Newton's method (the tilt, a
 homography, is inverted in closed form first), in three stages:
 
-1. an initial estimate from a table of the inverse along the radius;
+1. an initial estimate from a table of the inverse along the radius, with tangential and prism terms to first order;
 2. a fixed number of Newton steps without autograd, then a globally convergent search, with a maximum number of steps,
    for the few points that have not converged;
 3. where a derivative is wanted, what `brown_gradient` adds.
@@ -198,6 +198,6 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
     def _tabulate(coefficients: Tensor, domain: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         terms = Terms.of(torch.where((domain > 0).unsqueeze(-1), coefficients, 0))
         end = brown_domain.table_radius(terms, domain)
-        table = inverse_table(lambda r: r * radial(terms, r * r), end, brown_domain.sway(terms, end))
+        table = inverse_table(lambda r: r * radial(terms, r * r), end)
         reach, noise = brown_domain.reach(terms, domain), brown_domain.cancellation(terms, end)
         return reach, noise, table.rho_max, table.ratio

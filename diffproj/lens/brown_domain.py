@@ -223,16 +223,6 @@ def table_radius(terms: Terms, domain: Tensor) -> Tensor:
     return torch.where(domain > 0, radius.gather(-1, last).squeeze(-1), 1)
 
 
-def sway(terms: Terms, radius: Tensor) -> Tensor:
-    """First harmonic of the distorted radius over the direction: its cosine and sine coefficients, `(*B, 2)`."""
-    s = (radius * radius).unsqueeze(-1)
-    parts = [
-        s * (tangential + polynomial(s, sideways))
-        for tangential, sideways in ((terms.two_p2, terms.sideways_x), (terms.two_p1, terms.sideways_y))
-    ]
-    return torch.cat(parts, dim=-1)
-
-
 def reach(terms: Terms, domain: Tensor) -> Tensor:
     """Upper bound of the distorted radius over the domain (before the tilt), `(*B,)`; infinite if the domain is.
 

@@ -177,6 +177,14 @@ def bend(terms: Terms, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     return torch.addcmul(x * factor, s, sideways_x), torch.addcmul(y * factor, s, sideways_y)
 
 
+def residual(terms: Terms, target: tuple[Tensor, Tensor], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`target - (x', y')`, and `s`."""
+    s = torch.addcmul(x * x, y, y)
+    factor = torch.addcmul(_tangential_factor(terms, x, y), s, _growth(terms, s))
+    off_x = minus_product(minus_product(target[0], x, factor), s, polynomial(s, terms.sideways_x))
+    return off_x, minus_product(minus_product(target[1], y, factor), s, polynomial(s, terms.sideways_y)), s
+
+
 def bend_off(terms: Terms, target: tuple[Tensor, Tensor], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Jacobian]:
     """Residual `target - (x', y')` and Jacobian of `(x', y')`, in as few operations as possible."""
     s = torch.addcmul(x * x, y, y)
@@ -210,7 +218,7 @@ def newton_direction(
 
 def _tangential_factor(terms: Terms, x: Tensor, y: Tensor) -> Tensor:
     """`1 + 2 (p1 y + p2 x)`."""
-    return torch.addcmul(torch.addcmul(terms.one, x, terms.two_p2), y, terms.two_p1)
+    return torch.addcmul(x * terms.two_p2, y, terms.two_p1) + terms.one
 
 
 class Tilted(NamedTuple):

@@ -1,31 +1,26 @@
 """The inverse of the Brown-Conrady equations by Newton's method, with a globally convergent search as fallback."""
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffproj._core.numerics import has_values, in_float64
-from diffproj.lens.brown_equations import Jacobian, Terms, bend, bend_off, newton_direction, term_growth, tilted
+from diffproj.lens.brown_equations import Terms, bend_off, newton_direction, residual, term_growth
+from diffproj.lens.brown_global import EDGE_MARGIN, Pair, global_newton
 from diffproj.lens.compiling import coordinates, length_of, with_batch_in_front
 from diffproj.lens.plan import Plan
+from diffproj.lens.polynomial import minus_product, polynomial
 from diffproj.lens.table import InverseTable
 
-Pair = tuple[Tensor, Tensor]
-
-NEWTON_STEPS = {torch.float32: 2, torch.float64: 3}
-"""Newton steps from the table's estimate to full precision, except for points next to a fold."""
-MAX_STEPS = 200
-"""Maximum number of steps of the global search: near a fold each step only halves the distance to the solution."""
-SUFFICIENT_DECREASE = 1e-4
-"""An accepted step lowers the squared residual by at least this part, times the step's fraction (Armijo 1966)."""
-EDGE_MARGIN = 1e-7
-"""Distance from the domain's edge, relative to its radius, below which a step may cross the edge."""
-BISECTIONS = 24
-"""Bisections along a ray for the start of the global search."""
-MIN_STEP_FRACTION = 1e-9
-"""Fraction of the Newton step below which the line search stops: rounding prevents any decrease."""
+NEWTON_STEPS = {torch.float32: 1, torch.float64: 2}
+"""Newton steps from the start to full precision, except next to a fold or where tangential terms are strong."""
+MOST_OUTWARD = 0.5
+"""Largest share of the squared radius by which the start takes the tangential and prism terms to move a point."""
+MOST_STRETCHED = 4.0
+"""Largest factor that the start takes from the squared radius to the undistorted one to find these terms."""
+MANY = 0.125
+"""Share of all points above which those that have not converged are many."""
 TOLERANCE = {torch.float32: 1.0, torch.float64: 2.0}
 """Largest residual of a solution, in units of the equations' rounding error."""
 TILT_FACTOR = 0.5
@@ -75,16 +70,11 @@ def search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, Te
         possible = inverse_depth > 0
     target = x, y
     rho_squared = torch.addcmul(x * x, y, y)
-    ratio = InverseTable(plan.rho_max, plan.ratio).ratio_at(x, y, rho_squared.sqrt())
-    start_x, start_y = x * ratio, y * ratio
+    start_x, start_y = _start(terms, target, rho_squared, InverseTable(plan.rho_max, plan.ratio))
     x, y = newton(terms, target, start_x, start_y, steps=NEWTON_STEPS[x.dtype])
     limit = (plan.reach * plan.reach).clamp_max(torch.finfo(x.dtype).max).unsqueeze(-1)
     possible = rho_squared <= limit if possible is None else possible & (rho_squared <= limit)
-    domain_squared = squared_domain(plan.domain)
-    share = 1 if terms.tilt is None else TILT_FACTOR
-    tolerance = share * TOLERANCE[x.dtype] * torch.finfo(x.dtype).eps * plan.noise
-    tolerance_squared = tolerance.square().unsqueeze(-1) * rho_squared
-    solved = _solves(terms, target, x, y, domain_squared, tolerance_squared) & possible
+    solved = _solves(terms, target, rho_squared, plan.domain, plan.noise, x, y) & possible
     batch = points.shape[:-2]
     lens = coefficients.expand(*batch, -1), plan.domain.expand(batch), plan.noise.expand(batch)
     left = possible & ~solved
@@ -96,20 +86,38 @@ def search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, Te
     return x, y, solved | found
 
 
+def _start(terms: Terms, target: Pair, rho_squared: Tensor, table: InverseTable) -> Pair:
+    """The inverse of the radial terms, with the tangential and prism ones taken along to first order."""
+    x, y = target
+    along = torch.addcmul(x * terms.two_p2, y, terms.two_p1)
+    aside_x, aside_y = (polynomial(rho_squared, part) for part in (terms.sideways_x, terms.sideways_y))
+    outward = torch.addcmul(torch.addcmul(along, x, aside_x), y, aside_y)
+    bent = rho_squared * (terms.above[0] - terms.below[0] if terms.below else terms.above[0])
+    outward = outward * ((1 - bent) / (1 + bent)).clamp(0, MOST_STRETCHED)  # where the terms act, farther out or in
+    inner = minus_product(rho_squared, rho_squared, (2 * outward).clamp(-MOST_OUTWARD, MOST_OUTWARD))
+    ratio = table.ratio_at(inner)
+    square = ratio * ratio
+    scale, aside = minus_product(terms.one, along, square) * ratio, square * ratio * rho_squared
+    return minus_product(x * scale, aside, aside_x), minus_product(y * scale, aside, aside_y)
+
+
 def _solves(
-    terms: Terms, target: Pair, x: Tensor, y: Tensor, domain_squared: Tensor, tolerance_squared: Tensor
+    terms: Terms, target: Pair, rho_squared: Tensor, domain: Tensor, noise: Tensor, x: Tensor, y: Tensor
 ) -> Tensor:
-    """Whether `(x, y)` lies in the domain and is distorted to the target."""
-    x_bent, y_bent = bend(terms, x, y)
-    off_x, off_y = x_bent - target[0], y_bent - target[1]
+    """Whether `(x, y)` lies in the domain and is distorted to the target, whose squared radius is `rho_squared`."""
+    share = 1 if terms.tilt is None else TILT_FACTOR
+    tolerance = share * TOLERANCE[x.dtype] * torch.finfo(x.dtype).eps * noise
+    off_x, off_y, s = residual(terms, target, x, y)
     off_squared = torch.addcmul(off_x * off_x, off_y, off_y)
-    return (off_squared <= tolerance_squared) & (torch.addcmul(x * x, y, y) <= domain_squared)
+    return (off_squared <= tolerance.square().unsqueeze(-1) * rho_squared) & (s <= squared_domain(domain))
 
 
 def _solve_remaining(
     coefficients: Tensor, domain: Tensor, noise: Tensor, points: Tensor, x: Tensor, y: Tensor, left: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Solve the points that have not converged, in float64: two Newton steps, then at most `MAX_STEPS` global ones.
+    """Solve the points that have not converged: by one more Newton step, then in float64.
+
+    There they take two Newton steps, then global ones.
 
     Args:
         coefficients: `(*B, k)`.
@@ -126,17 +134,60 @@ def _solve_remaining(
     index = left.nonzero(as_tuple=True)
     if index[0].numel() == 0:
         return x, y, left
-    chosen = points[index]
-    count = len(chosen)
-    lens = coefficients[index[:-1]].expand(count, -1), domain[index[:-1]].expand(count), noise[index[:-1]].expand(count)
-    found_x, found_y, solved = _solved_by_newton(*lens, chosen, x[index], y[index])
+    lens = coefficients, domain, noise
+    x, y, solved = _once_more(*lens, points, x, y, left, index)
+    index = (left & ~solved).nonzero(as_tuple=True)
+    if index[0].numel() == 0:
+        return x, y, left & solved
+    picked = *_lens_of_each(index, *lens), points[index]
+    found_x, found_y, solved = _solved_by_newton(*picked, x[index], y[index])
     unsolved = (~solved).nonzero(as_tuple=True)
     if unsolved[0].numel():
-        answer = _solved_globally(*(part[unsolved] for part in (*lens, chosen, found_x, found_y)))
+        answer = _solved_globally(*(part[unsolved] for part in (*picked, found_x, found_y)))
         found_x, found_y, solved = (
             whole.index_put(unsolved, part) for whole, part in zip((found_x, found_y, solved), answer, strict=True)
         )
     return x.index_put(index, found_x), y.index_put(index, found_y), left.index_put(index, solved)
+
+
+def _lens_of_each(index: tuple[Tensor, ...], *lens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Coefficients `(n, k)`, domain `(n,)` and noise `(n,)` for each of the picked points."""
+    coefficients, domain, noise = (part[index[:-1]] for part in lens)
+    count = index[0].numel()
+    return coefficients.expand(count, -1), domain.expand(count), noise.expand(count)
+
+
+def _once_more(
+    coefficients: Tensor,
+    domain: Tensor,
+    noise: Tensor,
+    points: Tensor,
+    x: Tensor,
+    y: Tensor,
+    left: Tensor,
+    index: tuple[Tensor, ...],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One more Newton step of the points that are left, in their dtype, and which it solves.
+
+    Where they are many all points take it, which costs less than to pick them. Each is moved in the same way.
+    """
+    if index[0].numel() > MANY * left.numel():
+        step_x, step_y, solved = _stepped_and_checked(coefficients, domain, noise, points, x, y)
+        return torch.where(left, step_x, x), torch.where(left, step_y, y), solved
+    lens, place = _lens_of_each(index, coefficients, domain, noise), (x[index].unsqueeze(-1), y[index].unsqueeze(-1))
+    step_x, step_y, solved = _one_by_one(_stepped_and_checked(*lens, points[index].unsqueeze(-2), *place))
+    return x.index_put(index, step_x), y.index_put(index, step_y), left.index_put(index, solved)
+
+
+def _stepped_and_checked(
+    coefficients: Tensor, domain: Tensor, noise: Tensor, points: Tensor, x: Tensor, y: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """A Newton step from `(x, y)`, each `(*B, N)`, and whether it leads to a solution."""
+    terms = Terms.of(coefficients)
+    target = untilted(terms, points)
+    x, y = newton(terms, target, x, y, steps=1)
+    rho_squared = torch.addcmul(target[0] * target[0], target[1], target[1])
+    return x, y, _solves(terms, target, rho_squared, domain, noise, x, y)
 
 
 def _solved_in_graph(
@@ -175,14 +226,14 @@ def _solved_by_newton(
 def _solved_globally(
     coefficients: Tensor, domain: Tensor, noise: Tensor, points: Tensor, x: Tensor, y: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The global search, of at most `MAX_STEPS` steps. One lens for each of `n` points."""
+    """The global search. One lens for each of `n` points."""
     terms = Terms.of(in_float64(coefficients))
     goal_x, goal_y = in_float64(points).split(1, dim=-1)
     target = untilted(terms, in_float64(points).unsqueeze(-2))
     enough = (torch.finfo(goal_x.dtype).eps * torch.hypot(goal_x, goal_y)) ** 2
     start_x, start_y = (in_float64(part).unsqueeze(-1).nan_to_num(0.0, 0.0, 0.0) for part in (x, y))
     radius = in_float64(domain).unsqueeze(-1)
-    found = _global_newton(terms, (goal_x, goal_y), start_x, start_y, radius, enough)
+    found = global_newton(terms, (goal_x, goal_y), start_x, start_y, radius, enough)
     return _one_by_one(_rounded_and_checked(terms, target, domain, noise, x.dtype, *found))
 
 
@@ -235,122 +286,3 @@ def _solve_remaining_batched(
     info: Any, in_dims: tuple[int | None, ...], *tensors: Tensor
 ) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[int, int, int]]:
     return _solve_remaining_op(*with_batch_in_front(info, in_dims, *tensors)), (0, 0, 0)
-
-
-def _global_newton(
-    terms: Terms, goal: Pair, x: Tensor, y: Tensor, radius: Tensor, enough: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Damped Newton's method with line search on the lens extended to the whole plane, of at most `MAX_STEPS` steps.
-
-    The lens is extended beyond its disc by `G(z) = F(p) + c (z - p)`, where `p` is the point of the disc closest to
-    `z` and the stiffness `c` is about the lens's magnification (Robinson 1992, the normal map of a variational
-    inequality). In the disc the symmetric part of the Jacobian is positive definite, so `G` maps the plane one-to-one
-    onto itself and its Jacobian is singular nowhere: the residual has no other local minimum, whatever the start. A
-    goal without a preimage in the disc has one under `G` outside.
-
-    Args:
-        terms: those of the lens, as columns that broadcast against the points.
-        goal: distorted points, with tilt if the lens has one.
-        x: initial estimate.
-        y: the same.
-        radius: of the disc.
-        enough: squared residual at which to stop.
-
-    Returns:
-        The last accepted `x` and `y`.
-    """
-    x_next, y_next = _on_ray(terms, goal, x, y, radius)
-    there = tilted(terms, x_next, y_next)
-    xx, xy, yx, yy = there.jacobian
-    stiffness = torch.hypot(torch.hypot(xx, xy), torch.hypot(yx, yy)) / (math.sqrt(2) * there.depth)
-    step_x = step_y = torch.zeros_like(x)
-    off = torch.full_like(x, torch.inf)
-    share, going = torch.ones_like(x), torch.ones_like(x, dtype=torch.bool)
-    settled = torch.finfo(x.dtype).eps ** 2
-    for _ in range(MAX_STEPS):
-        off_x, off_y, along_x, along_y = _extended_step(terms, goal, x_next, y_next, radius, stiffness)
-        off_next = torch.addcmul(off_x * off_x, off_y, off_y)
-        accepted = off_next < (1 - SUFFICIENT_DECREASE * share) * off
-        x, y, off = (
-            torch.where(accepted, x_next, x),
-            torch.where(accepted, y_next, y),
-            torch.where(accepted, off_next, off),
-        )
-        step_x, step_y = torch.where(accepted, along_x, step_x), torch.where(accepted, along_y, step_y)
-        size = torch.addcmul(x * x, y, y)
-        going = (
-            (off > enough)
-            & (torch.addcmul(step_x * step_x, step_y, step_y) > settled * size)
-            & (share > MIN_STEP_FRACTION)
-        )
-        if not bool(going.any()):
-            break
-        share = torch.where(accepted, 2 * share, share / 4).clamp_max(1)
-        x_next, y_next = _stepped(x, y, share * step_x, share * step_y, radius)
-    return x, y
-
-
-def _stepped(x: Tensor, y: Tensor, step_x: Tensor, step_y: Tensor, radius: Tensor) -> Pair:
-    """The point after a step: its tangential part follows the circle, and it goes at most 0.9 of the way to the edge.
-
-    Next to a pole the distance to the edge may be a millionth of the radius; a straight tangential step would cross
-    the edge. A point within `EDGE_MARGIN` of the edge or outside is not limited.
-    """
-    distance = torch.hypot(x, y)
-    length = distance.clamp_min(torch.finfo(x.dtype).tiny)
-    along, sideways = (x * step_x + y * step_y) / length, (x * step_y - y * step_x) / length
-    circular = (sideways.abs() < distance / 2) & (along > -distance / 2)
-    angle = torch.where(circular, sideways / length, 0)
-    ahead = distance + along
-    turned_x = torch.where(circular, ahead * (x * angle.cos() - y * angle.sin()) / length, x + step_x)
-    turned_y = torch.where(circular, ahead * (x * angle.sin() + y * angle.cos()) / length, y + step_y)
-    inside = radius - distance > EDGE_MARGIN * radius
-    most = torch.where(inside, distance + 0.9 * (radius - distance), torch.inf)
-    shrink = (most / torch.hypot(turned_x, turned_y)).clamp_max(1).nan_to_num(1.0)
-    return turned_x * shrink, turned_y * shrink
-
-
-def _on_ray(terms: Terms, goal: Pair, x: Tensor, y: Tensor, radius: Tensor) -> Pair:
-    """Start of the global search: a point on the ray towards the goal, or `(x, y)` if its residual is smaller.
-
-    Along a ray from the centre the component of the distorted point in the ray's direction is increasing, so bisection
-    finds where it equals the goal's distance.
-    """
-    size = torch.hypot(*goal)
-    towards_x, towards_y = (part / size.clamp_min(torch.finfo(x.dtype).tiny) for part in goal)
-    low, high = torch.zeros_like(size), torch.where(radius < torch.inf, radius, 0)
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        there = tilted(terms, towards_x * middle, towards_y * middle)
-        short = towards_x * there.x + towards_y * there.y < size
-        low, high = torch.where(short, middle, low), torch.where(short, high, middle)
-    shrink = (radius / torch.hypot(x, y)).clamp_max(1).nan_to_num(1.0)
-    starts = (x * shrink, y * shrink), (towards_x * low, towards_y * low)
-    there = [tilted(terms, *start) for start in starts]
-    off, off_on_ray = (torch.hypot(goal[0] - place.x, goal[1] - place.y) for place in there)
-    return torch.where(off < off_on_ray, starts[0][0], starts[1][0]), torch.where(
-        off < off_on_ray, starts[0][1], starts[1][1]
-    )
-
-
-def _extended_step(
-    terms: Terms, goal: Pair, x: Tensor, y: Tensor, radius: Tensor, stiffness: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Residual of the extended lens `G` at `(x, y)`, and the Newton step there."""
-    distance = torch.hypot(x, y)
-    outside = distance > radius
-    shrink = torch.where(outside, radius / distance, 1)
-    x_in, y_in = x * shrink, y * shrink
-    there = tilted(terms, x_in, y_in)
-    off_x, off_y = goal[0] - there.x - stiffness * (x - x_in), goal[1] - there.y - stiffness * (y - y_in)
-    # Jacobian of the closest point of the disc: a scaling, without the radial component.
-    along_x, along_y = torch.where(outside, x / distance, 0), torch.where(outside, y / distance, 0)
-    p_xx, p_xy, p_yy = (shrink * part for part in (along_y * along_y, -along_x * along_y, along_x * along_x))
-    p_xx, p_yy = torch.where(outside, p_xx, 1), torch.where(outside, p_yy, 1)
-    slope = Jacobian(*(part / there.depth for part in there.jacobian))
-    xx = slope.xx * p_xx + slope.xy * p_xy + stiffness * (1 - p_xx)
-    xy = slope.xx * p_xy + slope.xy * p_yy - stiffness * p_xy
-    yx = slope.yx * p_xx + slope.yy * p_xy - stiffness * p_xy
-    yy = slope.yx * p_xy + slope.yy * p_yy + stiffness * (1 - p_yy)
-    determinant = xx * yy - xy * yx
-    return off_x, off_y, (yy * off_x - xy * off_y) / determinant, (xx * off_y - yx * off_x) / determinant

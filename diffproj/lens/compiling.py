@@ -30,13 +30,15 @@ def _transforming() -> bool:
 def coordinates(points: Tensor) -> tuple[Tensor, Tensor]:
     """`x` and `y` of points `(*B, N, 2)`, outside of autograd.
 
-    In a compiled graph for the CPU, but not in an exported one, an opaque operation makes them contiguous first: a
-    loop with stride 2 is not vectorised and runs at a quarter of the speed.
+    On a CPU, but not in an exported graph, they are made contiguous first, in a compiled graph by an opaque operation:
+    a loop with stride 2 is not vectorised and runs at a quarter of the speed.
     """
     compiling = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
     if compiling and points.device.type == "cpu" and not _transforming():
         points = _deinterleaved(points).movedim(0, -1)
     x, y = points.unbind(-1)
+    if points.device.type == "cpu" and not torch.compiler.is_compiling():
+        x, y = x.contiguous(), y.contiguous()
     return x, y
 
 

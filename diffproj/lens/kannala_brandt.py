@@ -191,7 +191,7 @@ class KannalaBrandt(CoefficientLens, tensors={"coefficients": 1}):
             return theta * _profile(columns, theta * theta)
 
         end = torch.where(domain > 0, domain, 1)
-        table = inverse_table(rise, end, torch.zeros_like(coefficients[..., :2]))
+        table = inverse_table(rise, end)
         squares = (end.unsqueeze(-1) * _angles(coefficients) / math.pi) ** 2
         growth = _profile([column.abs() for column in columns], squares) / _profile(columns, squares)
         noise = growth.amax(-1).clamp(1, 64)
@@ -244,7 +244,7 @@ def _search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, T
     rho = torch.where(possible, rho, 0)
     rho_squared = rho * rho
     highest = _highest(plan.domain.unsqueeze(-1), rho)
-    sigma = torch.minimum(InverseTable(plan.rho_max, plan.ratio).ratio_at(x, y, rho), highest)
+    sigma = torch.minimum(InverseTable(plan.rho_max, plan.ratio).ratio_at(rho_squared), highest)
     sigma = _bracketed(k, rho_squared, sigma, highest, NEWTON_STEPS)
     settled = _settled(k, plan.noise.unsqueeze(-1), rho_squared, sigma)
     batch = points.shape[:-2]

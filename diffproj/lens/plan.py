@@ -23,8 +23,8 @@ class Plan(NamedTuple):
         domain: `(*B,)`, the largest undistorted radius, or the largest angle from the axis.
         reach: `(*B,)`, no point of the domain is distorted to a larger radius (the tilt undone).
         noise: `(*B,)`, how much larger than its result the terms of the radial sum get.
-        rho_max: `(*B, 3)`, part of the table of the inverse.
-        ratio: `(*B, NODES)`, the other part.
+        rho_max: `(*B,)`, part of the table of the inverse.
+        ratio: `(*B, 2, NODES)`, the other part.
     """
 
     domain: Tensor
@@ -34,7 +34,7 @@ class Plan(NamedTuple):
     ratio: Tensor
 
 
-AXES = (0, 0, 0, 1, 1)
+AXES = (0, 0, 0, 0, 2)
 """How many axes each part has behind those of the batch."""
 
 
@@ -150,7 +150,7 @@ def _domain_shape(coefficients: Tensor, key: str) -> Tensor:  # noqa: ARG001
 @_rest.register_fake
 def _rest_shapes(coefficients: Tensor, domain: Tensor, key: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # noqa: ARG001
     batch = coefficients.shape[:-1]
-    reach, noise, rho_max, ratio = (coefficients.new_empty((*batch, *size)) for size in ((), (), (3,), (NODES,)))
+    reach, noise, rho_max, ratio = (coefficients.new_empty((*batch, *size)) for size in ((), (), (), (2, NODES)))
     return reach, noise, rho_max, ratio
 
 

@@ -1,14 +1,12 @@
-"""Initial estimate for Newton's method: a small table of the inverse along the radius, so that few steps suffice.
+"""Initial estimate for Newton's method: a table of the inverse along the radius, so good that one step or two suffice.
 
 Along a ray from the centre let `rho = f(r)` be the distorted radius and `rho_max = f(r_max)` that at the edge. At a
 fold the inverse has a square root, `r_max - r ~ sqrt(rho_max - rho)`. As a function of
 
-    u = sqrt(1 - rho / rho_max)
+    u = sqrt((1 - rho^2 / rho_max^2) / (1 + rho^2 / c^2)),  c = min(rho_max, 1)
 
-it is smooth up to the edge, so that linear interpolation between a few uniform nodes in `u` is accurate enough. The
-table holds `r / rho` averaged over all rays, which is smooth at the centre too. Tangential and prism terms make
-`rho_max` vary with the cosine and sine of the ray's direction (`sway`); the ratio is corrected by the same variation,
-the more the closer to the edge.
+it is smooth from the centre up to the edge, so that linear interpolation between uniform nodes in `u` is accurate. The
+denominator keeps most nodes within 45 degrees of the axis however far the table reaches. The table holds `r / rho`.
 """
 
 from collections.abc import Callable
@@ -17,9 +15,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-NODES = 64
+NODES = 256
 """Nodes of the table."""
-SAMPLES = 96
+SAMPLES = 384
 """Samples of the forward profile from which it is built."""
 
 
@@ -27,58 +25,70 @@ class InverseTable(NamedTuple):
     """A tabulated inverse.
 
     Attributes:
-        rho_max: `(*B, 3)`, the distorted radius at which the table ends: mean, cosine part, sine part.
-        ratio: `(*B, NODES)`, `r / rho` of the mean at uniform nodes in `u`.
+        rho_max: `(*B,)`, the distorted radius at which the table ends.
+        ratio: `(*B, 2, NODES)`, `r / rho` at uniform nodes in `u`, and how much it rises from each to the next.
     """
 
     rho_max: Tensor
     ratio: Tensor
 
-    def ratio_at(self, x: Tensor, y: Tensor, rho: Tensor) -> Tensor:
-        """`r / rho` for distorted points `(*B, N)` of radius `rho`; beyond the table's end, that at its end."""
-        mean, cosine, sine = self.rho_max.unsqueeze(-2).unbind(-1)
-        tiny = torch.full_like(mean, torch.finfo(rho.dtype).tiny)
-        along_mean = torch.addcmul(tiny, rho, mean)
-        along_ray = torch.addcmul(torch.addcmul(along_mean, x, cosine), y, sine)
-        out = rho * rho / along_ray
+    def ratio_at(self, rho_squared: Tensor) -> Tensor:
+        """`r / rho` for distorted points of squared radius `rho_squared (*B, N)`; beyond the table, that at its end."""
+        farthest = (self.rho_max * self.rho_max).unsqueeze(-1)
+        near = farthest.clamp_max(1)
+        end = (NODES - 1) ** 2 * near / farthest  # position^2 is A / (c^2 + rho^2) - this
+        squared = (near + rho_squared).reciprocal() * (near * ((NODES - 1) ** 2 + end)) - end
         if torch.compiler.is_exporting():  # of operations that ONNX has
-            position = torch.where(out < 1, 1 - out, 0.0).clamp_max(1).sqrt() * (NODES - 1)
-        else:
-            position = torch.fmax(1 - out, torch.zeros_like(mean)).clamp_max_(1).sqrt_().mul_(NODES - 1)  # 0 for NaN
-        index = position.long()
-        ratio = _interpolated(self.ratio, index, position - index)
-        return torch.addcmul(ratio, ratio * out, along_mean / along_ray - 1)
+            position = torch.where(squared > 0, squared, 0.0).sqrt()
+            index = position.long().clamp(0, NODES - 1)
+            return _interpolated(self.ratio, index, position - index)
+        position = squared.clamp_min(0).sqrt()
+        return _interpolated(self.ratio, position.int().clamp(0, NODES - 1), position.frac())  # a NaN has an index too
 
 
 def _interpolated(nodes: Tensor, index: Tensor, fraction: Tensor) -> Tensor:
-    slope = torch.nn.functional.pad(nodes.diff(dim=-1), (0, 1))
-    if nodes.ndim == 1:
-        return torch.addcmul(nodes[index], fraction, slope[index])
-    shape = (*index.shape[:-1], NODES)
-    return torch.addcmul(nodes.expand(shape).gather(-1, index), fraction, slope.expand(shape).gather(-1, index))
+    if nodes.ndim == 2:  # four times as fast on a CPU as by brackets
+        low, rise = (part.index_select(0, index.flatten()).view(index.shape) for part in nodes)
+    else:
+        shape, index = (*index.shape[:-1], NODES), index.long()
+        low, rise = (part.expand(shape).gather(-1, index) for part in nodes.unbind(-2))
+    return torch.addcmul(low, fraction, rise)
 
 
-def inverse_table(profile: Callable[[Tensor], Tensor], radius: Tensor, sway: Tensor) -> InverseTable:
+def inverse_table(profile: Callable[[Tensor], Tensor], radius: Tensor) -> InverseTable:
     """Tabulate the inverse of a radial profile with slope 1 at the centre.
 
     Args:
-        profile: maps radii `(*B, n)` to distorted radii, averaged over all rays.
+        profile: maps radii `(*B, n)` to distorted radii.
         radius: the finite radius at which the table ends `(*B,)`; the profile must increase up to it.
-        sway: cosine and sine coefficients of the distorted radius at the end, `(*B, 2)`.
 
     Returns:
         The table.
     """
-    t = torch.linspace(0, 1, SAMPLES, dtype=radius.dtype, device=radius.device)
-    nodes = torch.linspace(0, 1, NODES, dtype=radius.dtype, device=radius.device)
     radius = radius.unsqueeze(-1)
-    rho = profile(radius * (1 - t * t))
+    steps = torch.linspace(0, 1, SAMPLES, dtype=radius.dtype, device=radius.device)
+    r = _radius_at(steps, radius)
+    rho = profile(r)
     rho_max = rho[..., :1]
-    u = (1 - rho / rho_max).clamp(0, 1).sqrt()
-    right = (u.unsqueeze(-2) < nodes.unsqueeze(-1)).sum(-1).clamp(1, SAMPLES - 1)
+    nodes = torch.zeros_like(radius) + torch.linspace(0, 1, NODES, dtype=radius.dtype, device=radius.device)
+    u = _position_of(rho, rho_max).contiguous()
+    right = torch.searchsorted(u, nodes).clamp(1, SAMPLES - 1)
     u0, u1 = u.gather(-1, right - 1), u.gather(-1, right)
-    t_node = torch.lerp(t[right - 1], t[right], ((nodes - u0) / (u1 - u0)).clamp(0, 1))
-    ratio = radius * (1 - t_node**2) / (rho_max * (1 - nodes**2))
-    at_centre = torch.arange(NODES, device=radius.device) == NODES - 1
-    ratio = torch.where(at_centre | ~ratio.isfinite(), 1, ratio)
-    return InverseTable(torch.cat([rho_max, sway], dim=-1), ratio)
+    ratio = torch.where(rho > 0, r / rho, 1)
+    share = ((nodes - u0) / (u1 - u0)).clamp(0, 1).nan_to_num(0.0)
+    ratio = torch.lerp(ratio.gather(-1, right - 1), ratio.gather(-1, right), share)
+    ratio = torch.where(ratio.isfinite(), ratio, 1)
+    rise = torch.nn.functional.pad(ratio.diff(dim=-1), (0, 1))
+    return InverseTable(rho_max.squeeze(-1), torch.stack([ratio, rise], dim=-2))
+
+
+def _position_of(rho: Tensor, rho_max: Tensor) -> Tensor:
+    """`u`."""
+    share = (rho / rho_max) ** 2
+    return ((1 - share).clamp_min(0) / (1 + share * rho_max.square().clamp_min(1))).sqrt()
+
+
+def _radius_at(u: Tensor, rho_max: Tensor) -> Tensor:
+    """The inverse of `_position_of`."""
+    square = u * u
+    return rho_max * ((1 - square) / (1 + square * rho_max.square().clamp_min(1))).sqrt()
