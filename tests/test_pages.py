@@ -21,7 +21,7 @@ def code_of(page: Path) -> str:
 def test_code_gives_what_the_page_says(page: Path) -> None:
     test = doctest.DocTestParser().get_doctest(code_of(page), {}, page.name, str(page), 0)
     said = io.StringIO()
-    doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(test, out=said.write)
+    doctest.DocTestRunner(verbose=False, optionflags=doctest.NORMALIZE_WHITESPACE).run(test, out=said.write)
     assert len(test.examples) > 3
     assert not said.getvalue(), said.getvalue()
 

@@ -40,7 +40,8 @@ from diffproj.calibration.task import Task
 FEW_VIEWS = 2.5
 """The excess counts `1 + FEW_VIEWS / (views - 1)` fold."""
 FEW_VIEWS_OF_A_SHAPE = 6.0
-"""The same where the target's points are free: what these take from few views is not seen in their residuals."""
+"""The same where the target's points are free: what these take from few views is not seen in their residuals. Of
+surveyed landmarks it is, which stay near where they were surveyed."""
 BELIEF = 4.0
 """Degrees of freedom below which phi counts little: what one or two of them say is mostly chance."""
 SINGULAR = 1e-9
@@ -57,7 +58,7 @@ def dispersion(found: Fit) -> Tensor:
     free = shared.shape[-1] if task.basis is None else task.basis.shape[-1]
     if free == 0 or task.used.shape[1] < 2:
         return torch.ones_like(shared[:, 0])
-    few_views = FEW_VIEWS if not task.free else FEW_VIEWS_OF_A_SHAPE
+    few_views = FEW_VIEWS_OF_A_SHAPE if task.free and not task.surveyed else FEW_VIEWS
     with torch.inference_mode():
         if task.free:
             contradicting = _moved_intrinsics(found, shared, local)
@@ -185,7 +186,14 @@ def _moved_intrinsics(found: Fit, shared: Tensor, local: tuple[Tensor, ...]) -> 
     views = task.used.any(-1).sum(-1)
     phi = ratio.sum(-1) / free.sum(-1).clamp(min=1)
     counted = (share * task.used.any(-1)).sum(-1)
-    return Contradiction(phi, torch.where(free.any(-1), 2 * (counted - 1), 0.0), views)
+    return Contradiction(phi, torch.where(free.any(-1), _directions(basis) * (counted - 1), 0.0), views)
+
+
+def _directions(basis: Tensor | None) -> Tensor | int:
+    """In how many directions `(P,)` focal lengths and principal point move that differ: they tell two at most."""
+    if basis is None:
+        return 2
+    return (basis[:, : len(INTRINSICS)] != 0).any(1).sum(-1).clamp(max=2)
 
 
 def _weighted(
