@@ -41,6 +41,7 @@ WORDS = (
     (r"; fix (it|them), or take a simpler lens", "; take a simpler lens"),
     (r"\b(distortion|shape)=(['\"]?)(\w*)\2", r"--\1 \3"),
     (r"'(none|brown\d+|fisheye|auto)'", r"\1"),
+    (r"\bformat='", "--to '"),
     (r"\bpixel_sigma=", "--pixel-sigma "),
     (r"\bskew=True", "--skew"),
     (r"\breject_outliers=True", "--reject-outliers"),

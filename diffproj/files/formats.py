@@ -93,7 +93,7 @@ CONVENTIONS: dict[FormatName, str] = {
     "kalibr": "IMU or first camera to camera; pixel centres at whole numbers",
     "ros": "K and D of the raw image; --camera rectified is that of the rectified one, by P",
     "settings": "pixel centres at whole numbers, k1 k2 p1 p2 k3 one by one; poses in a body are not taken",
-    "opencv": "pixel centres at whole numbers, coefficients in OpenCV's order; of two cameras, R and T from 1 to 2",
+    "opencv": "pixel centres at whole numbers, coefficients in OpenCV's order; with two cameras, R and T from 1 to 2",
 }
 """What was turned into the conventions of `Camera`, in a line each."""
 
