@@ -27,9 +27,7 @@ def check_like_alone(
     assert (one.shares is None) == (alone.shares is None)
     assert torch.allclose(one.shared, alone.shared, rtol=accuracy, atol=accuracy)
     scale = alone.covariance.shared.abs().max()
-    assert (
-        one.covariance.shared - alone.covariance.shared
-    ).abs().max() < 1e-5 * scale  # hardly known coefficients follow rounding
+    assert (one.covariance.shared - alone.covariance.shared).abs().max() < max(1e-6, 100 * accuracy) * scale
     assert one.verdict == alone.verdict
 
 
@@ -47,8 +45,10 @@ def test_each_ends_as_alone(options: dict) -> None:
 )
 def test_each_ends_as_alone_whatever_is_fitted(options: dict) -> None:
     found = dp.calibrate(cameras(), BOARD, throw=False, **options)
-    for number in (0, 1, 4, 5, 6):  # a print's prior weighs against noise that is known to 1e-7
-        check_like_alone(found, number, 1e-6 if "priors" in options else 1e-10, **options)
+    # A print's prior weighs against noise that is known to 1e-7, and a denominator's coefficients are hardly known.
+    rough = not {"priors", "distortion"}.isdisjoint(options)
+    for number in (0, 1, 4, 5, 6):
+        check_like_alone(found, number, 1e-6 if rough else 1e-10, **options)
 
 
 def test_a_failure_is_told_in_its_place() -> None:
