@@ -43,21 +43,12 @@ class RigTask:
     moved: Tensor | None = None
 
 
-def rig_calibrated(
-    views_by_camera: Mapping[str, Views],
-    target: Target,
-    distortion: LensModel | Mapping[str, LensModel],
-    moments: Moments | None,
-    cameras: Any,
-    chosen: Options,
-    who: str,
-    moved: Tensor | None = None,
-) -> RigCalibration:
-    """What `calibrate_rig` promises, for checked options; errors name `who` was asked.
+def rig_calibrated(task: RigTask) -> RigCalibration:
+    """What `calibrate_rig` promises.
 
-    With `moved (N, 3)` the target's points are known to lie so far from where it has them.
+    Raises:
+        CalibrationError: as `finished`.
     """
-    task = rig_task(views_by_camera, target, distortion, moments, cameras, chosen, who, moved)
     return finished(task, alone(task.asked))
 
 
@@ -71,7 +62,10 @@ def rig_task(
     who: str,
     moved: Tensor | None = None,
 ) -> RigTask:
-    """What is asked, looked at; nothing is computed yet."""
+    """What is asked, looked at, with checked options; nothing is computed yet, and errors name `who` was asked.
+
+    With `moved (N, 3)` the target's points are known to lie so far from where it has them.
+    """
     views = rig_views(views_by_camera, target, moments, chosen.weights, who)
     known = checked_cameras(cameras, views.names)
     lens = lenses(distortion, views.names)

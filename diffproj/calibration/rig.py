@@ -7,7 +7,7 @@ one pose a camera relative to the first, one pose of the target a moment. It com
 from collections.abc import Mapping, Sequence
 from typing import Any, Unpack, overload
 
-from diffproj.calibration.one_rig import rig_calibrated
+from diffproj.calibration.one_rig import rig_calibrated, rig_task
 from diffproj.calibration.result import CalibrationError
 from diffproj.calibration.rig_fleet import each_rig
 from diffproj.calibration.rig_options import RigOptions, rig_options
@@ -88,4 +88,5 @@ def calibrate_rig(
     who, chosen = "calibrate_rig", rig_options("calibrate_rig", options)
     if isinstance(views_by_camera, list | tuple) and views_by_camera:
         return each_rig(views_by_camera, target, distortion, moments, cameras, chosen, who)
-    return rig_calibrated(views_by_camera, target, distortion, moments, cameras, chosen, who)  # type: ignore[arg-type]
+    task = rig_task(views_by_camera, target, distortion, moments, cameras, chosen, who)  # type: ignore[arg-type]
+    return rig_calibrated(task)

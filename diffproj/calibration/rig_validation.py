@@ -11,7 +11,7 @@ from torch import Tensor
 from diffproj._core.arguments import whole_number
 from diffproj._core.shown import Shown
 from diffproj.calibration.locate import located
-from diffproj.calibration.one_rig import rig_calibrated
+from diffproj.calibration.one_rig import rig_calibrated, rig_task
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.rig_options import RigOptions, rig_options
 from diffproj.calibration.rig_result import RigCalibration
@@ -121,7 +121,7 @@ def cross_validate_rig(
     for fold in range(folds):
         out = {name: where % folds == fold for name, where in whole.where.items()}
         kept = {name: views.hiding(_every_corner(views, out[name])) for name, views in views_by_camera.items()}
-        fit = rig_calibrated(kept, target, distortion, labels, cameras, chosen, who)
+        fit = rig_calibrated(rig_task(kept, target, distortion, labels, cameras, chosen, who))
         fits.append(fit)
         errors = _Errors()
         for one in fit.calibrations.values():
@@ -159,7 +159,7 @@ def _held_out(
             known = {name: fit.cameras[name] for name in seen}
             theirs = {name: labels[name] for name in seen}
             moved = None if fit.shape == "flat" else fit.points - next(iter(fit.calibrations.values())).nominal
-            found = rig_calibrated(seen, target, "none", theirs, known, chosen, who, moved).calibrations
+            found = rig_calibrated(rig_task(seen, target, "none", theirs, known, chosen, who, moved)).calibrations
         for name, one in found.items():
             counts = held[name].visible & hidden & one.used.any(-1, keepdim=True)
             total = total.plus(_errors(one, counts, held[name]))
