@@ -93,7 +93,7 @@ def _start(terms: Terms, target: Pair, rho_squared: Tensor, table: InverseTable)
     aside_x, aside_y = (polynomial(rho_squared, part) for part in (terms.sideways_x, terms.sideways_y))
     outward = torch.addcmul(torch.addcmul(along, x, aside_x), y, aside_y)
     bent = rho_squared * (terms.above[0] - terms.below[0] if terms.below else terms.above[0])
-    outward = outward * ((1 - bent) / (1 + bent)).clamp(0, MOST_STRETCHED)  # where the terms act, farther out or in
+    outward = outward * ((1 - bent) / (1 + bent)).clamp(0.0, MOST_STRETCHED)  # where the terms act, farther out or in
     inner = minus_product(rho_squared, rho_squared, (2 * outward).clamp(-MOST_OUTWARD, MOST_OUTWARD))
     ratio = table.ratio_at(inner)
     square = ratio * ratio

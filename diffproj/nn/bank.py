@@ -13,7 +13,7 @@ from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.collating import stack
 from diffproj.geometry.plane import Plane
 from diffproj.lens.models import model_of
-from diffproj.nn.partial import Learn
+from diffproj.nn.partial import Learn, asked_parts
 from diffproj.nn.projector import PlaneProjector, camera_numbers
 
 
@@ -70,10 +70,9 @@ class ProjectorBank(nn.Module):
         for kind, numbers in enumerate(kinds.values()):
             for place, number in enumerate(numbers):
                 kind_of[number], place_of[number] = kind, place
-            own = learn
-            if given[numbers[0]].distortion is None and not isinstance(learn, str):
-                parts = {part: learn[part] for part in learn} if isinstance(learn, dict) else dict.fromkeys(learn, True)
-                own = {part: where for part, where in parts.items() if part != "distortion"}
+            own = asked_parts(learn)
+            if given[numbers[0]].distortion is None:
+                own.pop("distortion", None)
             projectors.append(PlaneProjector(stack([given[number] for number in numbers]), plane, own, False))
         self.projectors = nn.ModuleList(projectors)
         self.register_buffer("kind_of", kind_of)

@@ -93,6 +93,17 @@ NO_SIZE = (0, 0)
 """In a state, of a camera that does not know its size."""
 
 
+def asked_parts(learn: Learn) -> dict[str, Any]:
+    """From each name that is asked for to where.
+
+    Raises:
+        TypeError: no names.
+    """
+    if isinstance(learn, Mapping):
+        return {part: learn[part] for part in words("learn", tuple(learn), "names of parts")}
+    return dict.fromkeys((learn,) if isinstance(learn, str) else words("learn", learn, "names of parts"), True)
+
+
 def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
     """From each part that is learned to True, or to the booleans that say for which elements of the batch.
 
@@ -104,12 +115,10 @@ def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
         TypeError: no names, or no booleans for one.
         ValueError: a part that is not available.
     """
-    given = tuple(learn) if isinstance(learn, Mapping) else learn
-    names = (given,) if isinstance(given, str) else words("learn", given, "names of parts")
-    unknown = [part for part in names if part not in available]
+    wanted = asked_parts(learn)
+    unknown = [part for part in wanted if part not in available]
     if unknown:
         raise ValueError(f"learn: want parts of {', '.join(available)}, got {unknown[0]!r}")
-    wanted = {part: learn[part] for part in names} if isinstance(learn, Mapping) else dict.fromkeys(names, True)
     chosen = {part: where for part, where in wanted.items() if bool(booleans("learn", where).any())}
     for whole, within in (("pose", OF_POSE), ("rotation", TURNS), ("translation", ("height",))):
         twice = [part for part in within if part in chosen and whole in chosen]

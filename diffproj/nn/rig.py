@@ -18,14 +18,14 @@ from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from diffproj._core.arguments import Array, called, choice, words
+from diffproj._core.arguments import Array, called, choice
 from diffproj._core.numerics import check_tensor, dot, has_values
 from diffproj.calibration.rig_result import RigCalibration
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.cayley import turned
 from diffproj.geometry.rotations import check_pose
 from diffproj.nn.camera import LearnableCamera
-from diffproj.nn.partial import OF_POSE, PARTS, GeometryModule, Learn, add_parameter, learned
+from diffproj.nn.partial import OF_POSE, PARTS, GeometryModule, Learn, add_parameter, asked_parts, learned
 
 MOMENTS = "moments"
 """Among the parts to learn: the poses of the rig itself."""
@@ -195,9 +195,7 @@ def _chosen(learn: Learn | None, cameras: Mapping[str, Camera], moving: bool) ->
     names = tuple(cameras)
     if learn is None:
         learn = (*PARTS, *([MOMENTS] if moving else []))
-    given = tuple(learn) if isinstance(learn, Mapping) else learn
-    entries = (given,) if isinstance(given, str) else words("learn", given, "names of parts")
-    wanted = {entry: learn[entry] for entry in entries} if isinstance(learn, Mapping) else dict.fromkeys(entries, True)
+    wanted = asked_parts(learn)
     parts: dict[str, dict[str, Any]] = {name: {} for name in names}
     for entry, where in wanted.items():
         if entry == MOMENTS:
@@ -208,7 +206,10 @@ def _chosen(learn: Learn | None, cameras: Mapping[str, Camera], moving: bool) ->
         part = entry if owner is None else entry[len(owner) + 1 :]
         if part not in (*PARTS, *OF_POSE):
             offered = ", ".join((*PARTS, *OF_POSE, *([MOMENTS] if moving else [])))
-            raise ValueError(f"learn: want parts of {offered}, or one camera's, as {names[-1]}.pose, got {entry!r}")
+            raise ValueError(
+                f"learn: want parts of {offered}, or one of the rig's cameras and its part, as {names[-1]}.pose, "
+                f"got {entry!r}"
+            )
         if owner is not None:
             parts[owner][part] = where
             continue
