@@ -42,6 +42,7 @@ _DAMPED = np.ones((10, 10)) + np.diag([DAMPING] * 5 + [0.0] * 5)
 _RIDGE = 1e-6 * np.eye(10)
 _ROOT_HALF = 0.5**0.5
 _SLOPE = (2 / np.pi) ** 0.5
+_LACKING = np.array([1.0, 1.0, 1.0, 1.0, -(2**0.5)])
 
 
 class Fitted(NamedTuple):
@@ -121,7 +122,7 @@ def _fit_block(
         blur, contrast = edges[moving, 4], found[:, _CONTRAST]
         factor[moving] = np.where(np.abs(contrast) > 1e-3, contrast, 1e-3) * (_SLOPE / blur)
         solution[moving] = found
-        move = np.clip(found[:, :_EDGES] / factor[moving, None], -FARTHEST, FARTHEST)
+        move = np.clip(found[:, :_EDGES] / (factor[moving, None] * _LACKING), -FARTHEST, FARTHEST)
         edges[moving] += move
         edges[moving, 4] = np.clip(edges[moving, 4], np.maximum(blur / 2, SHARPEST), np.minimum(blur * 2, BLURRIEST))
         # A start at the very place says nothing yet about the blur, which decides how well the model fits.
@@ -149,10 +150,10 @@ def _judged(
     inverse = np.linalg.solve(normal, np.broadcast_to(np.eye(_GREY, 2), (len(normal), _GREY, 2))).swapaxes(1, 2)
     rows = torch.from_numpy(np.concatenate([inverse, solution[:, None]], axis=1).astype(np.float32)) @ model
     # With the last step, which was small, as the linear model sees it.
-    error = (table[:, _GREY] - rows[:, 2]).square().sum(-1).double().numpy()
-    variance = error / np.maximum(weight.square().sum(-1).numpy(), 1e-6)
+    error = torch.linalg.vector_norm(table[:, _GREY] - rows[:, 2], dim=-1).double().square().numpy()
+    variance = error / np.maximum(products[:, _LEVEL, _LEVEL], 1e-6)
     # The estimate weighs pixels by w, their noise is alike.
-    spread = rows[:, :2].mul(weight.unsqueeze(1)).square().sum(dim=(1, 2)).double().numpy()
+    spread = torch.linalg.vector_norm(rows[:, :2].mul_(weight.unsqueeze(1)), dim=(1, 2)).double().square().numpy()
     contrast = np.maximum(np.abs(solution[:, _CONTRAST]), 1e-3)
     sigma = np.sqrt(variance * spread / 2) / np.abs(factor)
     return np.sqrt(variance) / contrast, np.nan_to_num(sigma, nan=np.inf)
@@ -162,23 +163,29 @@ def _patches(
     image: Shaped[np.ndarray, "h w"], corners: Float[np.ndarray, "n 2"], radius: Float[np.ndarray, " n"]
 ) -> tuple[Float32[Tensor, "n 10 p"], Float32[Tensor, "3 p"], Int[np.ndarray, "n 2"]]:
     """Tables whose rows for the edges are still empty, the places x, y, 1 of pixels, and the pixels they count from."""
-    x, y, places = _disc(int(np.ceil(radius.max())))
+    reach = int(np.ceil(radius.max()))
+    x, y, places = _disc(reach)
     base = np.rint(corners).astype(int)
-    u, v = base[:, :1] + x, base[:, 1:] + y
     height, width = image.shape
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    if inside.all():
-        grey = image.reshape(-1).take(v * width + u).astype(np.float32)
-    else:
-        grey = image[v.clip(0, height - 1), u.clip(0, width - 1)].astype(np.float32)
     offset = (corners - base).astype(np.float32)
-    square = (places[0] - offset[:, :1]) ** 2 + (places[1] - offset[:, 1:]) ** 2
+    square = (places[0] - offset[:, :1]) ** 2
+    square += (places[1] - offset[:, 1:]) ** 2
     square /= radius[:, None].astype(np.float32) ** 2
-    weight = np.exp(-0.5 * square) * (inside & (square < 1))
+    within = square < 1
+    if bool((base >= reach).all() and (base < np.array([width, height]) - reach).all()):
+        grey = image.reshape(-1).take((base[:, :1] + width * base[:, 1:]) + (x + width * y)).astype(np.float32)
+    else:
+        u, v = base[:, :1] + x, base[:, 1:] + y
+        within &= (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        grey = image[v.clip(0, height - 1), u.clip(0, width - 1)].astype(np.float32)
+    square *= -0.5
+    weight = np.exp(square, out=square)
+    weight *= within
     table = np.empty((len(corners), _GREY + 1, len(x)), np.float32)
     table[:, _LEVEL] = weight
     np.multiply(weight[:, None], places[:2], out=table[:, _LEVEL + 1 : _GREY])
-    np.multiply(weight, grey - grey.mean(axis=1, keepdims=True), out=table[:, _GREY])
+    grey -= grey.mean(axis=1, keepdims=True)
+    np.multiply(weight, grey, out=table[:, _GREY])
     return torch.from_numpy(table), torch.from_numpy(places), base
 
 
@@ -196,24 +203,22 @@ def _disc(radius: int) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"], Fl
 def _fill(table: Float32[Tensor, "n 10 p"], edges: Float64[np.ndarray, "n 5"], places: Float32[Tensor, "3 p"]) -> None:
     """Write the rows of the table that depend on the edges; those of their derivatives lack a factor.
 
-    The factor is the contrast times `sqrt(2 / pi)` over the blur.
+    The factor is the contrast times `sqrt(2 / pi)` over the blur, and for the blur that times the last of `_LACKING`.
     """
     cosine, sine = np.cos(edges[:, 2:4]), np.sin(edges[:, 2:4])
     lines = np.empty((len(edges), 4, 3))
     lines[:, :2, 0], lines[:, :2, 1], lines[:, 2:, 0], lines[:, 2:, 1] = -sine, cosine, -cosine, -sine
     lines[..., 2] = -(lines[..., :2] @ edges[:, :2, None])[..., 0]
+    turns = torch.from_numpy(np.stack([sine, -cosine], axis=1).astype(np.float32))
     lines[:, :2] *= _ROOT_HALF / edges[:, 4, None, None]
-    lines = torch.from_numpy(lines.astype(np.float32))
-    off, back = (lines @ places).split(2, dim=1)
+    off, back = (torch.from_numpy(lines.astype(np.float32)) @ places).split(2, dim=1)
     off.clamp_(-5.5, 5.5)  # beyond, profiles are flat, and denormal numbers slow
-    first, second = torch.erf(off).unbind(1)
     slope = off.square().neg_().exp_()
-    weight = table[:, _LEVEL]
-    slope[:, 0] *= second * weight
-    slope[:, 1] *= first * weight
-    turns = torch.from_numpy(np.stack([sine, -cosine]).astype(np.float32)).unsqueeze(-1)
-    torch.sum(slope * turns[0], dim=1, out=table[:, 0])
-    torch.sum(slope * turns[1], dim=1, out=table[:, 1])
+    first, second = torch.erf(off).unbind(1)
+    weight, contrast, blur = table[:, _LEVEL], table[:, _CONTRAST], table[:, _EDGES - 1]
+    torch.mul(first, second, out=contrast).mul_(weight)
+    slope[:, 0].mul_(second.mul_(weight))
+    slope[:, 1].mul_(first.mul_(weight))
+    table[:, :2] = turns @ slope
     torch.mul(slope, back, out=table[:, 2:4])
-    torch.sum(slope.mul_(off), dim=1, out=table[:, 4]).mul_(-1 / _ROOT_HALF)
-    torch.mul(first * second, weight, out=table[:, _CONTRAST])
+    torch.add(*slope.mul_(off).unbind(1), out=blur)

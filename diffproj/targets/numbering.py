@@ -17,12 +17,16 @@ def in_order(grid: Grid, image: Shaped[np.ndarray, "h w"], board: Chessboard) ->
         image: `(H, W)`, the grey image.
         board: the board; boards with rows = columns may be rotated by 90 degrees, others by 180.
     """
-    grids = [grid, grid[::-1], grid[:, ::-1], grid[::-1, ::-1]]
+    grids = [grid, grid[::-1]]
     if board.rows == board.columns:
         grids += [candidate.swapaxes(0, 1) for candidate in grids]
     grids = [candidate for candidate in grids if _turns_clockwise(candidate)] or [grid]
-    grids = [candidate for candidate in grids if _starts_dark(candidate, image)] or grids
-    return np.ascontiguousarray(min(grids, key=lambda candidate: float(np.linalg.norm(_first(candidate)))))
+    # Turned by 180 degrees, a board is as clockwise as before, and so are its squares with rows + columns even.
+    grids = [(candidate, _is_darker(candidate, image)) for candidate in grids]
+    alike = (board.rows + board.columns) % 2 == 0
+    grids += [(candidate[::-1, ::-1], dark if alike else -dark) for candidate, dark in grids]
+    found = [candidate for candidate, dark in grids if dark > 0] or [candidate for candidate, _ in grids]
+    return np.ascontiguousarray(min(found, key=lambda candidate: float(np.linalg.norm(_first(candidate)))))
 
 
 def follow(grids: list[Grid], board: Chessboard | CircleGrid) -> list[Grid]:
@@ -61,12 +65,12 @@ def _first(grid: Grid) -> Float[np.ndarray, "2"]:
 
 def _turns_clockwise(grid: Grid) -> bool:
     """Whether right along the rows, then down the columns, is clockwise in the image (v points down)."""
-    across, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
+    across, down = grid[:-1, 1:] - grid[:-1, :-1], grid[1:, :-1] - grid[:-1, :-1]
     return float(np.nansum(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])) > 0
 
 
-def _starts_dark(grid: Grid, image: Shaped[np.ndarray, "h w"]) -> bool:
-    """Whether the square between the first four corners is one of the dark ones.
+def _is_darker(grid: Grid, image: Shaped[np.ndarray, "h w"]) -> float:
+    """By how many grey values the square between the first four corners, and those of its colour, are darker.
 
     Decided by the mean of all squares between corners, which is robust to noise and uneven illumination; squares
     outside the corners are not used, since the image's border may cut them off.
@@ -77,4 +81,4 @@ def _starts_dark(grid: Grid, image: Shaped[np.ndarray, "h w"]) -> bool:
     height, width = image.shape
     values = image[v.clip(0, height - 1), u.clip(0, width - 1)].astype(float)
     same = np.indices(values.shape).sum(axis=0) % 2 == 0
-    return bool(values[same & seen].mean() < values[~same & seen].mean())
+    return float(values[~same & seen].mean() - values[same & seen].mean())

@@ -49,14 +49,18 @@ def saddle_points(image: Shaped[np.ndarray, "h w"]) -> Saddles:
         >>> len(saddle_points(squares).points)
         12
     """
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR)
-    xx, yy, xy = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((2, 0), (0, 2), (1, 1)))
-    strength = cv2.subtract(cv2.multiply(xy, xy), cv2.multiply(xx, yy))
+    # Few large arrays, written again and again, stay in the processor's cache.
+    spare = image.astype(np.float32)
+    smooth = cv2.GaussianBlur(spare, (0, 0), BLUR)
+    xx, yy, xy = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, dst=spare, ksize=3), *(
+        cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((0, 2), (1, 1))
+    )
+    strength = cv2.subtract(cv2.multiply(xy, xy, dst=xy), cv2.multiply(xx, yy, dst=xx), dst=xy)
     # Without noise, pixels around one corner may be equally strong: by a hair, the last of them shall be the peak.
     height, width = image.shape
     strength *= 1 + 1e-6 * np.arange(width, dtype=np.float32)
     strength *= 1 + 5e-6 * np.arange(height, dtype=np.float32)[:, None]
-    peak = (strength == cv2.dilate(strength, np.ones((5, 5), np.uint8))) & (strength > WEAKEST)
+    peak = (strength == cv2.dilate(strength, np.ones((5, 5), np.uint8), dst=yy)) & (strength > WEAKEST)
     peak[:_BORDER] = peak[-_BORDER:] = False
     peak[:, :_BORDER] = peak[:, -_BORDER:] = False
     places = np.flatnonzero(peak)
