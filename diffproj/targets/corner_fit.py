@@ -150,13 +150,13 @@ def _judged(
     inverse = np.linalg.solve(normal, np.broadcast_to(np.eye(_GREY, 2), (len(normal), _GREY, 2))).swapaxes(1, 2)
     rows = torch.from_numpy(np.concatenate([inverse, solution[:, None]], axis=1).astype(np.float32)) @ model
     # With the last step, which was small, as the linear model sees it.
-    error = torch.linalg.vector_norm(table[:, _GREY] - rows[:, 2], dim=-1).double().square().numpy()
-    variance = error / np.maximum(products[:, _LEVEL, _LEVEL], 1e-6)
+    error = (table[:, _GREY] - rows[:, 2]).norm(dim=-1).numpy().astype(np.float64)
+    variance = error**2 / np.maximum(products[:, _LEVEL, _LEVEL], 1e-6)
     # The estimate weighs pixels by w, their noise is alike.
-    spread = torch.linalg.vector_norm(rows[:, :2].mul_(weight.unsqueeze(1)), dim=(1, 2)).double().square().numpy()
+    spread = rows[:, :2].mul_(weight.unsqueeze(1)).norm(dim=(1, 2)).numpy().astype(np.float64)
     contrast = np.maximum(np.abs(solution[:, _CONTRAST]), 1e-3)
-    sigma = np.sqrt(variance * spread / 2) / np.abs(factor)
-    return np.sqrt(variance) / contrast, np.nan_to_num(sigma, nan=np.inf)
+    sigma = np.sqrt(variance / 2) * spread / np.abs(factor)
+    return np.sqrt(variance) / contrast, np.where(np.isfinite(sigma), sigma, np.inf)
 
 
 def _patches(
@@ -211,7 +211,8 @@ def _fill(table: Float32[Tensor, "n 10 p"], edges: Float64[np.ndarray, "n 5"], p
     lines[..., 2] = -(lines[..., :2] @ edges[:, :2, None])[..., 0]
     turns = torch.from_numpy(np.stack([sine, -cosine], axis=1).astype(np.float32))
     lines[:, :2] *= _ROOT_HALF / edges[:, 4, None, None]
-    off, back = (torch.from_numpy(lines.astype(np.float32)) @ places).split(2, dim=1)
+    both = torch.from_numpy(lines.astype(np.float32)) @ places
+    off, back = both[:, :2], both[:, 2:]
     off.clamp_(-5.5, 5.5)  # beyond, profiles are flat, and denormal numbers slow
     slope = off.square().neg_().exp_()
     first, second = torch.erf(off).unbind(1)

@@ -67,11 +67,13 @@ def _seeds(
     for seed, others in enumerate(partners):
         if seed in used:
             continue
+        here = points[seed]
+        ways = [(there := points[q] - here, 0.25 * abs(there)) for q in others]
         steps: list[complex] = []
-        for k, q in enumerate(others):
-            for r in others[k + 1 :]:
-                there, back = points[q] - points[seed], points[r] - points[seed]
-                if abs(there + back) < 0.25 * min(abs(there), abs(back)):
+        for k, (there, most) in enumerate(ways):
+            for back, least in ways[k + 1 :]:
+                off = abs(there + back)
+                if off < most and off < least:
                     steps.append((there - back) / 2)
         for k, first in enumerate(steps):
             across = [s for s in steps[k + 1 :] if abs((first.conjugate() * s).imag) > 0.3 * abs(first) * abs(s)]
@@ -97,12 +99,11 @@ def _grown(
                 continue
             step = _step(cells, points, (i, j), (di, dj)) or start
             want, reach = here + step, REACH * abs(step)
-            best = min(
-                (q for q in partners[cells[i, j]] if q not in taken and q not in used),
-                key=lambda q: abs(points[q] - want),
-                default=None,
-            )
-            if best is not None and abs(points[best] - want) < reach:
+            best = None
+            for q in partners[cells[i, j]]:
+                if (off := abs(points[q] - want)) < reach and q not in taken and q not in used:
+                    best, reach = q, off
+            if best is not None:
                 cells[cell] = best
                 taken.add(best)
                 waiting.append(cell)

@@ -124,11 +124,11 @@ def matched(grid: Float[np.ndarray, "r c 2"], board: Chessboard) -> Float[np.nda
 
 def _goes_on(occupied: Bool[np.ndarray, "r c"], i: int, j: int, board: Chessboard) -> bool:
     """Whether most of a line of corners just outside the board is there."""
-    rows, columns = slice(i, i + board.rows), slice(j, j + board.columns)
-    padded = np.pad(occupied, 1)
-    beside = padded[i, 1:][columns], padded[i + board.rows + 1, 1:][columns]
-    beside += padded[1:, j][rows], padded[1:, j + board.columns + 1][rows]
-    return max(float(line.mean()) for line in beside) >= FULL
+    for lines, start, count in ((occupied[:, j : j + board.columns], i, board.rows), (occupied[i : i + board.rows].T, j, board.columns)):
+        for line in (start - 1, start + count):
+            if 0 <= line < len(lines) and lines[line].mean() >= FULL:
+                return True
+    return False
 
 
 def extent_of(grid: Float[np.ndarray, "r c 2"]) -> tuple[int, int]:
@@ -161,13 +161,15 @@ def _is_other(seen: tuple[int, int], grid: Float[np.ndarray, "r c 2"], board: Ch
 
 def _spacing(grid: Float[np.ndarray, "r c 2"]) -> float:
     """The mean step of a pattern along its denser direction, in px."""
-    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1) for axis in (0, 1)]
-    return min((float(np.nanmean(step)) for step in steps if np.isfinite(step).any()), default=0.0)
+    steps = [np.hypot(*(part[1:] - part[:-1]).reshape(-1, 2).T) for part in (grid, grid.swapaxes(0, 1))]
+    known = [step[np.isfinite(step)] for step in steps]
+    return min((float(step.mean()) for step in known if len(step)), default=0.0)
 
 
 def _area(grid: Float[np.ndarray, "r c 2"]) -> float:
     """The area in px of the box around a pattern."""
-    return float(np.prod(np.nanmax(grid, axis=(0, 1)) - np.nanmin(grid, axis=(0, 1))))
+    width, height = np.nanmax(grid, axis=(0, 1)) - np.nanmin(grid, axis=(0, 1))
+    return float(width * height)
 
 
 def _shadows(other: Float[np.ndarray, "_r _c 2"], one: Float[np.ndarray, "_R _C 2"]) -> bool:

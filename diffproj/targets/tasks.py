@@ -1,7 +1,8 @@
 """One piece of work for each photograph or camera, here or on the workers of an executor: in order, or as they come."""
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import Executor, Future
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 Item = TypeVar("Item")
@@ -60,15 +61,17 @@ def as_done(
             yield place, work(item)
         return
     places: dict[Future[Any], int] = {}
+    done: SimpleQueue[Future[Any]] = SimpleQueue()
     waiting = list(reversed(range(len(items))))
     try:
         while waiting or places:
             while waiting and len(places) < AHEAD:
                 place = waiting.pop()
-                places[executor.submit(work, items[place])] = place
-            done, _ = wait(places, return_when=FIRST_COMPLETED)
-            for future in sorted(done, key=places.__getitem__):
-                yield places.pop(future), future.result()
+                future = executor.submit(work, items[place])
+                places[future] = place
+                future.add_done_callback(done.put)
+            future = done.get()
+            yield places.pop(future), future.result()
     finally:
         for future in places:
             future.cancel()
