@@ -114,9 +114,9 @@ def broadcast_batches(**shapes: Sequence[int]) -> torch.Size:
     Raises:
         ValueError: the shapes do not broadcast.
     """
-    first, *others = map(torch.Size, shapes.values())
+    first, *others = shapes.values()
     if all(len(other) == len(first) and other == first for other in others):  # the usual case, and 20 times as fast
-        return first
+        return torch.Size(first)
     sizes: list[int] = []  # by hand: PyTorch's own loads a library of symbols first, which takes half a second
     for axis in range(1, 1 + max(map(len, shapes.values()))):
         size = 1
@@ -152,7 +152,7 @@ def arrays_of(*tensors: Tensor, double: bool = False) -> tuple[Any, list[Any]]:
         tensors: without a look at their graph.
         double: whether in float64.
     """
-    if all(tensor.device.type == "cpu" for tensor in tensors):
+    if all(tensor.is_cpu for tensor in tensors):
         arrays = [tensor.numpy(force=True) for tensor in tensors]
         return np, [array.astype(np.float64, copy=False) for array in arrays] if double else arrays
     return torch, [in_float64(tensor.detach()) if double else tensor.detach() for tensor in tensors]
@@ -217,6 +217,11 @@ def interleaved(components: Sequence[Tensor]) -> Tensor:
     for column, component in zip(vectors.unbind(-1), components, strict=True):
         column.copy_(component)
     return vectors
+
+
+def side_by_side(components: Sequence[Tensor]) -> Tensor:
+    """The same vectors, each component in one piece of memory: for what takes them apart again at once."""
+    return torch.stack(list(components)).movedim(0, -1)
 
 
 def transform(matrix: Tensor, vectors: Tensor) -> Tensor:

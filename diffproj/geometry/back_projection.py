@@ -222,7 +222,7 @@ class PlaneMap(MapViews, Copied, Shown):
         if not isinstance(lens, BrownConrady):
             return self.camera.directions(pixels)
         xy, finite = self.camera._normalised(pixels)
-        xy, seen = lens.undistort(xy)
+        xy, seen = lens.undistort_apart(xy)
         return xy, seen & finite
 
     def _checked(self, pixels: Tensor | Array) -> Tensor:

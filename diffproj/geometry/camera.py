@@ -31,6 +31,7 @@ from diffproj._core.numerics import (
     in_blocks,
     interleaved,
     linear,
+    side_by_side,
     transform,
     wants_derivative,
 )
@@ -42,6 +43,7 @@ from diffproj.geometry.grid import checked_size, inside
 from diffproj.geometry.intrinsics import check_intrinsics, pixel_to_normalized, through_pinhole
 from diffproj.geometry.placement import Placed
 from diffproj.geometry.rotations import check_pose
+from diffproj.lens.compiling import coordinates, derivative_wanted
 from diffproj.lens.protocol import Lens
 
 SQUARED = 0.45
@@ -304,12 +306,12 @@ class Camera(
     ) -> tuple[Float[Tensor, "*batch n 2"], Bool[Tensor, "*batch n"]]:
         """Pixels that were checked, on the normalised plane, still distorted `(*B, N, 2)`, and which are finite."""
         center = self.K[..., :2, 2].unsqueeze(-1).unbind(-2)
-        u, v = pixels.unbind(-1)
+        u, v = pixels.unbind(-1) if derivative_wanted(pixels, self.K) else coordinates(pixels)
         finite = torch.maximum(u.abs(), v.abs()) < torch.finfo(pixels.dtype).max ** SQUARED
         offset = [u - center[0], v - center[1]]
         if not (has_values(finite) and finite.device.type == "cpu" and bool(finite.all())):
             offset = [torch.where(finite, part, 0.0) for part in offset]
-        return interleaved(linear(entries(pixel_to_normalized(self.K)), offset)), finite
+        return side_by_side(linear(entries(pixel_to_normalized(self.K)), offset)), finite
 
     def rays(
         self, pixels: Float[Tensor, "*#batch n 2"] | Array

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj._core.arguments import Array
-from diffproj._core.numerics import in_blocks, interleaved, least_depth, rounding
+from diffproj._core.numerics import in_blocks, least_depth, rounding, side_by_side
 from diffproj.lens import brown_domain
 from diffproj.lens.brown_equations import COUNTS, Terms, bend, by_coefficients, radial, tilted
 from diffproj.lens.brown_gradient import follows_gradient, recorded, with_gradient
@@ -105,6 +105,13 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
             Undistorted points, and `valid`: a solution inside the domain was found. (0, 0) with zero gradient where
             not valid.
         """
+        xy, valid = self.undistort_apart(xy_distorted)
+        return xy.contiguous(), valid
+
+    def undistort_apart(
+        self, xy_distorted: Float[Tensor, "*batch n 2"] | Array
+    ) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
+        """The same, with x and y perhaps each in one piece of memory, for what takes them apart again at once."""
         xy_distorted = self._checked("xy_distorted", xy_distorted, 2)
         plan = self._plan()
 
@@ -113,7 +120,7 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
             x, y, valid = search(coefficients.detach(), plan, points.detach())
             x, y = torch.where(valid, x, 0), torch.where(valid, y, 0)
             if not derivative_wanted(points, coefficients):
-                return interleaved([x, y]), valid
+                return side_by_side([x, y]), valid
             if follows_gradient(points, coefficients):
                 return with_gradient(coefficients, points, x, y, valid), valid
             return recorded(coefficients, points, x, y, valid), valid
