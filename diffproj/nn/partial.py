@@ -35,9 +35,12 @@ class GeometryModule(nn.Module):
     Attributes:
         lowest_precision: a conversion to a dtype with fewer bits than this one changes nothing but the device.
         masked: names of the parameters that are learned for a part of the batch only; see `add_parameter`.
+        own_kind: lens model and image size, and the buffer that says so; see `add_kind`.
     """
 
     lowest_precision: ClassVar[torch.dtype] = torch.float32
+    own_kind: tuple[tuple[int, ...], Tensor]
+    kind: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -69,24 +72,45 @@ def add_kind(module: GeometryModule, camera: Camera) -> None:
     """
     own = (list(MODELS).index(model_of(camera.distortion).name), *(camera.size or NO_SIZE))
     module.register_buffer("kind", torch.tensor(own, dtype=torch.int64, device=camera.device))
-
+    module.own_kind = own, module.kind
     module.register_load_state_dict_pre_hook(partial(_check_kind, own))
+
+
+def check_swapped_kind(module: GeometryModule) -> None:
+    """That what stands in the place of a module's state, as in `functional_call`, is of the same lens and size.
+
+    It is looked at on a CPU, outside of graphs and of `vmap`.
+
+    Raises:
+        ValueError: it is another's.
+    """
+    if torch.compiler.is_compiling():
+        return
+    (own, before), now = module.own_kind, module._buffers["kind"]
+    if now is before or now is None or now.device.type != "cpu" or not has_values(now):
+        return
+    if wrong := _other_kind(own, now):
+        raise ValueError(f"kind: {wrong}")
 
 
 def _check_kind(own: tuple[int, ...], _: nn.Module, state: dict[str, Any], prefix: str, *rest: Any) -> None:
     """Called before `load_state_dict`, which adds the message to its own."""
     saved = state.get(f"{prefix}kind")
-    if saved is None or not has_values(saved):
-        return
-    theirs, errors = tuple(saved.tolist()), rest[-1]
+    if saved is not None and has_values(saved) and (wrong := _other_kind(own, saved)):
+        rest[-1].append(f"{prefix}kind: {wrong}")
+
+
+def _other_kind(own: tuple[int, ...], saved: Tensor) -> str:
+    """What is wrong with a state of this kind; nothing where it fits."""
+    theirs = tuple(saved.tolist())
     if theirs[0] != own[0]:
         names = dict(enumerate(MODELS))
         want, got = f"lens {names[own[0]]!r}", f"lens {names.get(theirs[0], 'of another release')!r}"
     elif theirs[1:] != own[1:] and NO_SIZE not in (theirs[1:], own[1:]):
         want, got = f"size {own[1:]}", f"size {theirs[1:]}"
     else:
-        return
-    errors.append(f"{prefix}kind: want the state of a camera with {want}, got {got}; build the module from such a one")
+        return ""
+    return f"want the state of a camera with {want}, got {got}; build the module from such a one"
 
 
 NO_SIZE = (0, 0)
