@@ -5,11 +5,13 @@ from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from diffproj._core.arguments import booleans, words
 from diffproj._core.numerics import has_values
+from diffproj._core.torch_private import has_no_values
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import MODELS, model_of
 
@@ -143,12 +145,30 @@ def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
     unknown = [part for part in wanted if part not in available]
     if unknown:
         raise ValueError(f"learn: want parts of {', '.join(available)}, got {unknown[0]!r}")
-    chosen = {part: where for part, where in wanted.items() if bool(booleans("learn", where).any())}
+    masks = {part: _mask(where) for part, where in wanted.items()}
+    chosen = {part: mask for part, mask in masks.items() if bool(mask.any())}
     for whole, within in (("pose", OF_POSE), ("rotation", TURNS), ("translation", ("height",))):
         twice = [part for part in within if part in chosen and whole in chosen]
         if twice:
             raise ValueError(f"learn: want {whole!r} or parts of it, got both {whole!r} and {twice[0]!r}")
     return chosen
+
+
+def _mask(where: Any) -> np.ndarray:
+    """Booleans as an array, which has values under `FakeTensorMode` too.
+
+    Raises:
+        TypeError: no booleans.
+        ValueError: a tensor without values.
+    """
+    if isinstance(where, bool):
+        return np.array(where)
+    mask = booleans("learn", where, torch.device("cpu"))
+    if has_no_values(mask):
+        if isinstance(where, Tensor):
+            raise ValueError("learn: want True, False or booleans, got a tensor without values")
+        return np.array(where, dtype=bool)
+    return mask.numpy(force=True)
 
 
 def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, batch: torch.Size) -> None:
@@ -168,30 +188,31 @@ def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, b
         ValueError: `where` does not broadcast to the batch shape, or differs along an axis with one shared value.
     """
     zero = torch.zeros_like(like, memory_format=torch.contiguous_format)
-    mask = booleans("learn", where).cpu()
+    mask = where if isinstance(where, np.ndarray) else _mask(where)
     try:
-        mask = mask.expand(batch)
-    except RuntimeError:
+        mask = np.broadcast_to(mask, tuple(batch))
+    except ValueError:
         raise ValueError(
-            f"learn: want booleans that broadcast to the batch shape {tuple(batch)}, got shape {tuple(mask.shape)}"
+            f"learn: want booleans that broadcast to the batch shape {tuple(batch)}, got shape {mask.shape}"
         ) from None
-    if not bool(mask.any()):
+    if not mask.any():
         module.register_buffer(name, zero)
         return
     module.register_parameter(name, nn.Parameter(zero))
-    if bool(mask.all()):
+    if mask.all():
         return
     for axis, length in enumerate(like.shape[:-1]):
         if length < mask.shape[axis]:
-            first = mask.narrow(axis, 0, 1)
-            if not bool((mask == first).all()):
+            first = mask.take([0], axis)
+            if not (mask == first).all():
                 raise ValueError(
                     f"learn: want the same for all poses of one camera, got {mask.tolist()} for {name}, which they "
                     "share because they start with the same intrinsics; tied_intrinsics=False gives each its own"
                 )
             mask = first
     module.masked.add(name)
-    module.register_buffer(f"{name}_learned", mask.unsqueeze(-1).to(like))
+    where = torch.tensor(mask.tolist(), dtype=like.dtype, device=like.device)
+    module.register_buffer(f"{name}_learned", where.unsqueeze(-1))
 
 
 def learned(module: GeometryModule, name: str) -> Tensor:
