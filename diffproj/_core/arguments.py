@@ -159,14 +159,21 @@ def whole_number(
     return found
 
 
-def whole_numbers(name: str, value: object, want: str) -> Tensor:
+def whole_numbers(name: str, value: object, want: str, device: torch.device | None = None) -> Tensor:
     """Whole numbers as a tensor: an integer tensor as it is, or an array or (nested) lists of them.
+
+    Args:
+        name: the argument's name.
+        value: what the caller handed in.
+        want: what the message says is wanted.
+        device: where the numbers are needed: on the device meta, a tensor there has to do.
 
     Raises:
         TypeError: anything else.
     """
     if isinstance(value, Tensor):
-        whole = not (value.is_floating_point() or value.is_complex() or value.is_meta or value.dtype == torch.bool)
+        whole = not (value.is_floating_point() or value.is_complex() or value.dtype == torch.bool)
+        whole = whole and (not value.is_meta or (device is not None and device.type == "meta"))
         found = value
     else:
         taken = isinstance(value, np.ndarray | list | tuple | range)

@@ -51,6 +51,7 @@ from diffproj.geometry.plane import Plane, as_plane
 from diffproj.geometry.plane_kernel import components, denominator_and_threshold, direct, intersection, recorded
 from diffproj.geometry.plane_matrix import plane_matrix
 from diffproj.lens.brown_conrady import BrownConrady
+from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.slopes import by_direction
 
 
@@ -120,8 +121,12 @@ class PlaneMap(MapViews, Copied, Shown):
             camera = camera[..., None]
         broadcast_batches(camera=camera.batch_shape, plane=plane.batch_shape)
         self.matrix = plane_matrix(camera, plane, warn)
-        # The principal point is read at each call: that of a K that was written to since would not go with the matrix.
-        self.camera = Camera.unchecked(camera.K.clone(), camera.R, camera.t, camera.distortion, camera.size)
+        # Principal point and lens are read at each call: of a camera that was written to since they would not go with
+        # the matrix.
+        lens = camera.distortion
+        if isinstance(lens, CoefficientLens) and has_values(lens.coefficients):
+            lens = lens.planned(lens.coefficients.clone(), lens.plan())
+        self.camera = Camera.unchecked(camera.K.clone(), camera.R, camera.t, lens, camera.size)
         self.is_per_point = plane.is_per_point
 
     @classmethod

@@ -1,19 +1,20 @@
 """`ProjectorBank`: a `PlaneProjector` for cameras of any lenses and sizes."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from diffproj._core.arguments import Array, listing
-from diffproj._core.numerics import check_tensor, has_values
+from diffproj._core.numerics import broadcast_batches, check_tensor, has_values
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.collating import stack
 from diffproj.geometry.plane import Plane
 from diffproj.lens.models import model_of
 from diffproj.nn.partial import Learn, asked_parts
+from diffproj.nn.plane import check_one_plane
 from diffproj.nn.projector import PlaneProjector, camera_numbers
 
 
@@ -86,12 +87,16 @@ class ProjectorBank(nn.Module):
         self,
         pixels: Float[Tensor, "samples n 2"] | Array,
         camera: Int[Tensor, " samples"] | Sequence[int],
+        warp: Float[Tensor, "*#samples 3 3"] | Array | None = None,
+        plane: Plane | None = None,
     ) -> tuple[Float[Tensor, "samples n 3"], Bool[Tensor, "samples n"]]:
         """Points on the plane.
 
         Args:
             pixels: `(S, N, 2)`, of S samples.
             camera: which of the cameras took each sample `(S,)`, whole numbers from 0.
+            warp: how the images that they belong to were warped `(S, 3, 3)`, or one for all; see `PlaneProjector`.
+            plane: of these samples, of batch shape `(S,)` or one for all, in place of the bank's own.
 
         Returns:
             Points `(S, N, 3)` in world units and `valid (S, N)`; see `back_project`.
@@ -100,26 +105,75 @@ class ProjectorBank(nn.Module):
             TypeError: no floating-point tensor, or no whole numbers.
             ValueError: shapes or devices that do not fit, or a number of no camera.
         """
+        points, valid = self._by_kind(PlaneProjector.__call__, pixels, camera, warp, plane)
+        return points, valid
+
+    def miss(
+        self,
+        pixels: Float[Tensor, "samples n 2"] | Array,
+        camera: Int[Tensor, " samples"] | Sequence[int],
+        warp: Float[Tensor, "*#samples 3 3"] | Array | None = None,
+        plane: Plane | None = None,
+    ) -> Float[Tensor, "samples n"]:
+        """The angles in radians by which rays miss the plane `(S, N)`, for a `PlaneLoss` that pulls.
+
+        See `PlaneMap.miss`; arguments as for the call.
+        """
+
+        def miss(projector: PlaneProjector, pixels: Tensor, **options: Any) -> tuple[Tensor]:
+            return (projector.miss(pixels, **options),)
+
+        (missed,) = self._by_kind(miss, pixels, camera, warp, plane)
+        return missed
+
+    def _by_kind(
+        self,
+        work: Callable[..., tuple[Tensor, ...]],
+        pixels: Tensor | Array,
+        camera: Tensor | Sequence[int],
+        warp: Tensor | Array | None,
+        plane: Plane | None,
+    ) -> list[Tensor]:
+        """What each kind's projector makes of its samples, in the order of the samples."""
         pixels = check_tensor("pixels", pixels, "N", 2)
         chosen = camera_numbers(camera, len(self), self.kind_of.device)
         if pixels.ndim != 3 or chosen.shape != pixels.shape[:1]:
             raise ValueError(
                 f"pixels, camera: want shapes (S, N, 2) and (S,), got {tuple(pixels.shape)} and {tuple(chosen.shape)}"
             )
-        points = pixels.new_zeros(*pixels.shape[:2], 3)
-        valid = torch.zeros(pixels.shape[:2], dtype=torch.bool, device=pixels.device)
+        if warp is not None:
+            warp = check_tensor("warp", warp, 3, 3, like=pixels)
+            broadcast_batches(pixels=pixels.shape[:1], warp=warp.shape[:-2])
+            warp = warp.expand(*pixels.shape[:1], 3, 3)
+        if plane is not None:
+            check_one_plane(plane)
+            broadcast_batches(pixels=pixels.shape[:1], plane=plane.batch_shape)
+            plane = plane.expand(*pixels.shape[:1])
+        found: list[Tensor] = []
         for kind, projector in enumerate(self.projectors):
             own = self.kind_of[chosen] == kind
             if not has_values(chosen, pixels):  # in a graph each kind takes all samples, and gives its own
-                found, seen = projector(pixels, camera=torch.where(own, self.place_of[chosen], 0))
-                points = torch.where(own[:, None, None], found, points.to(found))
-                valid = torch.where(own[:, None], seen, valid)
+                of_kind = torch.where(own, self.place_of[chosen], 0)
+                new = work(projector, pixels, warp=warp, plane=plane, camera=of_kind)
+                found = [torch.where(_beside(own, a), a, b.to(a)) for a, b in zip(new, found or new, strict=True)]
                 continue
             (samples,) = own.nonzero(as_tuple=True)
-            if len(samples):
-                found, seen = projector(pixels[samples], camera=self.place_of[chosen[samples]])
-                points, valid = points.to(found).index_put((samples,), found), valid.index_put((samples,), seen)
-        return points, valid
+            if not len(samples) and (found or len(chosen)):
+                continue
+            options = {
+                "warp": None if warp is None else warp[samples],
+                "plane": None if plane is None else plane[samples],
+                "camera": self.place_of[chosen[samples]],
+            }
+            new = work(projector, pixels[samples], **options)
+            found = found or [part.new_zeros(len(chosen), *part.shape[1:]) for part in new]
+            found = [a.to(b).index_put((samples,), b) for a, b in zip(found, new, strict=True)]
+        return found
 
     if TYPE_CHECKING:  # PyTorch types the call of a module as Any
         __call__ = forward
+
+
+def _beside(of_samples: Tensor, values: Tensor) -> Tensor:
+    """A tensor `(S,)` that broadcasts against one of more axes `(S, ...)`."""
+    return of_samples.reshape(-1, *(1,) * (values.ndim - 1))

@@ -36,6 +36,7 @@ from diffproj.nn.partial import (
     Learn,
     add_kind,
     add_parameter,
+    check_swapped_kind,
     learned,
     learned_parts,
     same_values,
@@ -137,6 +138,7 @@ class LearnableCamera(GeometryModule):
 
     def forward(self) -> Camera:
         """The camera with the current values of the parameters, of the batch shape of the starting camera."""
+        check_swapped_kind(self)
         scale = nn.functional.pad(learned(self, "log_focal").exp(), (0, 1), value=1.0)
         shift = (self.K_0[..., :2] * learned(self, "principal_point").unsqueeze(-2)).sum(-1, keepdim=True)
         K = self.K_0 * scale.unsqueeze(-2) + nn.functional.pad(shift, (2, 0))

@@ -6,14 +6,13 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from diffproj._core.numerics import version_of
 from diffproj.geometry.back_projection import PlaneMap
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.models import coefficients_of, model_of
 from diffproj.lens.plan import Plan
-from diffproj.nn.partial import GeometryModule, add_kind
+from diffproj.nn.partial import GeometryModule, add_kind, check_swapped_kind
 from diffproj.nn.plane import check_one_plane
 
 
@@ -23,7 +22,9 @@ class FixedMap(GeometryModule):
     Everything that the map depends on is a buffer: its matrix, the tensors of camera and plane, and what was worked out
     for the lens, all of which are in the `state_dict`. So whatever swaps or writes a module's state, such as
     `functional_call`, `stack_module_state` or DistributedDataParallel, swaps or writes the whole map. Matrix and plan
-    are built again, in full precision, where the dtype or device changes (`.to`), and behind `load_state_dict`.
+    are built again, in full precision, where the dtype or device changes (`.to`), and behind `load_state_dict`; and
+    where a part of what they were made from is swapped or written to without them, such as K alone. A compiled or
+    exported graph does not look for that: there, swap the whole state.
 
     Args:
         camera: of batch shape `*B`. Its tensors are copied, without gradients.
@@ -67,11 +68,12 @@ class FixedMap(GeometryModule):
             for name, tensor in tensors.items():
                 self.register_buffer(name, tensor.detach().clone(memory_format=torch.contiguous_format))
         add_kind(self, camera)
-        self._planned_for: tuple[_Mark, _Mark] | None = None
+        self._made: dict[str, _Mark] = {}
         if self._model.kind is not None:
             for name in PLAN:
                 self.register_buffer(name, None)
             self._plan_again()
+        self._mark_all()
         self.register_load_state_dict_post_hook(_rebuild)
 
     @property
@@ -86,10 +88,16 @@ class FixedMap(GeometryModule):
 
     def forward(self) -> PlaneMap:
         """The map. It shares the buffers, as `camera` and `plane` do: what is written to them later changes it too."""
+        if self._is_outdated(OF_MATRIX, "matrix"):
+            return PlaneMap.quietly(self.camera(), self.plane())
         return PlaneMap.unchecked(self.matrix, self.camera(), False)
 
     def camera(self) -> Camera:
         """The camera."""
+        check_swapped_kind(self)
+        return self._camera()
+
+    def _camera(self) -> Camera:
         return Camera.unchecked(self.K, self.R, self.t, self._current_lens(), self._size)
 
     def plane(self) -> Plane:
@@ -97,18 +105,37 @@ class FixedMap(GeometryModule):
         return Plane.unchecked(self.normal, self.offset)
 
     def _current_lens(self) -> CoefficientLens | None:
-        """The lens of the coefficients and the plan as they are: of the buffers, or of what stands in their place.
-
-        Where the coefficients alone were swapped or written to, the plan is no longer theirs, and worked out anew.
-        """
+        """The lens of the coefficients and the plan as they are: of the buffers, or of what stands in their place."""
         if self._model.kind is None:
             return None
-        if not torch.compiler.is_compiling() and self._planned_for is not None:
-            before = self._planned_for
-            now = _mark(self.coefficients), _mark(self.domain)
-            if now[0] != before[0] and now[1] == before[1]:
-                return self._model.lens(self.coefficients)
+        if self._is_outdated(("coefficients",), "domain"):
+            return self._model.lens(self.coefficients)
         return self._model.kind.planned(self.coefficients, Plan(*(getattr(self, name) for name in PLAN)))
+
+    def _is_outdated(self, made_from: tuple[str, ...], result: str) -> bool:
+        """Whether a part of what a result was made from was swapped or written to, and the result was not.
+
+        Of the module's own buffers, matrix and plan are then built again, and none is.
+        """
+        if torch.compiler.is_compiling():
+            return False
+        buffers, made = self._buffers, self._made
+        if all(_is_as_marked(buffers[name], made[name]) for name in made_from):
+            return False
+        written = all(id(buffers[name]) == made[name][0] for name in (*made_from, result))
+        if not _is_as_marked(buffers[result], made[result]):  # all of it, as by DistributedDataParallel
+            if written:
+                self._mark_all()
+            return False
+        if not written:
+            return True
+        self._mark_all()
+        self.rebuild()
+        return False
+
+    def _mark_all(self) -> None:
+        """Take all buffers as they are now for what goes together."""
+        self._made = {name: _mark(buffer) for name, buffer in self._buffers.items() if buffer is not None}
 
     def _plan_again(self) -> None:
         """Work out the plan of the coefficients."""
@@ -118,12 +145,14 @@ class FixedMap(GeometryModule):
                 return
             for name, part in lens.plan()._asdict().items():
                 setattr(self, name, part.detach().clone(memory_format=torch.contiguous_format))
-        self._planned_for = _mark(self.coefficients), _mark(self.domain)
+
+    def __getstate__(self) -> dict[str, Any]:
+        self._is_outdated(OF_MATRIX, "matrix")  # built again here, for the marks are not those of a copy
+        return self.__dict__.copy()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
-        if self._planned_for is not None:  # copied, or read from a file: the tensors are others
-            self._planned_for = _mark(self.coefficients), _mark(self.domain)
+        self._mark_all()
 
     def _apply(self, fn, recurse: bool = True):  # type: ignore[override]
         super()._apply(fn, recurse)
@@ -131,12 +160,16 @@ class FixedMap(GeometryModule):
         return self
 
     def rebuild(self) -> None:
-        """Build the matrix again from the tensors of camera and plane, in the precision that they have now."""
+        """Build matrix and plan again from the tensors of camera and plane, in the precision that they have now."""
         with torch.inference_mode(False), torch.no_grad():
             self._plan_again()
-            self.matrix = PlaneMap.quietly(self.camera(), self.plane()).matrix
+            self._mark_all()
+            self.matrix = PlaneMap.quietly(self._camera(), self.plane()).matrix
+            self._mark_all()
 
 
+OF_MATRIX = ("K", "R", "t", "normal", "offset")
+"""The names of what the matrix is made from."""
 PLAN = tuple(Plan.__annotations__)
 """The names of the parts of a plan."""
 
@@ -145,7 +178,11 @@ _Mark = tuple[int, int]
 
 def _mark(tensor: Tensor) -> _Mark:
     """Which tensor it is, and how often it was written to, as far as that is known."""
-    return id(tensor), version_of(tensor)
+    return id(tensor), 0 if tensor.is_inference() else tensor._version
+
+
+def _is_as_marked(tensor: Tensor | None, mark: _Mark) -> bool:
+    return tensor is not None and id(tensor) == mark[0] and _mark(tensor)[1] == mark[1]
 
 
 def _rebuild(fixed: FixedMap, _: Any) -> None:

@@ -5,11 +5,13 @@ from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from diffproj._core.arguments import booleans, words
 from diffproj._core.numerics import has_values
+from diffproj._core.torch_private import has_no_values
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import MODELS, model_of
 
@@ -35,9 +37,12 @@ class GeometryModule(nn.Module):
     Attributes:
         lowest_precision: a conversion to a dtype with fewer bits than this one changes nothing but the device.
         masked: names of the parameters that are learned for a part of the batch only; see `add_parameter`.
+        own_kind: lens model and image size, and the buffer that says so; see `add_kind`.
     """
 
     lowest_precision: ClassVar[torch.dtype] = torch.float32
+    own_kind: tuple[tuple[int, ...], Tensor]
+    kind: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -69,24 +74,45 @@ def add_kind(module: GeometryModule, camera: Camera) -> None:
     """
     own = (list(MODELS).index(model_of(camera.distortion).name), *(camera.size or NO_SIZE))
     module.register_buffer("kind", torch.tensor(own, dtype=torch.int64, device=camera.device))
-
+    module.own_kind = own, module.kind
     module.register_load_state_dict_pre_hook(partial(_check_kind, own))
+
+
+def check_swapped_kind(module: GeometryModule) -> None:
+    """That what stands in the place of a module's state, as in `functional_call`, is of the same lens and size.
+
+    It is looked at on a CPU, outside of graphs and of `vmap`.
+
+    Raises:
+        ValueError: it is another's.
+    """
+    if torch.compiler.is_compiling():
+        return
+    (own, before), now = module.own_kind, module._buffers["kind"]
+    if now is before or now is None or now.device.type != "cpu" or not has_values(now):
+        return
+    if wrong := _other_kind(own, now):
+        raise ValueError(f"kind: {wrong}")
 
 
 def _check_kind(own: tuple[int, ...], _: nn.Module, state: dict[str, Any], prefix: str, *rest: Any) -> None:
     """Called before `load_state_dict`, which adds the message to its own."""
     saved = state.get(f"{prefix}kind")
-    if saved is None or not has_values(saved):
-        return
-    theirs, errors = tuple(saved.tolist()), rest[-1]
+    if saved is not None and has_values(saved) and (wrong := _other_kind(own, saved)):
+        rest[-1].append(f"{prefix}kind: {wrong}")
+
+
+def _other_kind(own: tuple[int, ...], saved: Tensor) -> str:
+    """What is wrong with a state of this kind; nothing where it fits."""
+    theirs = tuple(saved.tolist())
     if theirs[0] != own[0]:
         names = dict(enumerate(MODELS))
         want, got = f"lens {names[own[0]]!r}", f"lens {names.get(theirs[0], 'of another release')!r}"
     elif theirs[1:] != own[1:] and NO_SIZE not in (theirs[1:], own[1:]):
         want, got = f"size {own[1:]}", f"size {theirs[1:]}"
     else:
-        return
-    errors.append(f"{prefix}kind: want the state of a camera with {want}, got {got}; build the module from such a one")
+        return ""
+    return f"want the state of a camera with {want}, got {got}; build the module from such a one"
 
 
 NO_SIZE = (0, 0)
@@ -119,12 +145,30 @@ def learned_parts(learn: Learn, available: Sequence[str]) -> dict[str, Any]:
     unknown = [part for part in wanted if part not in available]
     if unknown:
         raise ValueError(f"learn: want parts of {', '.join(available)}, got {unknown[0]!r}")
-    chosen = {part: where for part, where in wanted.items() if bool(booleans("learn", where).any())}
+    masks = {part: _mask(where) for part, where in wanted.items()}
+    chosen = {part: mask for part, mask in masks.items() if bool(mask.any())}
     for whole, within in (("pose", OF_POSE), ("rotation", TURNS), ("translation", ("height",))):
         twice = [part for part in within if part in chosen and whole in chosen]
         if twice:
             raise ValueError(f"learn: want {whole!r} or parts of it, got both {whole!r} and {twice[0]!r}")
     return chosen
+
+
+def _mask(where: Any) -> np.ndarray:
+    """Booleans as an array, which has values under `FakeTensorMode` too.
+
+    Raises:
+        TypeError: no booleans.
+        ValueError: a tensor without values.
+    """
+    if isinstance(where, bool):
+        return np.array(where)
+    mask = booleans("learn", where, torch.device("cpu"))
+    if has_no_values(mask):
+        if isinstance(where, Tensor):
+            raise ValueError("learn: want True, False or booleans, got a tensor without values")
+        return np.array(where, dtype=bool)
+    return mask.numpy(force=True)
 
 
 def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, batch: torch.Size) -> None:
@@ -144,30 +188,31 @@ def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, b
         ValueError: `where` does not broadcast to the batch shape, or differs along an axis with one shared value.
     """
     zero = torch.zeros_like(like, memory_format=torch.contiguous_format)
-    mask = booleans("learn", where).cpu()
+    mask = where if isinstance(where, np.ndarray) else _mask(where)
     try:
-        mask = mask.expand(batch)
-    except RuntimeError:
+        mask = np.broadcast_to(mask, tuple(batch))
+    except ValueError:
         raise ValueError(
-            f"learn: want booleans that broadcast to the batch shape {tuple(batch)}, got shape {tuple(mask.shape)}"
+            f"learn: want booleans that broadcast to the batch shape {tuple(batch)}, got shape {mask.shape}"
         ) from None
-    if not bool(mask.any()):
+    if not mask.any():
         module.register_buffer(name, zero)
         return
     module.register_parameter(name, nn.Parameter(zero))
-    if bool(mask.all()):
+    if mask.all():
         return
     for axis, length in enumerate(like.shape[:-1]):
         if length < mask.shape[axis]:
-            first = mask.narrow(axis, 0, 1)
-            if not bool((mask == first).all()):
+            first = mask.take([0], axis)
+            if not (mask == first).all():
                 raise ValueError(
                     f"learn: want the same for all poses of one camera, got {mask.tolist()} for {name}, which they "
                     "share because they start with the same intrinsics; tied_intrinsics=False gives each its own"
                 )
             mask = first
     module.masked.add(name)
-    module.register_buffer(f"{name}_learned", mask.unsqueeze(-1).to(like))
+    where = torch.tensor(mask.tolist(), dtype=like.dtype, device=like.device)
+    module.register_buffer(f"{name}_learned", where.unsqueeze(-1))
 
 
 def learned(module: GeometryModule, name: str) -> Tensor:

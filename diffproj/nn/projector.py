@@ -174,7 +174,7 @@ def camera_numbers(chosen: Tensor | Sequence[int] | int, count: int, device: tor
         number = whole_number("camera", chosen, f"a number from 0 to {count - 1}", least=0, most=count - 1)
         found = torch.tensor(number, dtype=torch.long, device=device)
     else:
-        found = whole_numbers("camera", chosen, "which camera took each sample").to(device)
+        found = whole_numbers("camera", chosen, "which camera took each sample", device).to(device)
     if found.device.type == "cpu" and has_values(found) and found.numel():
         low, high = (int(end) for end in found.aminmax())
         if low < 0 or high >= count:
