@@ -11,11 +11,13 @@ from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import CalibrationError
 from diffproj.calibration.rig_alone import Alone, Asked, alone, checked_cameras, lenses
 from diffproj.calibration.rig_fit import rig_fit
+from diffproj.calibration.rig_knowledge import RigKnowledge
 from diffproj.calibration.rig_options import held, held_places, held_points
 from diffproj.calibration.rig_outcome import rig_outcome
+from diffproj.calibration.rig_priors import PLACES, own_priors, rig_knowledge
 from diffproj.calibration.rig_problem import RigParameters
 from diffproj.calibration.rig_result import RigCalibration
-from diffproj.calibration.rig_shape import with_bow, with_known_points, with_points
+from diffproj.calibration.rig_shape import weighed_anew, with_bow, with_known_points, with_points
 from diffproj.calibration.rig_start import rig_start
 from diffproj.calibration.rig_views import Moments, rig_views
 from diffproj.calibration.solver import Status
@@ -33,6 +35,7 @@ class RigTask:
         parameters: the shared unknowns.
         positions: of those that are held.
         held_points: coordinates of free points that are, numbers from 0.
+        known: what is known of them beforehand, if anything is.
         moved: how far the target's points are known to lie from where it has them `(N, 3)`, if they do.
     """
 
@@ -40,6 +43,7 @@ class RigTask:
     parameters: RigParameters
     positions: list[int]
     held_points: list[int]
+    known: RigKnowledge | None = None
     moved: Tensor | None = None
 
 
@@ -77,7 +81,11 @@ def rig_task(
         raise ValueError(f"shape: want 'flat' for points that are not all on z = 0, got {chosen.shape!r}")
     fixed, points = held_points(chosen.fixed, len(views.points))
     names, positions = held(parameters, fixed)
-    return RigTask(Asked(views, target, lens, known, names, chosen, who), parameters, positions, points, moved)
+    priors = own_priors(parameters, chosen.priors)
+    knowledge = rig_knowledge(parameters, priors, known, views, positions)
+    alone = {name: {what: value for what, value in own.items() if what not in PLACES} for name, own in priors.items()}
+    asked = Asked(views, target, lens, known, names, alone, chosen, who)
+    return RigTask(asked, parameters, positions, points, knowledge, moved)
 
 
 def finished(task: RigTask, own: Mapping[str, Alone]) -> RigCalibration:
@@ -97,6 +105,7 @@ def finished(task: RigTask, own: Mapping[str, Alone]) -> RigCalibration:
         {name: one.used for name, one in seen.items()},
         task.positions,
         chosen,
+        task.known,
     )
     if task.moved is not None:
         found = with_known_points(found, task.moved, chosen)
@@ -104,6 +113,8 @@ def finished(task: RigTask, own: Mapping[str, Alone]) -> RigCalibration:
         found = with_bow(found, chosen)
     elif chosen.shape == "free":
         found = with_points(found, task.held_points, chosen)
+    elif task.known is not None:
+        found = weighed_anew(found, chosen)
     rig = rig_outcome(found, own)
     if chosen.throw and rig.status != Status.CONVERGED:
         raise CalibrationError(f"{who}: {rig.message}", rig)

@@ -5,7 +5,7 @@ for its lens, the others contradict. The frame of free points and what holds the
 `shape.py`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -24,38 +24,70 @@ STIFF = 100.0
 """How many times as firmly as without a prior the frame is held beside one, which leaves it no say about the frame."""
 
 
+def weighed_anew(flat: RigFit, options: Options) -> RigFit:
+    """The fit to a flat target with what is known beforehand weighed against the noise that the residuals tell."""
+
+    def again(found: RigFit, noise: float) -> RigFit:
+        return _fitted(found, flat.parameters, (), flat.shared.new_zeros(0), options, noise)
+
+    return flat if _is_weighed(flat) else _settled(flat, again, settled=False)
+
+
 def with_bow(flat: RigFit, options: Options) -> RigFit:
     """The fit with the board's bow."""
     parameters = replace(flat.parameters, bow=True)
-    return _fitted(flat, parameters, (), flat.shared.new_zeros(2), options)
+
+    def again(found: RigFit, noise: float) -> RigFit:
+        return _fitted(found, parameters, (), _shape_of(found, 2), options, noise)
+
+    return _settled(flat, again, settled=flat.problem.known is None or _is_weighed(flat))
 
 
 def with_points(flat: RigFit, held_points: Sequence[int], options: Options) -> RigFit:
     """The fit with free points.
-
-    Where corners have no weights, how well the target was printed weighs against the noise that the residuals tell,
-    which depends on it in turn: a few rounds settle both.
 
     Args:
         flat: to the flat target.
         held_points: coordinates of the displacements that stay 0, numbers from 0.
         options: checked.
     """
-    views, few = flat.views, flat.parameters.few
-    parameters = replace(flat.parameters, points=len(views.points))
-    printed = printing_precision(options.priors, (), views.points)
-    weighed = any(data.weights is not None for data in views.data.values())
-    settled = printed is None or weighed
-    noise = 1.0 if settled else _noise(flat)
-    found, moves = flat, flat.shared.new_zeros(3 * parameters.points)
-    for _ in range(MAX_ROUNDS):
+    parameters = replace(flat.parameters, points=len(flat.views.points))
+    printed = printing_precision(options.priors, (), flat.views.points)
+
+    def again(found: RigFit, noise: float) -> RigFit:
         restraint = _restraint(flat, None if printed is None else noise * printed)
-        found = replace(_fitted(found, parameters, held_points, moves, options, restraint), prior_variance=noise)
-        moves = found.shared[0, few:]
+        return _fitted(
+            found, parameters, held_points, _shape_of(found, 3 * parameters.points), options, noise, restraint
+        )
+
+    nothing = printed is None and flat.problem.known is None
+    return _settled(flat, again, settled=nothing or _is_weighed(flat))
+
+
+def _settled(flat: RigFit, again: Callable[[RigFit, float], RigFit], settled: bool) -> RigFit:
+    """The fit that `again` makes of one, with what is known beforehand weighed against that variance of residuals.
+
+    Where corners have no weights, it weighs against the noise that the residuals tell, which depends on it in turn: a
+    few rounds settle both.
+    """
+    found, noise = flat, 1.0 if settled else _noise(flat)
+    for _ in range(MAX_ROUNDS):
+        found = replace(again(found, noise), prior_variance=noise)
         before, noise = noise, noise if settled else _noise(found)
         if abs(noise - before) <= SAME_NOISE * before:
             break
     return found
+
+
+def _is_weighed(found: RigFit) -> bool:
+    """Whether corners have weights, which say what their noise is."""
+    return any(data.weights is not None for data in found.views.data.values())
+
+
+def _shape_of(found: RigFit, count: int) -> Tensor:
+    """The unknowns of the target's shape `(count,)`: 0 as long as it has none."""
+    shape = found.shared[0, found.parameters.few :]
+    return shape if len(shape) else found.shared.new_zeros(count)
 
 
 def with_known_points(flat: RigFit, moves: Tensor, options: Options) -> RigFit:
@@ -70,15 +102,21 @@ def _fitted(
     held: Sequence[int],
     shape: Tensor,
     options: Options,
+    noise: float = 1.0,
     restraint: Restraint | None = None,
 ) -> RigFit:
-    """From a fit to one with a shape, which starts at `shape` and of which some unknowns are held, numbers from 0."""
-    few = parameters.few
+    """From a fit to one with a shape, which starts at `shape` and of which some unknowns are held, numbers from 0.
+
+    What is known of the cameras weighs against residuals of the variance `noise`.
+    """
+    few, known = parameters.few, begin.problem.known
     basis = free_directions(parameters, [*begin.positions, *(few + i for i in held)], begin.shared)
     shared = torch.cat([begin.shared[:, :few], shape.unsqueeze(0)], dim=-1)
     given = {name: begin.views.data[name].used[0] for name in begin.views.names}
     with torch.inference_mode():
-        fit = Rounds(begin.views, parameters, begin.problem.base, basis, options, restraint)
+        fit = Rounds(
+            begin.views, parameters, begin.problem.base, basis, options, restraint, known and known.against(noise)
+        )
         fit.solve(begin.used, shared, begin.local)
         found = fit.at_the_minimum(fit.without_outliers(given, begin.apart), begin.apart)
     found = replace(found, iterations=begin.iterations + found.iterations)
