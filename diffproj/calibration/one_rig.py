@@ -22,6 +22,7 @@ from diffproj.calibration.rig_start import rig_start
 from diffproj.calibration.rig_views import Moments, rig_views
 from diffproj.calibration.solver import Status
 from diffproj.lens.models import LensModel
+from diffproj.targets.landmarks import Landmarks
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
@@ -76,15 +77,15 @@ def rig_task(
     # What is held has to be known by camera before each is calibrated on its own; a known camera brings its lens.
     kinds = {name: Parametrisation.of(known[name]) if name in known else Parametrisation(lens[name]) for name in lens}
     parameters = RigParameters(views.names, tuple(kinds.values()))
-    shaped = chosen.shape != "flat" or moved is not None
-    if shaped and bool((views.data[views.names[0]].given_points.detach()[:, 2] != 0).any()):
-        raise ValueError(f"shape: want 'flat' for points that are not all on z = 0, got {chosen.shape!r}")
+    views.data[views.names[0]].check_options("image", chosen.shape, (*chosen.fixed, *(chosen.priors or ())))
     fixed, points = held_points(chosen.fixed, len(views.points))
     names, positions = held(parameters, fixed)
     priors = own_priors(parameters, chosen.priors)
     knowledge = rig_knowledge(parameters, priors, known, views, positions)
     alone = {name: {what: value for what, value in own.items() if what not in PLACES} for name, own in priors.items()}
-    asked = Asked(views, target, lens, known, names, alone, chosen, who)
+    # On its own, each camera takes landmarks for exact: their errors are unknowns of the rig, which all its views share.
+    bare = Landmarks(target.points, target.names) if isinstance(target, Landmarks) else target
+    asked = Asked(views, bare, lens, known, names, alone, chosen, who)
     return RigTask(asked, parameters, positions, points, knowledge, moved)
 
 
@@ -111,7 +112,7 @@ def finished(task: RigTask, own: Mapping[str, Alone]) -> RigCalibration:
         found = with_known_points(found, task.moved, chosen)
     elif chosen.shape == "bow":
         found = with_bow(found, chosen)
-    elif chosen.shape == "free":
+    elif chosen.shape == "free" or views.spread is not None:
         found = with_points(found, task.held_points, chosen)
     elif task.known is not None:
         found = weighed_anew(found, chosen)

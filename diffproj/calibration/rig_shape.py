@@ -19,7 +19,10 @@ from diffproj.calibration.rig_options import free_directions
 from diffproj.calibration.rig_problem import RigParameters
 from diffproj.calibration.rig_uncertainty import camera_noise, pooled_variance
 from diffproj.calibration.shape import Restraint, restraint_of
+from diffproj.calibration.surveyed import FINEST_PX
 
+EXACT = 1e-8
+"""Variance of a landmark in a direction, relative to the largest of all, below which it counts as so exact."""
 STIFF = 100.0
 """How many times as firmly as without a prior the frame is held beside one, which leaves it no say about the frame."""
 
@@ -52,7 +55,10 @@ def with_points(flat: RigFit, held_points: Sequence[int], options: Options) -> R
         options: checked.
     """
     parameters = replace(flat.parameters, points=len(flat.views.points))
+    surveyed = flat.views.spread is not None
     printed = printing_precision(options.priors, (), flat.views.points)
+    if flat.views.spread is not None:
+        printed = _as_surveyed(flat.views.spread)
 
     def again(found: RigFit, noise: float) -> RigFit:
         restraint = _restraint(flat, None if printed is None else noise * printed)
@@ -61,19 +67,19 @@ def with_points(flat: RigFit, held_points: Sequence[int], options: Options) -> R
         )
 
     nothing = printed is None and flat.problem.known is None
-    return _settled(flat, again, settled=nothing or _is_weighed(flat))
+    return _settled(flat, again, settled=nothing or _is_weighed(flat), least=FINEST_PX**2 if surveyed else 0.0)
 
 
-def _settled(flat: RigFit, again: Callable[[RigFit, float], RigFit], settled: bool) -> RigFit:
+def _settled(flat: RigFit, again: Callable[[RigFit, float], RigFit], settled: bool, least: float = 0.0) -> RigFit:
     """The fit that `again` makes of one, with what is known beforehand weighed against that variance of residuals.
 
     Where corners have no weights, it weighs against the noise that the residuals tell, which depends on it in turn: a
-    few rounds settle both.
+    few rounds settle both. The variance is taken for no less than `least`.
     """
-    found, noise = flat, 1.0 if settled else _noise(flat)
+    found, noise = flat, 1.0 if settled else max(_noise(flat), least)
     for _ in range(MAX_ROUNDS):
         found = replace(again(found, noise), prior_variance=noise)
-        before, noise = noise, noise if settled else _noise(found)
+        before, noise = noise, noise if settled else max(_noise(found), least)
         if abs(noise - before) <= SAME_NOISE * before:
             break
     return found
@@ -92,8 +98,8 @@ def _shape_of(found: RigFit, count: int) -> Tensor:
 
 def with_known_points(flat: RigFit, moves: Tensor, options: Options) -> RigFit:
     """The fit with the points of the target displaced by `moves (N, 3)`, which are known."""
-    parameters = replace(flat.parameters, points=len(moves))
-    return _fitted(flat, parameters, range(moves.numel()), moves.to(flat.shared).flatten(), options)
+    parameters, moves = replace(flat.parameters, points=len(moves)), flat.views.frame.turned(moves.to(flat.shared))
+    return _fitted(flat, parameters, range(moves.numel()), moves.flatten(), options)
 
 
 def _fitted(
@@ -123,6 +129,13 @@ def _fitted(
     return replace(in_normal_tensors(found), restrained=begin.restrained, positions=begin.positions)
 
 
+def _as_surveyed(spread: Tensor) -> Tensor:
+    """The precision of landmarks' displacements `(1, N, 3, 3)`; where one is exact along some direction, nearly none."""
+    values, axes = torch.linalg.eigh(spread)
+    precision = values.clamp(min=EXACT * float(values.amax())).reciprocal()
+    return ((axes * precision.unsqueeze(-2)) @ axes.mT).unsqueeze(0)
+
+
 def _noise(found: RigFit) -> float:
     """The variance of a residual; 1 where there are too few to tell."""
     level = float(pooled_variance(camera_noise(found)))
@@ -138,5 +151,6 @@ def _restraint(flat: RigFit, printed: Tensor | None) -> Restraint:
     ones = [torch.ones_like(views.data[name].pixels[0, :, :, 0]) for name in views.names]
     counts = torch.cat([one if given is None else given[0] for one, given in zip(ones, weights, strict=True)])
     # A point counts as shown where two views show it, of whichever cameras.
-    found = restraint_of(views.points, pixels[None], used[None], counts[None], printed)
-    return found if printed is None else found._replace(root=STIFF * found.root)
+    surveyed = views.spread is not None
+    found = restraint_of(views.points, pixels[None], used[None], counts[None], printed, surveyed)
+    return found if printed is None or surveyed else found._replace(root=STIFF * found.root)

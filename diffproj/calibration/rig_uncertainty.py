@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffproj.calibration.covariance import Covariance, Scores, covariance, reshaped
+from diffproj.calibration.covariance import Covariance, Scores, covariance, points_turned, reshaped
 from diffproj.calibration.dispersion import FEW_VIEWS, FEW_VIEWS_OF_A_SHAPE, believed, contradiction
 from diffproj.calibration.eliminated import local_inverse, reduced
 from diffproj.calibration.losses import slope_and_bend
@@ -183,7 +183,9 @@ def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
         dispersion=phi,
         unseen=unseen(found),
     )
-    middle = found.views.middle
+    middle, axes = found.views.middle, found.views.frame.axes
+    if axes is not None:
+        found_one = points_turned(found_one, axes.mT, found.parameters.few + 2 * found.parameters.bow)
     R, _ = found.views.frame.world_pose(found.local[0][0], found.local[1][0])
     return replace(reshaped(found_one, ()), middle=middle, _arm=R @ middle)
 
@@ -223,7 +225,8 @@ def _dispersion(found: RigFit, H: Equations, M: Equations) -> Tensor:
             total, pull = basis.mT @ total @ basis, (basis.mT @ pull.unsqueeze(-1)).squeeze(-1)
         share = seen.to(u).unsqueeze(0)
         told = contradiction(u, S, K, share, total, pull)
-        return believed(told, FEW_VIEWS_OF_A_SHAPE if found.restraint is not None else FEW_VIEWS).clone()
+        shaped = found.restraint is not None and found.views.spread is None
+        return believed(told, FEW_VIEWS_OF_A_SHAPE if shaped else FEW_VIEWS).clone()
 
 
 def _seen(found: RigFit, name: str) -> Tensor:

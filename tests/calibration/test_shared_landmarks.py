@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 import diffproj as dp
+from diffproj.geometry.cayley import turn_between
 
 D = torch.float64
 K = torch.tensor([[1000.0, 0, 639.5], [0, 1000, 479.5], [0, 0, 1]], dtype=D)
@@ -198,3 +199,80 @@ def test_what_does_not_go_together_is_refused() -> None:
         dp.refine(views, level, start, shape="free", fixed=("points_z",))
     with pytest.raises(ValueError, match="objective: want 'image' for landmarks with a sigma"):
         dp.refine(views, level, start, objective="plane")
+
+
+def located_often(trials: int = 300, **options: Any) -> tuple[Tensor, dp.Camera, dp.Calibration]:
+    """Points as they are in each trial `(B, N, 3)`, the camera in three views, and what `locate` finds of it in them."""
+    points, camera = scene(14, 3)
+    random = torch.Generator().manual_seed(3)
+    spread = covariances(len(points))
+    values, axes = torch.linalg.eigh(spread)
+    off = (axes * values.clamp(min=0).sqrt().unsqueeze(-2)) @ torch.randn(
+        trials, len(points), 3, 1, dtype=D, generator=random
+    )
+    true = points + off.squeeze(-1)
+    pixels, _ = camera.project(true.unsqueeze(1))
+    pixels = pixels + torch.randn(pixels.shape, dtype=D, generator=random)
+    found = dp.locate(dp.Views(pixels), dp.Landmarks(points, sigma=spread), dp.Camera(K, size=SIZE), **options)
+    return true, camera, found
+
+
+def pose_errors(found: dp.Calibration, camera: dp.Camera, middle: Tensor) -> Tensor:
+    """How far poses about the middle are off `(B, V, 6)`."""
+    omega = turn_between(camera.R.expand_as(found.cameras.R), found.cameras.R)
+    tau = found.cameras.t - camera.t + (found.cameras.R - camera.R) @ middle
+    return torch.cat([omega, tau], dim=-1)
+
+
+@pytest.mark.parametrize("options", [{"pixel_sigma": 1.0}, {"weights": 1.0}])
+def test_poses_of_several_views_go_together_as_their_joint_covariance_says(options: dict[str, Any]) -> None:
+    """Each view is located by itself; by errors of landmarks that they share their poses are off together."""
+    _, camera, found = located_often(**options)
+    middle = found.covariance.middle
+    assert middle is not None
+    errors, full = pose_errors(found, camera, middle).flatten(1), found.covariance.about_middle.full()[:, -18:, -18:]
+    squares = (errors * torch.linalg.solve(full, errors)).sum(-1) / 18
+    assert float(squares.mean()) == pytest.approx(1, abs=0.1)
+    between = found.covariance.about_middle.between(0, 2)
+    torch.testing.assert_close(between, full[:, :6, 12:], rtol=1e-9, atol=0)
+    unit = errors / full.diagonal(dim1=-2, dim2=-1).sqrt()
+    correlation = (
+        full
+        / full.diagonal(dim1=-2, dim2=-1).sqrt().unsqueeze(-1)
+        / full.diagonal(dim1=-2, dim2=-1).sqrt().unsqueeze(-2)
+    )
+    sampled = unit.mT @ unit / len(unit)
+    assert float(correlation[:, :6, 6:12].abs().amax()) > 0.3  # far from independent
+    assert float((sampled - correlation.mean(0)).abs().amax()) < 0.25
+
+
+def test_what_views_on_the_same_landmarks_measure_is_fused_as_of_one_survey() -> None:
+    """The error of the landmarks does not average out."""
+    _, camera, found = located_often(200, pixel_sigma=1.0)
+    ground = torch.tensor([[500_000.5, 5_600_000.3, 30.0]], dtype=D)
+    seen = [
+        dp.measure(camera[view].project(ground)[0], found, dp.Plane.z(30.0), view=view, pixel_sigma=0.01)
+        for view in range(3)
+    ]
+    fused = dp.fuse(seen)
+    off = (fused.points - ground)[:, 0, :2]
+    C = fused.covariance[:, 0, :2, :2]
+    squares = (off * torch.linalg.solve(C, off)).sum(-1) / 2
+    assert 0.3 < float(squares.mean()) < 1.0  # measured: 0.44; taken for independent, 1.33
+
+
+def test_files_keep_what_views_have_in_common(tmp_path: Path) -> None:
+    points, camera = scene(14, 3)
+    views, landmarks = observed(points, camera, covariances(14))
+    found = dp.locate(views, landmarks, dp.Camera(K, size=SIZE), pixel_sigma=1.0)
+    dp.save_camera(tmp_path / "located.json", found)
+    again = dp.load_calibration(tmp_path / "located.json")
+    torch.testing.assert_close(again.covariance.full(), found.covariance.full())
+    assert torch.equal(again.uncertain, found.uncertain)  # type: ignore[arg-type]
+    assert found.uncertain is not None
+    assert found.uncertain.tolist() == [False, *[True] * 13]
+    assert dp.locate(views, dp.Landmarks(points), dp.Camera(K, size=SIZE), pixel_sigma=1.0).uncertain is None
+    known = {"height": (35.0, 1000.0)}
+    held = dp.locate(views, landmarks, dp.Camera(K, size=SIZE), pixel_sigma=1.0, priors=known)
+    one, other = (each.covariance.about_middle.between(0, 1) for each in (held, found))
+    torch.testing.assert_close(one, other, rtol=0, atol=0.03 * float(other.abs().amax()))
