@@ -83,7 +83,7 @@ def rig_task(
     priors = own_priors(parameters, chosen.priors)
     knowledge = rig_knowledge(parameters, priors, known, views, positions)
     alone = {name: {what: value for what, value in own.items() if what not in PLACES} for name, own in priors.items()}
-    # On its own, each camera takes landmarks for exact: their errors are unknowns of the rig, which all its views share.
+    # On its own, each camera takes landmarks for exact: their errors are unknowns that all views of the rig share.
     bare = Landmarks(target.points, target.names) if isinstance(target, Landmarks) else target
     asked = Asked(views, bare, lens, known, names, alone, chosen, who)
     return RigTask(asked, parameters, positions, points, knowledge, moved)

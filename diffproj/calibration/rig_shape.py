@@ -130,7 +130,7 @@ def _fitted(
 
 
 def _as_surveyed(spread: Tensor) -> Tensor:
-    """The precision of landmarks' displacements `(1, N, 3, 3)`; where one is exact along some direction, nearly none."""
+    """The precision of landmarks' displacements `(1, N, 3, 3)`; exact directions hardly move."""
     values, axes = torch.linalg.eigh(spread)
     precision = values.clamp(min=EXACT * float(values.amax())).reciprocal()
     return ((axes * precision.unsqueeze(-2)) @ axes.mT).unsqueeze(0)

@@ -227,7 +227,7 @@ def _same(a: Plane, b: Plane) -> bool:
 
 
 def _sharing(found: Sequence[Measurement]) -> list[int]:
-    """For each measurement how many of them have its errors in common: those of one calibration, rig or survey, and copies."""
+    """For each measurement how many have its errors in common: those of one calibration, rig or survey, and copies."""
     return [sum(one is other or _one_calibration(one, other) for other in found) for one in found]
 
 
