@@ -67,6 +67,7 @@ class Covariance(Copied, Shown):
     _alone: Tensor  # Cov(W_v^-1 h_v), (*B, V, 6, 6); poses turn about the middle in these three
     middle: Float[Tensor, "3"] | None = None
     _arm: Tensor | None = None  # R_v middle (*B, V, 3), from the world's origin to the middle along the camera's axes
+    _common: Tensor | None = None  # what moves all poses besides, by errors of variance 1 (*B, V, 6, e); part of _alone
 
     @property
     def about_middle(self) -> "Covariance":
@@ -112,6 +113,8 @@ class Covariance(Copied, Shown):
         same = view == other
         if same:
             blocks = blocks + self._alone[..., view, :, :]
+        elif self._common is not None:
+            blocks = blocks + self._common[..., view, :, :] @ self._common[..., other, :, :].mT
         blocks = self._turns[..., view, :, :] @ blocks @ self._turns[..., other, :, :].mT
         unknown = (self.undetermined_views[..., view] | self.undetermined_views[..., other])[..., None, None]
         infinite = torch.diag_embed(torch.full_like(blocks[..., 0], torch.inf))
@@ -164,8 +167,12 @@ class Covariance(Copied, Shown):
         F, Q = self._follow.flatten(-3, -2), self._mixed.flatten(-3, -2)
         known = self.undetermined_views.repeat_interleave(6, dim=-1).logical_not().to(F.dtype)
         poses = F @ zero_where_infinite(self.shared) @ F.mT - Q @ F.mT - F @ Q.mT
+        alone = self._alone
+        if self._common is not None:
+            poses = poses + self._common.flatten(-3, -2) @ self._common.flatten(-3, -2).mT
+            alone = alone - self._common @ self._common.mT
         poses = poses + torch.stack(
-            [torch.nn.functional.pad(self._alone[..., v, :, :], (6 * v, 6 * (V - 1 - v))) for v in range(V)], dim=-3
+            [torch.nn.functional.pad(alone[..., v, :, :], (6 * v, 6 * (V - 1 - v))) for v in range(V)], dim=-3
         ).flatten(-3, -2)
         cross = Q - F @ zero_where_infinite(self.shared)
         turn = torch.zeros_like(poses)
@@ -189,6 +196,8 @@ class Covariance(Copied, Shown):
         }
         if self.middle is not None and self._arm is not None:
             tensors |= {"middle": self.middle, "arm": self._arm}
+        if self._common is not None:
+            tensors["common"] = self._common
         return {"names": list(self.names), **{key: tensor.tolist() for key, tensor in tensors.items()}}
 
     @classmethod
@@ -225,9 +234,13 @@ class Covariance(Copied, Shown):
         middle = []
         if "middle" in fields or "arm" in fields:
             middle = [tensor(fields, "middle", (3,)), tensor(fields, "arm", (*batch, views, 3))]
+        common = fields.get("common")
+        if common is not None:
+            common = tensor(fields, "common", (*batch, views, 6, None), gaps=True)
         infinite = torch.diag_embed(torch.where(undetermined, torch.inf, 0.0).to(shared))
         known = undetermined, undetermined_views, dispersion
-        return cls(tuple(names), shared + infinite, *known, follow, mixed, alone, *middle)
+        found = cls(tuple(names), shared + infinite, *known, follow, mixed, alone, *middle)
+        return replace(found, _common=common)
 
     @property
     def has_gaps(self) -> Bool[Tensor, "*batch"]:

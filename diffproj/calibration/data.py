@@ -98,6 +98,11 @@ class Data:
         self.used = visible & (visible.sum(-1, keepdim=True) >= 4)
         _check_inside(views, self.pixels, self.used)
 
+    @property
+    def uncertain(self) -> Tensor | None:
+        """Which landmarks come with an error of their own `(N,)`; `None` where none does."""
+        return None if self.spread is None else (self.spread != 0).flatten(1).any(-1)
+
     @cached_property
     def shares(self) -> Tensor | None:
         """How much each view counts in what all views share `(P, V)`; `None` where all count fully."""

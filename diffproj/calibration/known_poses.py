@@ -29,7 +29,7 @@ from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.pose_parameters import TURNS
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Solution, Status, equations_at
-from diffproj.calibration.surveyed import whitening
+from diffproj.calibration.surveyed import in_common, whitening
 from diffproj.calibration.task import Task as Seeing
 from diffproj.geometry.camera import Camera
 
@@ -97,7 +97,7 @@ def known_poses(
     scale = scale.repeat_interleave(len(data.views))
     located = replace(
         plain,
-        _covariance=partial(_covariance, data, task, found, calibration, scale),
+        _covariance=partial(_covariance, data, whole, task, found, calibration, scale),
         _others=partial(_others, data, whole, ends),
         _remarks=partial(_remarks, data, task, found, plain),
         _mismatch=None,
@@ -269,7 +269,9 @@ def _joined(data: Data, fit: Fit) -> Fit:
     return Fit(whole, solution, together(fit.rejected))
 
 
-def _covariance(data: Data, task: Task, found: Found, calibration: Calibration | None, scale: Tensor) -> Covariance:
+def _covariance(
+    data: Data, whole: Fit, task: Task, found: Found, calibration: Calibration | None, scale: Tensor
+) -> Covariance:
     s, batch = found.parameters.camera.size, tuple(data.batch)
     before = None if calibration is None or not calibration.has_covariance else calibration.covariance_of_kept_poses
     with torch.no_grad():
@@ -281,6 +283,12 @@ def _covariance(data: Data, task: Task, found: Found, calibration: Calibration |
 
     alone, follow = each(errors.own[:, s:, s:]), each(errors.follow[:, s:])
     shared = alone.new_zeros(*batch, s, s)
+    common = in_common(
+        whole.task,
+        whole.solution.shared,
+        whole.solution.local,
+        errors.own[:, s:, s:].reshape(*whole.task.used.shape[:2], 6, 6),
+    )
     lacking = each(errors.lacking[:, -1]) & data.used.any(-1).reshape(*batch, V)
     own = Covariance(
         found.parameters.camera.names,
@@ -293,6 +301,7 @@ def _covariance(data: Data, task: Task, found: Found, calibration: Calibration |
         (alone + alone.mT) / 2,
         data.middle,
         each(errors.arm),
+        None if common is None else common.reshape(*batch, *common.shape[1:]),
     )
     return own if before is None else own.following(before)
 

@@ -62,8 +62,10 @@ def locate(
     With a calibration in the place of a camera a `CameraMismatchWarning` names the views whose corners are not where it
     sees them, as photographs of another camera, zoom or focus: see `mismatch`.
     A calibration that fitted the target's shape brings that along, too, for the same target. `Landmarks` may lie
-    anywhere; where they come with a sigma of their own, each view's pose carries it, as if other views had other
-    landmarks; with a calibration that was found on them they are where that has them.
+    anywhere; where they come with a sigma of their own, each view's pose carries it, found by that view alone, whatever
+    else is in the batch. Views that share landmarks are off together, as the covariance between their poses says;
+    `refine` with all parameters of the camera fixed finds poses and landmarks together, and is surer. With a
+    calibration that was found on them landmarks are where that has them.
 
     Args:
         views: corners `(*B, V, N, 2)`.

@@ -11,15 +11,18 @@ from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.result import CalibrationError
 from diffproj.calibration.rig_alone import Alone, Asked, alone, checked_cameras, lenses
 from diffproj.calibration.rig_fit import rig_fit
+from diffproj.calibration.rig_knowledge import RigKnowledge
 from diffproj.calibration.rig_options import held, held_places, held_points
 from diffproj.calibration.rig_outcome import rig_outcome
+from diffproj.calibration.rig_priors import PLACES, own_priors, rig_knowledge
 from diffproj.calibration.rig_problem import RigParameters
 from diffproj.calibration.rig_result import RigCalibration
-from diffproj.calibration.rig_shape import with_bow, with_known_points, with_points
+from diffproj.calibration.rig_shape import weighed_anew, with_bow, with_known_points, with_points
 from diffproj.calibration.rig_start import rig_start
 from diffproj.calibration.rig_views import Moments, rig_views
 from diffproj.calibration.solver import Status
 from diffproj.lens.models import LensModel
+from diffproj.targets.landmarks import Landmarks
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
@@ -33,6 +36,7 @@ class RigTask:
         parameters: the shared unknowns.
         positions: of those that are held.
         held_points: coordinates of free points that are, numbers from 0.
+        known: what is known of them beforehand, if anything is.
         moved: how far the target's points are known to lie from where it has them `(N, 3)`, if they do.
     """
 
@@ -40,6 +44,7 @@ class RigTask:
     parameters: RigParameters
     positions: list[int]
     held_points: list[int]
+    known: RigKnowledge | None = None
     moved: Tensor | None = None
 
 
@@ -72,12 +77,16 @@ def rig_task(
     # What is held has to be known by camera before each is calibrated on its own; a known camera brings its lens.
     kinds = {name: Parametrisation.of(known[name]) if name in known else Parametrisation(lens[name]) for name in lens}
     parameters = RigParameters(views.names, tuple(kinds.values()))
-    shaped = chosen.shape != "flat" or moved is not None
-    if shaped and bool((views.data[views.names[0]].given_points.detach()[:, 2] != 0).any()):
-        raise ValueError(f"shape: want 'flat' for points that are not all on z = 0, got {chosen.shape!r}")
+    views.data[views.names[0]].check_options("image", chosen.shape, (*chosen.fixed, *(chosen.priors or ())))
     fixed, points = held_points(chosen.fixed, len(views.points))
     names, positions = held(parameters, fixed)
-    return RigTask(Asked(views, target, lens, known, names, chosen, who), parameters, positions, points, moved)
+    priors = own_priors(parameters, chosen.priors)
+    knowledge = rig_knowledge(parameters, priors, known, views, positions)
+    alone = {name: {what: value for what, value in own.items() if what not in PLACES} for name, own in priors.items()}
+    # On its own, each camera takes landmarks for exact: their errors are unknowns that all views of the rig share.
+    bare = Landmarks(target.points, target.names) if isinstance(target, Landmarks) else target
+    asked = Asked(views, bare, lens, known, names, alone, chosen, who)
+    return RigTask(asked, parameters, positions, points, knowledge, moved)
 
 
 def finished(task: RigTask, own: Mapping[str, Alone]) -> RigCalibration:
@@ -97,13 +106,16 @@ def finished(task: RigTask, own: Mapping[str, Alone]) -> RigCalibration:
         {name: one.used for name, one in seen.items()},
         task.positions,
         chosen,
+        task.known,
     )
     if task.moved is not None:
         found = with_known_points(found, task.moved, chosen)
     elif chosen.shape == "bow":
         found = with_bow(found, chosen)
-    elif chosen.shape == "free":
+    elif chosen.shape == "free" or views.spread is not None:
         found = with_points(found, task.held_points, chosen)
+    elif task.known is not None:
+        found = weighed_anew(found, chosen)
     rig = rig_outcome(found, own)
     if chosen.throw and rig.status != Status.CONVERGED:
         raise CalibrationError(f"{who}: {rig.message}", rig)

@@ -11,6 +11,7 @@ from diffproj.calibration.compatibility import mismatch
 from diffproj.calibration.constraints import free_basis, held_at, make_prior, of_camera, of_points
 from diffproj.calibration.covariance import Covariance, points_turned, reshaped
 from diffproj.calibration.data import Data
+from diffproj.calibration.eliminated import local_inverse
 from diffproj.calibration.entangled import Entangled
 from diffproj.calibration.fit import Fit, fit
 from diffproj.calibration.noise import Noise, level, noise_of
@@ -20,6 +21,7 @@ from diffproj.calibration.parametrisation import SKEW, Parametrisation
 from diffproj.calibration.remarks import remarks
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Prior, Status
+from diffproj.calibration.surveyed import in_common
 from diffproj.calibration.uncertainty import covariance_of
 from diffproj.calibration.verdict import verdicts
 from diffproj.geometry.camera import Camera
@@ -123,6 +125,7 @@ def outcome(
         _others=partial(_others, found, data, before),
         _remarks=partial(remarks, found, status, doubt, data.views.names, landmarks is not None),
         landmarks=landmarks,
+        uncertain=data.uncertain,
         _mismatch=None if known is None else partial(mismatch, found, known, tuple(batch)),
     )
     if throw and bool((status != Status.CONVERGED).any()):
@@ -137,8 +140,15 @@ def _covariance(found: Fit, data: Data, noise: Noise | None, known: Calibration 
     own = doubt.widened(own)
     own = own if data.frame.axes is None else points_turned(own, data.frame.axes.mT, found.task.parameters.few)
     R, _ = data.frame.world_pose(*(z.detach() for z in found.solution.local))
-    own = replace(reshaped(own, batch), middle=data.middle, _arm=(R @ data.middle).reshape(*batch, -1, 3))
+    arm = (R @ data.middle).reshape(*batch, -1, 3)
+    common = in_common(found.task, *_state(found), local_inverse(found.solution.equations.W)[0])
+    common = None if common is None else common.detach().reshape(*batch, *common.shape[1:])
+    own = replace(reshaped(own, batch), middle=data.middle, _arm=arm, _common=common)
     return own if before is None else own.following(before)
+
+
+def _state(found: Fit) -> tuple[Tensor, tuple[Tensor, ...]]:
+    return found.solution.shared.detach(), tuple(z.detach() for z in found.solution.local)
 
 
 def _others(found: Fit, data: Data, noise: Noise | None) -> OtherPoses:

@@ -79,6 +79,8 @@ class Calibration(Account, Copied, Recorded):
         unit: the world's unit, such as `"mm"`, where it is known; files keep it.
         displacements: how far each point of the target lies from where it was given `(*B, N, 3)` in world units, where
             `shape="free"` fitted them, or several views showed `Landmarks` with a sigma.
+        uncertain: which of the landmarks came with an error of their own `(N,)`; `None` where none did. What is found
+            by the same ones, in other views or with other cameras, is off in the same way.
         rig: which rig the camera is of, where it was calibrated with others: a text that these have, too. The errors of
             all of them go together.
     """
@@ -103,6 +105,7 @@ class Calibration(Account, Copied, Recorded):
     unit: str | None = None
     landmarks: tuple[str, ...] | None = None
     displacements: Float[Tensor, "*batch n 3"] | None = None
+    uncertain: Bool[Tensor, " n"] | None = None
     rig: str | None = None
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None

@@ -58,7 +58,8 @@ def calibrate_rig(
         views_by_camera: corners `(V, N, 2)` by the camera's name. Cameras may miss any moments, and views any corners;
             a view with fewer than 4 takes no part. Sizes may differ. Or a list with those of one rig each: all their
             cameras on their own are calibrated side by side.
-        target: a board, `Landmarks` without sigma, or anything with `.points (N, 3)`; its unit is the world's.
+        target: a board, `Landmarks`, or anything with `.points (N, 3)`; its unit is the world's. The places of
+            landmarks with a sigma are found along with the rig, for all cameras see them off in the same way.
         distortion: which lens to fit, as for `calibrate`; or one by camera.
         moments: by camera, the name or number of each view's moment. Left out, the views' names are the moments', with
             the camera's own name taken out where they would share none: `left03.jpg` and `right03.jpg` are `03.jpg`.

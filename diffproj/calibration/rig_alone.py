@@ -98,6 +98,7 @@ class Asked(NamedTuple):
         lens: to fit, by camera.
         known: cameras that are known beforehand.
         fixed: names of the parameters that are held, by camera.
+        priors: on each camera's own parameters, by camera.
         options: checked.
         who: was asked, for messages.
     """
@@ -107,6 +108,7 @@ class Asked(NamedTuple):
     lens: Mapping[str, LensModel]
     known: Mapping[str, Camera]
     fixed: Mapping[str, tuple[str, ...]]
+    priors: Mapping[str, Mapping[str, Any]]
     options: Options
     who: str
 
@@ -137,7 +139,9 @@ def alone_together(asked: Sequence[Asked]) -> list[dict[str, Alone] | Calibratio
         for name in one.views.names:
             if name not in one.known:
                 own = one.views.data[name].views
-                alike.setdefault((one.lens[name], own.size, one.fixed[name], own.device), []).append((number, name))
+                alike.setdefault(
+                    (one.lens[name], own.size, one.fixed[name], str(one.priors[name]), own.device), []
+                ).append((number, name))
     for members in alike.values():
         for batch in _batches(asked, members):
             for (number, name), one in zip(batch, _calibrated(asked, batch), strict=True):
@@ -204,7 +208,12 @@ def _calibrated(
 ) -> list[Alone | CalibrationError | ValueError]:
     """Cameras alike, calibrated side by side; those with fewer views get some in which nothing is seen."""
     first, name = asked[members[0][0]], members[0][1]
-    free = {"fixed": first.fixed[name], "reject_outliers": first.options.reject_outliers, "throw": False}
+    free = {
+        "fixed": first.fixed[name],
+        "priors": first.priors[name] or None,
+        "reject_outliers": first.options.reject_outliers,
+        "throw": False,
+    }
     chosen = calibration_options(first.who, _limits(first.options) | free)
     own = [asked[number].views.data[name] for number, name in members]
     most = max(len(data.views) for data in own)

@@ -11,6 +11,7 @@ from diffproj.calibration.fit import MAX_REJECTION_ROUNDS, normal_tensors
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.options import Options
 from diffproj.calibration.parametrisation import POSE
+from diffproj.calibration.rig_knowledge import RigKnowledge
 from diffproj.calibration.rig_options import free_directions
 from diffproj.calibration.rig_problem import RigParameters, RigProblem
 from diffproj.calibration.rig_start import RigStart
@@ -43,7 +44,7 @@ class RigFit:
         restrained: cameras whose terms below the line are held, for without that their lens folds.
         restraint: what fixes the frame of free points; `None` where none are free.
         positions: of the shared unknowns that are held.
-        prior_variance: the variance of residuals that what the target's print is known by was weighed against.
+        prior_variance: the variance of residuals that what is known beforehand was weighed against.
     """
 
     views: RigViews
@@ -92,6 +93,7 @@ def rig_fit(
     inliers: Mapping[str, Tensor],
     positions: Sequence[int],
     options: Options,
+    known: RigKnowledge | None = None,
 ) -> RigFit:
     """The minimum.
 
@@ -103,12 +105,13 @@ def rig_fit(
         inliers: corners that no camera on its own rejected `(V_c, N)`.
         positions: of the shared unknowns that are held.
         options: checked.
+        known: what is known of the cameras beforehand.
     """
-    found = _fitted(views, parameters, intrinsics, start, inliers, positions, options)
+    found = _fitted(views, parameters, intrinsics, start, inliers, positions, options, known)
     below = _folding(found)
     if below:  # two terms of a rational lens that nearly cancel: on its own, the camera's was kept from that
         positions = sorted({*positions, *(position for one in below.values() for position in one)})
-        found = _fitted(views, parameters, intrinsics, start, inliers, positions, options)
+        found = _fitted(views, parameters, intrinsics, start, inliers, positions, options, known)
     return replace(found, restrained=tuple(below), positions=tuple(positions))
 
 
@@ -137,6 +140,7 @@ def _fitted(
     inliers: Mapping[str, Tensor],
     positions: Sequence[int],
     options: Options,
+    known: RigKnowledge | None,
 ) -> RigFit:
     basis = free_directions(parameters, positions, start.t)
     shared = start.t.new_zeros(1, parameters.size)
@@ -148,7 +152,7 @@ def _fitted(
     given = {name: views.data[name].used[0] for name in views.names}
     used = {name: _enough(inliers[name] & ~start.apart[name].unsqueeze(-1)) for name in views.names}
     with torch.inference_mode():
-        fit = Rounds(views, parameters, start.R, basis, options)
+        fit = Rounds(views, parameters, start.R, basis, options, known=known)
         fit.solve(used, shared, local)
         apart = fit.reviewed(given, start.apart)
         if any(bool((apart[name] != start.apart[name]).any()) for name in views.names):
@@ -161,7 +165,7 @@ def _fitted(
 def in_normal_tensors(found: RigFit) -> RigFit:
     """The fit outside of inference mode."""
     state = normal_tensors((found.shared, found.local, found.equations, found.problem.base))
-    problem = RigProblem(found.views, found.parameters, state[3], found.used)
+    problem = RigProblem(found.views, found.parameters, state[3], found.used, found.problem.known)
     return replace(found, shared=state[0], local=state[1], equations=state[2], problem=problem)
 
 
@@ -186,9 +190,10 @@ class Rounds:
         basis: Tensor | None,
         options: Options,
         restraint: Restraint | None = None,
+        known: RigKnowledge | None = None,
     ) -> None:
         self.views, self.parameters, self.base, self.basis, self.options = views, parameters, base, basis, options
-        self.restraint, self.prior = restraint, prior_of(restraint, parameters)
+        self.restraint, self.prior, self.known = restraint, prior_of(restraint, parameters), known
         self.iterations, self.round = 0, 0
 
     def without_outliers(self, given: dict[str, Tensor], apart: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -210,7 +215,7 @@ class Rounds:
     def solve(self, used: dict[str, Tensor], shared: Tensor, local: tuple[Tensor, ...]) -> None:
         """A round on these corners, from unknowns `(1, s)` and poses of the target."""
         options, self.used = self.options, used
-        self.problem = RigProblem(self.views, self.parameters, self.base, used)
+        self.problem = RigProblem(self.views, self.parameters, self.base, used, self.known)
         self.every = sum(int(part.sum()) for part in used.values())
         rounds = 1 if options.outlier_limit is None else 1 + MAX_REJECTION_ROUNDS
         before = min(self.round, rounds - 1) * options.max_iterations

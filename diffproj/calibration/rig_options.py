@@ -29,10 +29,16 @@ class RigOptions(TypedDict, total=False):
             plane and out of it, to all cameras together: `RigCalibration.points` then is the target as it was printed.
             Its origin, axes and size as a whole stay the target's, in the sense of least squares. That takes six views
             that differ, over all cameras, or a word on how well the target was printed.
-        priors: how well the target of `shape="free"` was printed: `{"points": 0.1}` has a standard deviation of 0.1
-            world units for each coordinate about its nominal place; or one for each axis, `(3,)`, or coordinate,
-            `(N, 3)`; or `"points_x"`, `"points_y"` and `"points_z"`. It weighs against corners whose standard deviation
-            is `1 / sqrt(weight)` px; without weights, against the noise that the residuals tell.
+        priors: what is known beforehand, by name: a standard deviation, about the values that `fixed` would keep, or a
+            tuple `(mean, standard deviation)`. Names and groups of parameters as in `calibrate` (`"focal"`, `"k3"`,
+            `"distortion"`, ...), of all cameras that have them or of one, as `"left.focal"`, which counts first. Of a
+            camera's place, as `"right.baseline"`: `"baseline"`, its distance from the first camera; `"center"`, where
+            it stands in that one's frame, `(3,)`, in world units; `"rotation"`, the rotation vector from that frame to
+            its own, `(3,)`, in degrees, its deviations about the camera's own axes. With `shape="free"`, how well the
+            target was printed: `{"points": 0.1}` has a standard deviation of 0.1 world units for each coordinate about
+            its nominal place; or one for each axis, `(3,)`, or coordinate, `(N, 3)`; or `"points_x"`, `"points_y"` and
+            `"points_z"`. All of it weighs against corners whose standard deviation is `1 / sqrt(weight)` px; without
+            weights, against the noise that the residuals tell.
         weights: of the corners, by camera, each broadcasting to `(V, N)`: one over the variance of their coordinates,
             in px^-2; or one number. A corner of weight 0 takes no part. 1 everywhere if left out.
         loss: a robust loss such as `dp.Huber(0.5)`, its scale in pixels; least squares if left out.
@@ -67,14 +73,7 @@ def rig_options(who: str, given: Mapping[str, Any]) -> Options:
     unknown = [name for name in given if name not in RigOptions.__annotations__]
     if unknown:
         raise TypeError(f"{who}: want options of {', '.join(RigOptions.__annotations__)}, got {unknown[0]!r}")
-    options = calibration_options(who, given)
-    other = next((name for name in options.priors or () if not of_points(name)), None)
-    if other is not None:
-        raise ValueError(
-            f"priors: want 'points', 'points_x', 'points_y' or 'points_z' for a rig, got {other!r}; what is known of a "
-            "camera is given by cameras= and held by fixed="
-        )
-    return options
+    return calibration_options(who, given)
 
 
 def held_points(fixed: Sequence[str], points: int) -> tuple[tuple[str, ...], list[int]]:
@@ -99,8 +98,7 @@ def held(parameters: RigParameters, fixed: Sequence[str]) -> tuple[dict[str, tup
         if kind.skew:
             positions.add(parameters.intrinsics(number).start + kind.names.index(SKEW))
     for entry in fixed:
-        owner = next((c for c in parameters.cameras if entry.startswith(f"{c}.")), None)
-        what = entry if owner is None else entry[len(owner) + 1 :]
+        owner, what = owner_of(parameters, entry)
         found = False
         for number, (camera, kind) in enumerate(zip(parameters.cameras, parameters.kinds, strict=True)):
             if owner not in (None, camera):
@@ -111,7 +109,7 @@ def held(parameters: RigParameters, fixed: Sequence[str]) -> tuple[dict[str, tup
                 )
                 found = True
                 continue
-            own = range(kind.size) if what == "intrinsics" else _positions(kind, what)
+            own = range(kind.size) if what == "intrinsics" else positions_of(kind, what)
             found |= len(own) > 0
             names[camera] |= {kind.names[i] for i in own}
             positions |= {parameters.intrinsics(number).start + i for i in own}
@@ -140,9 +138,7 @@ def held_places(
         if first is None or name not in known:
             lacking = parameters.cameras[0] if first is None else name
             raise ValueError(f"fixed: want cameras={{{lacking!r}: ...}} at its pose, from which {name!r} is held")
-        one, other = first.to(torch.float64).detach(), known[name].to(torch.float64).detach()
-        R = other.R @ one.R.mT
-        places[number] = R, other.t - R @ one.t
+        places[number] = place_in_rig(first, known[name])
     return places
 
 
@@ -154,7 +150,21 @@ def free_directions(parameters: RigParameters, positions: Sequence[int], like: T
     return torch.eye(parameters.size, dtype=like.dtype, device=like.device)[:, kept].unsqueeze(0)
 
 
-def _positions(kind: Parametrisation, name: str) -> list[int]:
+def owner_of(parameters: RigParameters, entry: str) -> tuple[str | None, str]:
+    """The camera that a name is of, `None` for all, and what it names of it: `left.k3` is `k3` of `left`."""
+    owner = next((c for c in parameters.cameras if entry.startswith(f"{c}.")), None)
+    return owner, entry if owner is None else entry[len(owner) + 1 :]
+
+
+def place_in_rig(first: Camera, other: Camera) -> tuple[Tensor, Tensor]:
+    """Where a camera stands in the frame of the first, `(R, t)`, in float64 and without graph."""
+    one, two = first.to(torch.float64).detach(), other.to(torch.float64).detach()
+    R = two.R @ one.R.mT
+    return R, two.t - R @ one.t
+
+
+def positions_of(kind: Parametrisation, name: str) -> list[int]:
+    """Where a parameter of a camera's own stands, or a group; nowhere if it has none of that name."""
     try:
         return kind.positions("fixed", name)
     except ValueError:

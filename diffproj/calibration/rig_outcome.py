@@ -62,6 +62,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
             skew=kind.skew,
             degrees_of_freedom=noise.freedom[c],
             displacements=displacements(found),
+            uncertain=data.uncertain,
             rig=fingerprint,
             _covariance=partial(_of_camera, found, joint, c),
             _others=partial(_others, found, alone[name], name, posed.R, posed.t),
@@ -95,7 +96,7 @@ def displacements(found: RigFit) -> Tensor | None:
     """How far the target's points are from where they were given `(N, 3)`; `None` where they were not free."""
     if not found.parameters.points:
         return None
-    return found.shared[0, found.parameters.few :].unflatten(-1, (-1, 3)).clone()
+    return found.views.frame.turned_back(found.shared[0, found.parameters.few :].unflatten(-1, (-1, 3))).clone()
 
 
 def bow_of(found: RigFit) -> Tensor | None:

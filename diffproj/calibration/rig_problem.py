@@ -26,10 +26,11 @@ from torch import Tensor
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.parametrisation import BOW, POSE, Parametrisation, Pose, moved
 from diffproj.calibration.reprojection import Reprojection
+from diffproj.calibration.rig_knowledge import RigKnowledge
 from diffproj.calibration.rig_views import RigViews
 from diffproj.calibration.shape import by_displacement, names_of
 from diffproj.calibration.solver import Equations, LocalState
-from diffproj.geometry.cayley import turned
+from diffproj.geometry.cayley import cross_matrix, turn_rate, turned
 
 POSE_NAMES = ("omega_x", "omega_y", "omega_z", "tau_x", "tau_y", "tau_z")
 """How the pose of a camera moves in the rig, about and along the camera's axes."""
@@ -144,17 +145,23 @@ class RigProblem:
         base: the cameras' rotations `(C, 3, 3)` that the shared unknowns count from.
         groups: the views, by lens model.
         moments: how many.
+        known: what is known of the cameras beforehand, if anything is.
     """
 
     def __init__(
-        self, views: RigViews, parameters: RigParameters, base: Tensor, used: Mapping[str, Tensor] | None = None
+        self,
+        views: RigViews,
+        parameters: RigParameters,
+        base: Tensor,
+        used: Mapping[str, Tensor] | None = None,
+        known: RigKnowledge | None = None,
     ) -> None:
         every = [views.data[name].used[0] if used is None else used[name] for name in views.names]
         kinds: dict[Parametrisation, list[int]] = {}
         for c, kind in enumerate(parameters.kinds):
             if bool(every[c].any()):
                 kinds.setdefault(kind, []).append(c)
-        self.parameters, self.base, self.moments = parameters, base, len(views.moments)
+        self.parameters, self.base, self.moments, self.known = parameters, base, len(views.moments), known
         self.groups = [Group(views, cameras, parameters, every) for cameras in kinds.values()]
 
     def rebased(self, base: Tensor) -> "RigProblem":
@@ -192,8 +199,20 @@ class RigProblem:
         return moved(local, step)
 
     def equations(self, shared: Tensor, local: LocalState, loss: Loss | None) -> tuple[Tensor, Equations]:
-        """The cost `(1,)` and the normal equations at a point."""
-        return self.totals(shared, local, loss)
+        """The cost `(1,)` and the normal equations at a point, with what is known beforehand."""
+        cost, equations = self.totals(shared, local, loss)
+        if self.known is None:
+            return cost, equations
+        off, rows = self.known.rows(shared[0], *self.cameras(shared))
+        U, g = equations.U + rows.mT @ rows, equations.g + rows.mT @ off
+        return cost + off.square().sum() / 2, equations._replace(U=U, g=g)
+
+    def precision(self, shared: Tensor) -> Tensor | None:
+        """What is known beforehand as a precision `(1, s, s)`, in the unit of the weights; `None` where nothing is."""
+        if self.known is None:
+            return None
+        _, rows = self.known.rows(shared[0], *self.cameras(shared))
+        return (rows.mT @ rows).unsqueeze(0)
 
     def totals(
         self,
@@ -203,7 +222,7 @@ class RigProblem:
         scale: Tensor | None = None,
         by_moment: bool = False,
     ) -> tuple[Tensor, Equations]:
-        """The same, with the share of each camera `(C,)` scaled, and U and g as `(1, M, ...)` with `by_moment`."""
+        """Those of the corners, with the share of each camera `(C,)` scaled, and U and g by moment `(1, M, ...)`."""
         s, M, new = self.parameters.size, self.moments, shared.new_zeros
         U, g = new(s + POSE, s + POSE), new(s + POSE)
         if by_moment:
@@ -300,10 +319,7 @@ class RigProblem:
     def composition(self, group: Group, shared: Tensor, local: LocalState) -> Tensor:
         """The derivative of each view's pose by the camera's and the moment's `(n, 6, 12)`."""
         R, _ = self.cameras(shared)
-        half = torch.stack([self._pose(shared[0], c)[:3] for c in range(len(self.base))]) / 2
-        turns = (torch.eye(3, dtype=R.dtype, device=R.device) + cross_matrix(half)) / (1 + half.square().sum(-1))[
-            :, None, None
-        ]
+        turns = turn_rate(torch.stack([self._pose(shared[0], c)[:3] for c in range(len(self.base))]))
         R_c, J = R[group.camera], turns[group.camera]
         arm = (R_c @ local[1][0, group.moment].unsqueeze(-1)).squeeze(-1)
         D = R.new_zeros(len(arm), POSE, 2 * POSE)
@@ -314,10 +330,3 @@ class RigProblem:
 
     def _pose(self, x: Tensor, camera: int) -> Tensor:
         return x[self.parameters.pose(camera)] if camera else x.new_zeros(POSE)
-
-
-def cross_matrix(vectors: Tensor) -> Tensor:
-    """The matrices `(*, 3, 3)` that take the cross product with vectors `(*, 3)` from the left."""
-    x, y, z = vectors.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))

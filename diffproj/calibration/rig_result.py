@@ -15,12 +15,12 @@ from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.rig_account import RigAccount
-from diffproj.calibration.rig_problem import cross_matrix
 from diffproj.calibration.rig_record import RigRecorded
 from diffproj.calibration.rig_triangulation import Rig, Triangulation, triangulated
 from diffproj.calibration.shape_names import Shape
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
+from diffproj.geometry.cayley import cross_matrix
 
 
 class Baseline(NamedTuple):

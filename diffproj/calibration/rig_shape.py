@@ -5,7 +5,7 @@ for its lens, the others contradict. The frame of free points and what holds the
 `shape.py`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -19,49 +19,87 @@ from diffproj.calibration.rig_options import free_directions
 from diffproj.calibration.rig_problem import RigParameters
 from diffproj.calibration.rig_uncertainty import camera_noise, pooled_variance
 from diffproj.calibration.shape import Restraint, restraint_of
+from diffproj.calibration.surveyed import FINEST_PX
 
+EXACT = 1e-8
+"""Variance of a landmark in a direction, relative to the largest of all, below which it counts as so exact."""
 STIFF = 100.0
 """How many times as firmly as without a prior the frame is held beside one, which leaves it no say about the frame."""
+
+
+def weighed_anew(flat: RigFit, options: Options) -> RigFit:
+    """The fit to a flat target with what is known beforehand weighed against the noise that the residuals tell."""
+
+    def again(found: RigFit, noise: float) -> RigFit:
+        return _fitted(found, flat.parameters, (), flat.shared.new_zeros(0), options, noise)
+
+    return flat if _is_weighed(flat) else _settled(flat, again, settled=False)
 
 
 def with_bow(flat: RigFit, options: Options) -> RigFit:
     """The fit with the board's bow."""
     parameters = replace(flat.parameters, bow=True)
-    return _fitted(flat, parameters, (), flat.shared.new_zeros(2), options)
+
+    def again(found: RigFit, noise: float) -> RigFit:
+        return _fitted(found, parameters, (), _shape_of(found, 2), options, noise)
+
+    return _settled(flat, again, settled=flat.problem.known is None or _is_weighed(flat))
 
 
 def with_points(flat: RigFit, held_points: Sequence[int], options: Options) -> RigFit:
     """The fit with free points.
-
-    Where corners have no weights, how well the target was printed weighs against the noise that the residuals tell,
-    which depends on it in turn: a few rounds settle both.
 
     Args:
         flat: to the flat target.
         held_points: coordinates of the displacements that stay 0, numbers from 0.
         options: checked.
     """
-    views, few = flat.views, flat.parameters.few
-    parameters = replace(flat.parameters, points=len(views.points))
-    printed = printing_precision(options.priors, (), views.points)
-    weighed = any(data.weights is not None for data in views.data.values())
-    settled = printed is None or weighed
-    noise = 1.0 if settled else _noise(flat)
-    found, moves = flat, flat.shared.new_zeros(3 * parameters.points)
-    for _ in range(MAX_ROUNDS):
+    parameters = replace(flat.parameters, points=len(flat.views.points))
+    surveyed = flat.views.spread is not None
+    printed = printing_precision(options.priors, (), flat.views.points)
+    if flat.views.spread is not None:
+        printed = _as_surveyed(flat.views.spread)
+
+    def again(found: RigFit, noise: float) -> RigFit:
         restraint = _restraint(flat, None if printed is None else noise * printed)
-        found = replace(_fitted(found, parameters, held_points, moves, options, restraint), prior_variance=noise)
-        moves = found.shared[0, few:]
-        before, noise = noise, noise if settled else _noise(found)
+        return _fitted(
+            found, parameters, held_points, _shape_of(found, 3 * parameters.points), options, noise, restraint
+        )
+
+    nothing = printed is None and flat.problem.known is None
+    return _settled(flat, again, settled=nothing or _is_weighed(flat), least=FINEST_PX**2 if surveyed else 0.0)
+
+
+def _settled(flat: RigFit, again: Callable[[RigFit, float], RigFit], settled: bool, least: float = 0.0) -> RigFit:
+    """The fit that `again` makes of one, with what is known beforehand weighed against that variance of residuals.
+
+    Where corners have no weights, it weighs against the noise that the residuals tell, which depends on it in turn: a
+    few rounds settle both. The variance is taken for no less than `least`.
+    """
+    found, noise = flat, 1.0 if settled else max(_noise(flat), least)
+    for _ in range(MAX_ROUNDS):
+        found = replace(again(found, noise), prior_variance=noise)
+        before, noise = noise, noise if settled else max(_noise(found), least)
         if abs(noise - before) <= SAME_NOISE * before:
             break
     return found
 
 
+def _is_weighed(found: RigFit) -> bool:
+    """Whether corners have weights, which say what their noise is."""
+    return any(data.weights is not None for data in found.views.data.values())
+
+
+def _shape_of(found: RigFit, count: int) -> Tensor:
+    """The unknowns of the target's shape `(count,)`: 0 as long as it has none."""
+    shape = found.shared[0, found.parameters.few :]
+    return shape if len(shape) else found.shared.new_zeros(count)
+
+
 def with_known_points(flat: RigFit, moves: Tensor, options: Options) -> RigFit:
     """The fit with the points of the target displaced by `moves (N, 3)`, which are known."""
-    parameters = replace(flat.parameters, points=len(moves))
-    return _fitted(flat, parameters, range(moves.numel()), moves.to(flat.shared).flatten(), options)
+    parameters, moves = replace(flat.parameters, points=len(moves)), flat.views.frame.turned(moves.to(flat.shared))
+    return _fitted(flat, parameters, range(moves.numel()), moves.flatten(), options)
 
 
 def _fitted(
@@ -70,19 +108,32 @@ def _fitted(
     held: Sequence[int],
     shape: Tensor,
     options: Options,
+    noise: float = 1.0,
     restraint: Restraint | None = None,
 ) -> RigFit:
-    """From a fit to one with a shape, which starts at `shape` and of which some unknowns are held, numbers from 0."""
-    few = parameters.few
+    """From a fit to one with a shape, which starts at `shape` and of which some unknowns are held, numbers from 0.
+
+    What is known of the cameras weighs against residuals of the variance `noise`.
+    """
+    few, known = parameters.few, begin.problem.known
     basis = free_directions(parameters, [*begin.positions, *(few + i for i in held)], begin.shared)
     shared = torch.cat([begin.shared[:, :few], shape.unsqueeze(0)], dim=-1)
     given = {name: begin.views.data[name].used[0] for name in begin.views.names}
     with torch.inference_mode():
-        fit = Rounds(begin.views, parameters, begin.problem.base, basis, options, restraint)
+        fit = Rounds(
+            begin.views, parameters, begin.problem.base, basis, options, restraint, known and known.against(noise)
+        )
         fit.solve(begin.used, shared, begin.local)
         found = fit.at_the_minimum(fit.without_outliers(given, begin.apart), begin.apart)
     found = replace(found, iterations=begin.iterations + found.iterations)
     return replace(in_normal_tensors(found), restrained=begin.restrained, positions=begin.positions)
+
+
+def _as_surveyed(spread: Tensor) -> Tensor:
+    """The precision of landmarks' displacements `(1, N, 3, 3)`; exact directions hardly move."""
+    values, axes = torch.linalg.eigh(spread)
+    precision = values.clamp(min=EXACT * float(values.amax())).reciprocal()
+    return ((axes * precision.unsqueeze(-2)) @ axes.mT).unsqueeze(0)
 
 
 def _noise(found: RigFit) -> float:
@@ -100,5 +151,6 @@ def _restraint(flat: RigFit, printed: Tensor | None) -> Restraint:
     ones = [torch.ones_like(views.data[name].pixels[0, :, :, 0]) for name in views.names]
     counts = torch.cat([one if given is None else given[0] for one, given in zip(ones, weights, strict=True)])
     # A point counts as shown where two views show it, of whichever cameras.
-    found = restraint_of(views.points, pixels[None], used[None], counts[None], printed)
-    return found if printed is None else found._replace(root=STIFF * found.root)
+    surveyed = views.spread is not None
+    found = restraint_of(views.points, pixels[None], used[None], counts[None], printed, surveyed)
+    return found if printed is None or surveyed else found._replace(root=STIFF * found.root)

@@ -23,8 +23,8 @@ from diffproj._core.shown import Shown
 from diffproj._core.shown import number as shown
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.result import Calibration
-from diffproj.calibration.rig_problem import cross_matrix
 from diffproj.geometry.camera import Camera
+from diffproj.geometry.cayley import cross_matrix
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.slopes import by_direction
 

@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffproj.calibration.covariance import Covariance, Scores, covariance, reshaped
+from diffproj.calibration.covariance import Covariance, Scores, covariance, points_turned, reshaped
 from diffproj.calibration.dispersion import FEW_VIEWS, FEW_VIEWS_OF_A_SHAPE, believed, contradiction
 from diffproj.calibration.eliminated import local_inverse, reduced
 from diffproj.calibration.losses import slope_and_bend
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.rig_fit import RigFit
-from diffproj.calibration.rig_problem import cross_matrix
 from diffproj.calibration.solver import Equations
+from diffproj.geometry.cayley import cross_matrix
 
 
 class CameraNoise(NamedTuple):
@@ -53,6 +53,7 @@ def camera_noise(found: RigFit) -> CameraNoise:
     of_poses = POSE * (count / count.sum(0).clamp(min=1)).sum(-1)
     free = torch.ones_like(found.shared[0]) if found.basis is None else found.basis[0].abs().sum(-1)
     parameters = found.parameters
+    free = free * told_of_cameras(found)
     own = torch.stack(
         [free[parameters.columns(c)[: None if c else parameters.kinds[0].size]].sum() for c in range(len(names))]
     )
@@ -81,6 +82,19 @@ def camera_noise(found: RigFit) -> CameraNoise:
             plain = (1.4826 * residual[used].abs().flatten().median()).square() if bool(used.any()) else lost[c]
         rows.append((level, plain, spare[c], bend, inflation))
     return CameraNoise(*(torch.stack(column) for column in zip(*rows, strict=True)))
+
+
+def told_of_cameras(found: RigFit) -> Tensor:
+    """The part of each shared unknown that the corners tell, and not what is known beforehand `(s,)`."""
+    told = found.problem.precision(found.shared)
+    if told is None:
+        return torch.ones_like(found.shared[0])
+    basis = found.basis
+    S, told = reduced(found.equations, basis, None)[0], told if basis is None else basis.mT @ told @ basis
+    scale = S.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt().unsqueeze(-1)
+    known = torch.linalg.pinv(S * scale * scale.mT, hermitian=True) @ (told * scale * scale.mT)
+    told_by_corners = (1 - known.diagonal(dim1=-2, dim2=-1)[0]).clamp(0, 1)
+    return told_by_corners if basis is None else basis[0] @ told_by_corners
 
 
 def told_of_shape(found: RigFit) -> float:
@@ -144,14 +158,21 @@ def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
     """The joint covariance, without batch axes; poses are the target's in the rig."""
     problem, state = found.problem, (found.shared, found.local, None)
     _, H = problem.totals(*state, scale=noise.bend)
+    known = problem.precision(found.shared)
+    if known is not None:
+        H = H._replace(U=H.U + known)
     if found.prior is not None:
         H = H._replace(U=H.U + found.prior.whole)
     _, M = problem.totals(*state, scale=(noise.variance * noise.inflation).nan_to_num(0.0), by_moment=True)
     phi = _dispersion(found, H, M)
-    scores, precision = Scores(M.U, M.E, M.W), None
+    scores = Scores(M.U, M.E, M.W)
+    precision = (
+        None if known is None else found.prior_variance * known
+    )  # of its own scores, in the unit of the corners'
     if found.restraint is not None and bool((found.restraint.printed > 0).any()):
-        few = found.parameters.few  # the prior's scores, in the unit of the corners'
-        precision = torch.nn.functional.pad(found.prior_variance * found.restraint.measured, (few, 0, few, 0))
+        few = found.parameters.few
+        printed = torch.nn.functional.pad(found.prior_variance * found.restraint.measured, (few, 0, few, 0))
+        precision = printed if precision is None else precision + printed
     found_one = covariance(
         H,
         found.parameters.names,
@@ -162,7 +183,9 @@ def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
         dispersion=phi,
         unseen=unseen(found),
     )
-    middle = found.views.middle
+    middle, axes = found.views.middle, found.views.frame.axes
+    if axes is not None:
+        found_one = points_turned(found_one, axes.mT, found.parameters.few + 2 * found.parameters.bow)
     R, _ = found.views.frame.world_pose(found.local[0][0], found.local[1][0])
     return replace(reshaped(found_one, ()), middle=middle, _arm=R @ middle)
 
@@ -191,12 +214,19 @@ def _dispersion(found: RigFit, H: Equations, M: Equations) -> Tensor:
         leaning = F @ M.E.mT
         K = M.U - leaning - leaning.mT + F @ M.W @ F.mT
         u, S, K = u[..., kept], S[..., kept, kept], K[..., kept, kept]
+        total, pull = S.sum(1), u.sum(1)
+        if found.problem.known is not None:  # pulls along, and what it determines costs no degree of freedom
+            off, rows = found.problem.known.rows(found.shared[0], *found.problem.cameras(found.shared))
+            rows = rows[:, kept]
+            total, pull = total + rows.mT @ rows, pull + off @ rows
         if basis is not None:
             T = basis.mT.unsqueeze(1)
             u, S, K = (T @ u.unsqueeze(-1)).squeeze(-1), T @ S @ T.mT, T @ K @ T.mT
+            total, pull = basis.mT @ total @ basis, (basis.mT @ pull.unsqueeze(-1)).squeeze(-1)
         share = seen.to(u).unsqueeze(0)
-        told = contradiction(u, S, K, share, S.sum(1), u.sum(1))
-        return believed(told, FEW_VIEWS_OF_A_SHAPE if found.restraint is not None else FEW_VIEWS).clone()
+        told = contradiction(u, S, K, share, total, pull)
+        shaped = found.restraint is not None and found.views.spread is None
+        return believed(told, FEW_VIEWS_OF_A_SHAPE if shaped else FEW_VIEWS).clone()
 
 
 def _seen(found: RigFit, name: str) -> Tensor:

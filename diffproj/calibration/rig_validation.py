@@ -90,8 +90,8 @@ def cross_validate_rig(
 
     Args:
         views_by_camera: corners by the camera's name, as for `calibrate_rig`; moment i is left out of fit i mod k.
-        target: a board, `Landmarks` without sigma, or anything with `.points (N, 3)`. Errors of points in space are
-            distances from the pixels' rays.
+        target: a board, `Landmarks`, or anything with `.points (N, 3)`. Errors of points in space are distances from
+            the pixels' rays.
         distortion: the lens, or one by camera.
         folds: k.
         moments: of each view, by camera, as for `calibrate_rig`.
@@ -170,10 +170,10 @@ def _errors(one: Calibration, counts: Tensor, views: Views | None = None) -> _Er
     """Errors of some corners `(V, N)` with the poses of a calibration; infinite where a corner is not projected."""
     pixels = one.views.pixels if views is None else views.pixels.to(one.views.pixels)
     off, projected = projected_minus_seen(one.cameras, one.points, pixels, counts)
-    heights = one.points[:, 2]
-    if one.shape == "flat" and bool((heights == 0).all()):
+    heights, level = one.points[:, 2], bool((one.nominal[:, 2] == 0).all())
+    if one.shape == "flat" and level:
         landed, valid = put_back_minus_known(one.cameras, one.points, pixels, counts)
-    elif one.shape == "flat":  # landmarks in space, which no plane holds
+    elif not level:  # landmarks in space, which no plane holds
         landed, valid = nearest_minus_known(one.cameras, one.points, pixels, counts)
     else:  # onto the plane through each point as it was printed
         plane = Plane.per_point([0.0, 0.0, 1.0], heights.expand(counts.shape))

@@ -45,6 +45,11 @@ class RigViews:
         return self.data[self.names[0]].frame
 
     @property
+    def spread(self) -> Tensor | None:
+        """The covariances of landmarks in their own frame `(N, 3, 3)`; `None` where they are exact."""
+        return self.data[self.names[0]].spread
+
+    @property
     def middle(self) -> Tensor:
         """The middle of the target `(3,)` in its own frame."""
         return self.data[self.names[0]].middle
@@ -98,8 +103,6 @@ def rig_views(
             told = said.replace("views:", f"{label}:", 1) if said.startswith("views:") else said
             told = told.replace("weights:", f"weights[{name!r}]:", 1) if told.startswith("weights:") else told
             raise type(error)(told) from None
-    if any(one.spread is not None for one in data.values()):
-        raise ValueError("target: want landmarks without sigma, which a rig does not carry; leave out the sigma")
     labels = _labels(views_by_camera, moments, who)
     order = list(dict.fromkeys(label for name in names for label in labels[name]))
     places = {label: i for i, label in enumerate(order)}

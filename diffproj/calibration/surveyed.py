@@ -10,7 +10,9 @@ and the tests of a fit work with (errors in variables, to first order; Deming 19
 it is not known, on the residuals: both are taken anew from the last minimum until they stand.
 
 Of one view that is the whole error. Several views see the same landmark off in the same way, which no weight says:
-there the landmarks' places are unknowns that the views share (`free_points.py`).
+there the landmarks' places are unknowns that the views share (`free_points.py`). Where a known camera is located, each
+view's pose is its own, whatever else is in the batch, and only its covariance with those of other views tells what they
+have in common (`in_common`).
 """
 
 from dataclasses import replace
@@ -43,3 +45,29 @@ def whitening(task: Task, shared: Tensor, local: tuple[Tensor, ...], variance: T
     C = seen + torch.diag_embed(each.unsqueeze(-1).expand(*each.shape, 2))
     C = torch.where(task.used[..., None, None], C, torch.eye(2, dtype=C.dtype, device=C.device))
     return each.sqrt()[..., None, None] * torch.linalg.inv(torch.linalg.cholesky(C))
+
+
+def in_common(task: Task, shared: Tensor, local: tuple[Tensor, ...], inverse_W: Tensor) -> Tensor | None:
+    """How each view's pose is moved by the landmarks' errors, as by independent ones of variance 1 `(P, V, 6, 3 N)`.
+
+    Args:
+        task: with the landmarks' covariances in their own frame, and the residuals whitened by them.
+        shared: parameters `(P, s)`.
+        local: poses.
+        inverse_W: the covariance of each pose for residuals of variance 1 `(P, V, 6, 6)`.
+
+    Returns:
+        `None` where landmarks are exact.
+    """
+    if task.spread is None or task.whitening is None:
+        return None
+    panel = task.problem.linearise(shared, local)
+    weight = task.used.to(panel) if task.weights is None else task.weights * task.used
+    if task.loss is not None:
+        weight = weight * task.loss.weight(panel[:, :, -1].square().sum(2))
+    by_pose = panel[:, :, -7:-1]  # (P, V, 6, 2, N)
+    by_point = torch.einsum("pvikn,pvij->pvjkn", by_pose[:, :, 3:], local[0])
+    values, axes = torch.linalg.eigh(task.spread)
+    root = axes * values.clamp(min=0).sqrt().unsqueeze(-2)
+    pulls = torch.einsum("pvakn,pvjkn,pvn,njm->pvanm", by_pose, by_point, weight, root).flatten(-2)
+    return inverse_W @ pulls

@@ -66,7 +66,7 @@ def line_of(
     if isinstance(found, str):
         return line | {"error": found}
     more = {"verdict": found.verdict, "remarks": found.remarks[0], "summary": found.to_dict()}
-    return json.loads(own_json.as_line(found, **line, **more))
+    return own_json.plain_fields(found, **line, **more)
 
 
 def append(path: Path, lines: list[dict[str, Any]]) -> None:

@@ -73,7 +73,12 @@ def write(path: Path, item: Camera | Calibration | RigCalibration) -> dict[Path,
 
 def as_line(item: Camera | Calibration, **more: Any) -> str:
     """A camera or a calibration on one line, with more keys in front; `name` is that of the camera."""
-    return json.dumps(_plain(more | _fields(item)), allow_nan=False) + "\n"
+    return json.dumps(plain_fields(item, **more), allow_nan=False) + "\n"
+
+
+def plain_fields(item: Camera | Calibration, **more: Any) -> dict[str, Any]:
+    """What such a line says, as numbers, texts, lists and dictionaries."""
+    return _plain(more | _fields(item))
 
 
 def _fields(item: Camera | Calibration) -> dict[str, Any]:
@@ -223,15 +228,17 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return _packed(value) or [_plain(item) for item in value]
+        array = np.array(value, dtype=object) if not value or isinstance(value[0], str) else np.array(value)
+        if array.size >= MANY and array.dtype in (np.dtype(np.float64), np.dtype(np.bool_)):
+            return _packed(array)
+        if array.dtype.kind in "fib" and bool(np.isfinite(array).all()):
+            return value if isinstance(value, list) else list(value)  # nothing in it has to be looked at, one by one
+        return [_plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _packed(value: list[Any] | tuple[Any, ...]) -> dict[str, Any] | None:
-    """A long list of numbers or booleans, packed; `None` of another."""
-    array = np.array(value, dtype=object) if not value or isinstance(value[0], str) else np.array(value)
-    if array.size < MANY or array.dtype not in (np.dtype(np.float64), np.dtype(np.bool_)):
-        return None
+def _packed(array: np.ndarray) -> dict[str, Any]:
+    """Many numbers or booleans, packed."""
     name = "bool" if array.dtype == np.bool_ else "float64"
     return {"shape": list(array.shape), name: base64.b64encode(array.astype(PACKED[name]).tobytes()).decode()}
 

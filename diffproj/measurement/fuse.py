@@ -8,7 +8,8 @@ estimate and its covariance are
 where a camera that did not see a point adds nothing about it, and what it knows of the others still counts. The errors
 of different cameras are taken to be independent, as they are where each was calibrated and located by itself. Several
 photographs of one calibrated camera share the errors of its intrinsics, and those by the cameras of a rig the errors of
-all that was calibrated with it, in ways that are not known here: each of n counts by an nth of its information, which
+all that was calibrated with it, and cameras that were located by the same landmarks the errors that these came with, in
+ways that are not known here: each of n counts by an nth of its information, which
 no correlation makes too much (covariance intersection, Julier and Uhlmann 1997). So does a measurement that is given
 twice. Of a rig's own moments, and of points in space, `RigCalibration.triangulate` knows the joint covariance, and is
 surer.
@@ -226,12 +227,14 @@ def _same(a: Plane, b: Plane) -> bool:
 
 
 def _sharing(found: Sequence[Measurement]) -> list[int]:
-    """For each measurement how many of them have its errors in common: those of one calibration or rig, and copies."""
+    """For each measurement how many have its errors in common: those of one calibration, rig or survey, and copies."""
     return [sum(one is other or _one_calibration(one, other) for other in found) for one in found]
 
 
 def _one_calibration(one: Measurement, other: Measurement) -> bool:
-    """Whether the intrinsics' errors of both are those of one calibration: its numbers, or its rig's, are its own."""
+    """Whether both have errors in common: of landmarks, or of one calibration, whose numbers, or rig's, are its own."""
+    if one._sight.landmarks & other._sight.landmarks:
+        return True
     if not (one.includes_intrinsics and other.includes_intrinsics):
         return False
     if one._sight.rig is not None and one._sight.rig == other._sight.rig:

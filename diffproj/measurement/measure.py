@@ -152,7 +152,16 @@ def measure(
     beside = torch.cat(away, dim=-1)
     common = torch.where(valid[..., None, None], torch.cat([*blocks, beside], dim=-1), 0.0)
     rig = calibration.rig if isinstance(calibration, Calibration) else None
-    sight = Sight(pixels.expand(*batch, *pixels.shape[-2:]), sigma, camera, plane, by_theta, beside, rig)
+    sight = Sight(
+        pixels.expand(*batch, *pixels.shape[-2:]),
+        sigma,
+        camera,
+        plane,
+        by_theta,
+        beside,
+        rig,
+        _uncertain_landmarks(calibration),
+    )
     errors = Noise(
         sight,
         common,
@@ -256,3 +265,11 @@ def _block_diagonal(blocks: list[Tensor], batch: Sequence[int]) -> Tensor:
         rows.append(torch.nn.functional.pad(block, (start, size - start - block.shape[-1])))
         start += block.shape[-1]
     return torch.cat(rows, dim=-2)
+
+
+def _uncertain_landmarks(calibration: object) -> frozenset[tuple[float, ...]]:
+    """Where the landmarks are that a camera was found by and that are uncertain themselves."""
+    if not isinstance(calibration, Calibration) or calibration.uncertain is None:
+        return frozenset()
+    seen = calibration.uncertain & calibration.used.flatten(0, -2).any(0)
+    return frozenset(map(tuple, calibration.nominal[seen].tolist()))

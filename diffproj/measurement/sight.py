@@ -26,6 +26,7 @@ class Sight:
         by_theta: the derivative of the points' pixels by camera and pose `(*B, N, 2, q)`.
         away: where else the points may lie, linear in d more unknowns `(*B, N, 3, d)`.
         rig: which rig the camera is of, if it is of one.
+        landmarks: places of those that the pose was found by and that are uncertain themselves.
     """
 
     pixels: Tensor
@@ -35,6 +36,7 @@ class Sight:
     by_theta: Tensor
     away: Tensor
     rig: str | None = None
+    landmarks: frozenset[tuple[float, ...]] = frozenset()
 
     def points(self, index: Tensor, theta: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """The points after a step of camera, pose and plane, and of the pixels.

@@ -260,7 +260,7 @@ def test_it_says_what_it_does_not_take() -> None:
     views = scene(bent())
     with pytest.raises(ValueError, match="priors: want 'points' with shape='free' only, got shape='bow'"):
         dp.calibrate_rig(views, BOARD, "none", shape="bow", priors={"points": 0.1})
-    with pytest.raises(ValueError, match=r"priors: want 'points', .* got 'k3'; what is known of a camera"):
+    with pytest.raises(ValueError, match=r"priors: want 'points', .* got 'k3'"):
         dp.calibrate_rig(views, BOARD, "none", shape="free", priors={"k3": 0.1})
     with pytest.raises(ValueError, match="priors: want a positive standard deviation for 'points', got 0"):
         dp.calibrate_rig(views, BOARD, "none", shape="free", priors={"points": 0})
