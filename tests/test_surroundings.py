@@ -3,9 +3,11 @@
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
+from itertools import cycle, islice
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -338,9 +340,9 @@ def test_the_defaults_of_pytorch_change_nothing_at_all(
     under_other_defaults(shared, alone, list(CALLS), dtype, device)
 
 
-def in_threads(shared: Shared, alone: Alone, names: Sequence[str], rounds: int) -> None:
-    """Each thread starts at another call, so that different ones meet, and in the end all are at the same one."""
-    wanted = {name: alone(name) for name in names}
+def in_threads(shared: Shared, wanted: dict[str, list[Any]], rounds: int) -> None:
+    """Each thread starts at another of the calls, so that different ones meet, and in the end all are at the same."""
+    names = list(wanted)
 
     def run(thread: int) -> None:
         for turn in range(rounds):
@@ -349,20 +351,56 @@ def in_threads(shared: Shared, alone: Alone, names: Sequence[str], rounds: int) 
         for name in ("ground_resolution", "gradients"):
             check_same(name, CALLS[name](shared), wanted[name])
 
+    with often_switched(), ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(run, range(THREADS)))
+
+
+def in_pairs(shared: Shared, slow: dict[str, list[Any]], quick: dict[str, list[Any]]) -> None:
+    """Six threads make the slow calls, each of them in two threads at the same moment, beside two other ones; the rest
+    go round the quick calls, from two places, until the slow ones are made.
+    """
+    waiting = SimpleQueue[str]()
+    for name in (name for name in slow for _ in range(2)):
+        waiting.put(name)
+    names = list(quick)
+
+    def pairs() -> None:
+        while not waiting.empty():
+            with suppress(Empty):
+                name = waiting.get_nowait()
+                check_same(name, CALLS[name](shared), slow[name])
+
+    def around(place: int) -> None:
+        for name in islice(cycle(names), place, None):
+            if all(one.done() for one in slowly):
+                break
+            check_same(name, CALLS[name](shared), quick[name])
+
+    with often_switched(), ThreadPoolExecutor(THREADS) as pool:
+        slowly = [pool.submit(pairs) for _ in range(THREADS - 2)]
+        quickly = [pool.submit(around, place) for place in (0, len(names) // 2)]
+        for one in (*slowly, *quickly):
+            one.result()
+
+
+@contextmanager
+def often_switched() -> Iterator[None]:
+    """Threads take turns a hundred times as often as they do."""
     before = sys.getswitchinterval()
-    sys.setswitchinterval(1e-5)
+    sys.setswitchinterval(before / 100)
     try:
-        with ThreadPoolExecutor(THREADS) as pool:
-            list(pool.map(run, range(THREADS)))
+        yield
     finally:
         sys.setswitchinterval(before)
 
 
 @pytest.mark.slow
 def test_threads_that_share_all_objects(shared: Shared, alone: Alone) -> None:
-    in_threads(shared, alone, QUICK, rounds=6)
+    in_threads(shared, {name: alone(name) for name in QUICK}, rounds=6)
 
 
 @pytest.mark.slow
 def test_threads_that_share_all_objects_in_every_call(shared: Shared, alone: Alone) -> None:
-    in_threads(shared, alone, list(CALLS), rounds=len(CALLS))
+    quick = [name for name in QUICK if name != "measure"]
+    slow = {name: alone(name) for name in CALLS if name not in quick}
+    in_pairs(shared, slow, {name: alone(name) for name in quick})
