@@ -62,7 +62,9 @@ class _Explained:
         along = (vectors.mT @ (u * size).unsqueeze(-1)).squeeze(-1)
         explained = torch.where(told, along.square() / torch.where(told, values, 1.0), 0.0).sum(-1)
         self.rank, self.spare = told.sum(-1).to(total), spare
-        self.share = torch.where(total > 0, explained / total.clamp(min=1e-300), 0.0).nan_to_num(0.0).clamp(0, 1 - 1e-12)
+        self.share = (
+            torch.where(total > 0, explained / total.clamp(min=1e-300), 0.0).nan_to_num(0.0).clamp(0, 1 - 1e-12)
+        )
         self.px = (explained / spare.clamp(min=1)).sqrt()
 
     @property
