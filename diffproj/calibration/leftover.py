@@ -6,10 +6,10 @@ step: Rao's score test, as an F test. With `g` and `S` the gradient and the norm
 others eliminated, the sum of squares would fall by `g^T S^-1 g`.
 
 In the image two kinds of fields are added: radial ones, which another lens would explain; and any that are smooth. On
-the board each point may move, alike in all views: a printed board is never quite the grid that it is taken for. That test
-holds the poses, which can do nearly all of what a print does that is a little wider than high, or slanted; so that is
-tested by itself. Where the shape of the points is significant an effect in the image counts only as far as it is left when the shape is taken out, for a
-pattern that is seen over and over would pass for one of the image.
+the board each point may move, alike in all views: a printed board is never quite the grid that it is taken for. This
+test holds the poses, which can do nearly all that a stretched or slanted print does; so such a print has a test of its
+own. Where the points' shape is significant an effect in the image counts only as far as it is left when that is taken
+out, for a pattern that is seen over and over would pass for one of the image.
 """
 
 from dataclasses import dataclass, fields, replace

@@ -55,8 +55,8 @@ def described(found: Mismatch, names: tuple[str, ...], calibrated: bool = True) 
     if calibrated:
         return f"{told}: another camera, zoom or focus, or a resized, turned, mirrored or blurred photograph?"
     return (
-        f"{told}: are K and lens those of this camera, zoom and focus, in pixels of photographs of this size, are these "
-        "neither turned, cropped nor undistorted, and are all points of the target right?"
+        f"{told}: are K and lens those of this camera, zoom and focus, in pixels of photographs of this size, are "
+        "these neither turned, cropped nor undistorted, and are all points of the target right?"
     )
 
 

@@ -6,9 +6,9 @@ intrinsics would explain nearly all of them. By how much is predicted by one Gau
 each view by itself and for all together, whose camera is one.
 
 A true camera's own views do not pass for that. Of the bundled photographs, located with cameras that were calibrated on
-4 to 8 of the others, other intrinsics explain at most half of the sum of squares, and 0.12 px of a coordinate; of single
-views up to 0.9, but no more than 0.25 px. With the other camera of the pair, whose focal length differs by 1 %, it is
-three quarters and 0.2 px; with a K of twice the resolution, or without the lens, 0.98 and more than 1 px.
+4 to 8 of the others, other intrinsics explain at most half of the sum of squares, and 0.12 px of a coordinate; of
+single views up to 0.9, but no more than 0.25 px. With the other camera of the pair, whose focal length differs by 1 %,
+it is three quarters and 0.2 px; with a K of twice the resolution, or without the lens, 0.98 and more than 1 px.
 """
 
 import torch

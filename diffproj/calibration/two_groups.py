@@ -12,7 +12,8 @@ view would, and about three quarters of what is saved where each view has a plac
 cameras, for views are all along it. Of two cameras the views are at its ends: two groups save nine tenths of that. They
 save a third and more of the sum of squares where the second camera is another one of the kind, or the first turned by
 180 degrees, or zoomed by 5 %; and less where the corners' noise is most of it, as of four views of 13 that were cropped
-by a thirtieth, or zoomed by 3 %, but then nearly all that there is to save. A board that is bent by a hundredth of its length may look the same in few views.
+by a thirtieth, or zoomed by 3 %, but then nearly all that there is to save. A board that is bent by a hundredth of its
+length may look the same in few views.
 """
 
 from typing import NamedTuple

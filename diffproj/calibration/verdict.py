@@ -47,7 +47,7 @@ FOCAL = INTRINSICS[:2]
 KNOWN_FOCAL = ', or give priors={"focal": (value, deviation)} where it is known roughly'
 LANDMARKS_REMEDY = (
     "are pixels and landmarks in the same order, all coordinates in one unit, and x and y not exchanged? "
-    "reject_outliers=True finds few wrong ones among many"
+    "reject_outliers=True with pixel_sigma finds few wrong ones among many"
 )
 LEFT_HANDED = (
     "the corners fit the mirror image of the landmarks and not the landmarks: their coordinates are left-handed; "

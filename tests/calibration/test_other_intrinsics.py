@@ -138,3 +138,15 @@ def test_it_is_saved_and_weights_and_empty_views_are_known(camera: dp.Camera) ->
     assert some.mismatch.doubtful.tolist() == [True, True, False, True]
     weighted = located(LEFT[:4], BOARD, wrong, weights=torch.full((4, 54), 7.0, dtype=D))
     torch.testing.assert_close(weighted.mismatch.ratio, found.mismatch.ratio, rtol=1e-4, atol=0)
+
+
+def test_exchanged_landmarks_are_named_and_found() -> None:
+    """Two of twelve in space: no pose had all of them before the camera, which was put down to corners not finite."""
+    points, seen = landmarks(12, False, 1)
+    points[[2, 5]] = points[[5, 2]]
+    views, target = dp.Views(seen[0], size=DRONE.size), dp.Landmarks(points)
+    with pytest.raises(dp.CalibrationError, match="do not match the landmarks: .* in the same order"):
+        dp.locate(views, target, DRONE)
+    found = located(views, target, DRONE, pixel_sigma=0.8, reject_outliers=True)
+    assert (~found.used[0]).nonzero().flatten().tolist() == [2, 5]
+    torch.testing.assert_close(found.cameras[0].center, DRONE.center, atol=0.5, rtol=0)
