@@ -32,8 +32,8 @@ SINGULAR = 1e-7
 PARAMETERS_OF_K = 4
 
 
-def mismatch_of_a_camera(found: Fit, batch: tuple[int, ...]) -> Mismatch:
-    """Which located views of the cameras `*B` want other intrinsics than they were given.
+def mismatch_of_a_camera(found: Fit, converged: Tensor, batch: tuple[int, ...]) -> Mismatch:
+    """Which located views of the cameras `*B` want other intrinsics than they were given; of those `converged` (P,).
 
     The deviations of a doubtful view are those of residuals that do not average out over its corners, but only over as
     many numbers as there are intrinsics.
@@ -47,6 +47,7 @@ def mismatch_of_a_camera(found: Fit, batch: tuple[int, ...]) -> Mismatch:
         together = _Explained(S.sum(1), u.sum(1), squares.sum(-1), spare.sum(-1))
         all_views = together.told(SHARE_TOGETHER, PX_TOGETHER) & (used.any(-1).sum(-1) >= VIEWS_TOGETHER)
         doubtful = (alone.told(SHARE_ALONE, PX_ALONE) | all_views.unsqueeze(-1)) & used.any(-1)
+        doubtful &= converged.unsqueeze(-1)
         ratio = torch.where(doubtful, alone.ratio, torch.nan)
         scale = torch.where(doubtful, (alone.share * spare / alone.rank.clamp(min=1)).clamp(min=1).sqrt(), 1.0)
     return Mismatch(*(part.reshape(*batch, part.shape[-1]) for part in (ratio, doubtful, scale)))

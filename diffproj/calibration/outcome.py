@@ -127,17 +127,21 @@ def outcome(
         _others=partial(_others, found, data, before),
         _remarks=partial(remarks, found, status, doubt, data.views.names, landmarks is not None),
         landmarks=landmarks,
-        _mismatch=_mismatch(found, known, tuple(batch)),
+        _mismatch=_mismatch(found, status, known, tuple(batch)),
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)
     return calibration
 
 
-def _mismatch(found: Fit, known: Calibration | None, batch: tuple[int, ...]) -> Callable[[], Mismatch] | None:
+def _mismatch(
+    found: Fit, status: Tensor, known: Calibration | None, batch: tuple[int, ...]
+) -> Callable[[], Mismatch] | None:
     """How to compare located views with what is known of their camera; `None` where intrinsics were found."""
     if known is None or known.pixel_sigma is None:
-        return partial(mismatch_of_a_camera, found, batch) if poses_only(found.task) else None
+        return (
+            partial(mismatch_of_a_camera, found, status == Status.CONVERGED, batch) if poses_only(found.task) else None
+        )
     return partial(mismatch, found, known, batch)
 
 
