@@ -16,10 +16,12 @@ from diffproj.calibration.descent import Found, Task, best, differentiated, spar
 from diffproj.calibration.knowledge import Knowledge, knowledge, prior_shapes
 from diffproj.calibration.losses import check_loss
 from diffproj.calibration.observation import Observation
+from diffproj.calibration.pose_parameters import PLACE
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Status
 from diffproj.calibration.undetermined import described
 from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.targets.views import Views
 
 
@@ -89,6 +91,9 @@ def adjust(
     throw = flag("throw", throw)
     if 0 in start.batch_shape:
         raise ValueError(f"camera: want at least one, got batch shape {tuple(start.batch_shape)}")
+    if {"mounting", "position", *PLACE} & {*fixed, *(priors or ())} and looks_at_rounding(start.t):
+        center = start.detach().center
+        warn_of_rounding(center.norm(dim=-1), center[..., 2].abs())
     start = start.to(torch.float64)
     known_of = knowledge(start, priors, fixed, free, tied)
     batch = _batch(start, pieces, known_of)

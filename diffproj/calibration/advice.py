@@ -39,6 +39,10 @@ OTHER_LENS = "another lens"
 """What a remark says of residuals that another lens would explain."""
 TWO_CAMERAS = "want another camera than"
 """What a remark says of views that fall into two groups."""
+UNEVEN_PRINT = "or slanted"
+"""What a remark says of a board that was printed wider than high."""
+BENT = "as if it were bent"
+"""What a remark says of a board that is not flat."""
 CONTRADICTED = re.compile(r"[^;:,]*times what[^;:,]*")
 """What a remark says where residuals contradict the deviations that were given."""
 POSES_ONLY = "Poses only, the camera was given"
@@ -81,6 +85,16 @@ class Evidence:
     def two_cameras(self) -> bool:
         """Whether they fall into two groups that want different cameras."""
         return TWO_CAMERAS in self.remarks
+
+    @property
+    def uneven_print(self) -> bool:
+        """Whether the board was printed wider than high, or slanted."""
+        return UNEVEN_PRINT in self.remarks
+
+    @property
+    def bent(self) -> bool:
+        """Whether the board is bent."""
+        return BENT in self.remarks
 
 
 @dataclass(frozen=True)
@@ -148,6 +162,10 @@ def judged(seen: Evidence) -> Judgement:
             0,
             "first another look at the views that the remark names, for one camera with one zoom must have taken all",
         )
+    if seen.uneven_print:
+        remedies.insert(0, "no other photograph yet, but shape='free', or a board whose sides were measured both ways")
+    if seen.bent:
+        remedies.insert(0, "no other photograph yet, but shape='bow', or a board glued to something flat")
     word, reasons = ("Weak", faults) if faults else ("Good", _praise(seen, tilt, covered))
     return Judgement(word, tuple(reasons), tuple(remedies), tuple(bare), tilted or one_axis, more)
 
@@ -211,6 +229,10 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
         )
     if seen.two_cameras:
         faults.append("its views fall into two groups that want different cameras")
+    if seen.uneven_print:
+        faults.append("the board is not as wide and as high as it says")
+    if seen.bent:
+        faults.append("the board is bent")
     if seen.other_lens:
         faults.append("this lens model does not fit the lens")
     return faults

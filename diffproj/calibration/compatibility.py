@@ -63,7 +63,7 @@ def _compared(found: Fit, known: Calibration, usual: Noise, batch: tuple[int, ..
         return value.detach().to(torch.float64).expand((*batch, *shape)).reshape(-1, 1, *shape)
 
     used = found.task.used
-    rows, pose, residual = _derivatives(found)
+    rows, pose, residual = derivatives(found)
     variance, freedom = usual.variance.clamp(min=FINEST_PX**2).unsqueeze(-1), usual.freedom.unsqueeze(-1)
     squares = residual.square().sum((-2, -1))
     total = squares / variance
@@ -95,7 +95,7 @@ def _compared(found: Fit, known: Calibration, usual: Noise, batch: tuple[int, ..
     return Mismatch(ratio, doubtful, torch.where(doubtful, scale, 1.0))
 
 
-def _derivatives(found: Fit) -> tuple[Tensor, Tensor, Tensor]:
+def derivatives(found: Fit) -> tuple[Tensor, Tensor, Tensor]:
     """Derivatives of the residuals by the intrinsics `(P, V, s, 2 N)` and by the pose `(P, V, 6, 2 N)`, and these.
 
     Under a robust loss, weighted as it weighs them.

@@ -270,13 +270,14 @@ def inliers(task: Task, used: Tensor, solution: Solution, limit: float) -> Tenso
     if task.weights is not None:
         panel = panel * task.weights.sqrt()[:, :, None, None]
     residual = panel[:, :, -1]
+    met = panel.isfinite().all(2).all(2)  # what lies behind the camera is no inlier, and tells of no other
     # With exact corners the residuals are rounding errors, none of which may count as an outlier.
     least = 1e-6 if task.objective == "image" else 1e-9 * float(task.points.abs().amax())
     known = task.known_noise and task.loss is None
     sigma = _robust_sigma(residual, task.used, task.shares).clamp(min=1.0 if known else least)
     near = residual.square().sum(2) <= (limit * sigma[:, None, None]).square()
     if known:
-        size = _against_others(panel[:, :, -7:-1], residual, used)
+        size = _against_others(panel[:, :, -7:-1], residual, used & met)
         worst = size == torch.where(used, size, -1.0).amax(-1, keepdim=True)
         alone = ~used | (worst & (used.sum(-1, keepdim=True) > 4))
         near = near & ~(alone & (size > limit**2))

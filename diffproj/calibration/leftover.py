@@ -6,9 +6,10 @@ step: Rao's score test, as an F test. With `g` and `S` the gradient and the norm
 others eliminated, the sum of squares would fall by `g^T S^-1 g`.
 
 In the image two kinds of fields are added: radial ones, which another lens would explain; and any that are smooth. On
-the board each point may move, alike in all views: a printed board is never quite the grid that it is taken for. Where
-that shape is significant an effect in the image counts only as far as it is left when the shape is taken out, for a
-pattern that is seen over and over would pass for one of the image.
+the board each point may move, alike in all views: a printed board is never quite the grid that it is taken for. This
+test holds the poses, which can do nearly all that a stretched or slanted print does; so such a print has a test of its
+own. Where the points' shape is significant an effect in the image counts only as far as it is left when that is taken
+out, for a pattern that is seen over and over would pass for one of the image.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -61,6 +62,7 @@ class Leftover:
         skew: the skew of K alone; nothing where it is among the parameters.
         shape: points of the board moved, alike in all views.
         bow: the same by a paraboloid alone.
+        print: the same by a stretch along x and a shear, as printers and wrong sides of squares make them.
         moved: how far the points lie off the board within its plane, `(n,)`, RMS in world units, without the noise.
     """
 
@@ -69,6 +71,7 @@ class Leftover:
     skew: Effect
     shape: Effect
     bow: Effect
+    print: Effect
     moved: Tensor
 
 
@@ -130,7 +133,8 @@ class _Scores:
             for columns in (rings, torch.cat([rings, self._fields()], dim=2), self._skew())
         )
         bow = self._added(self._bow(), self.residual, self.count)
-        return Leftover(radial, smooth, skew, shape, bow, self._spread(moves))
+        uneven = self._added(self._uneven_print(), self.residual, self.count)
+        return Leftover(radial, smooth, skew, shape, bow, uneven, self._spread(moves))
 
     def _radial(self) -> Tensor:
         off = self.projected - self.middle[:, None, None]
@@ -158,6 +162,11 @@ class _Scores:
 
     def _bow(self) -> Tensor:
         return self.by_point[:, :, 2:] * bow_shape(self.task.points)[:, None]
+
+    def _uneven_print(self) -> Tensor:
+        along = self.by_point[:, :, :1]
+        x, y = self.task.points[:, :2].unbind(-1)
+        return torch.cat([along * x, along * y], dim=2)
 
     def _columns(self, fields: list[Tensor]) -> Tensor:
         """Weighted derivatives `(n, V, q, 2, N)` by the strengths of fields `(n, V, N, 2)`."""

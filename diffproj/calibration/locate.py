@@ -60,7 +60,8 @@ def locate(
     A chessboard that looks the same when turned (`Chessboard.turns`) leaves open which corner is the origin: a warning
     says so.
     With a calibration in the place of a camera a `CameraMismatchWarning` names the views whose corners are not where it
-    sees them, as photographs of another camera, zoom or focus: see `mismatch`.
+    sees them, as photographs of another camera, zoom or focus; with a camera alone, those whose residuals other
+    intrinsics would explain nearly all of: see `mismatch`.
     A calibration that fitted the target's shape brings that along, too, for the same target. `Landmarks` may lie
     anywhere; where they come with a sigma of their own, each view's pose carries it, found by that view alone, whatever
     else is in the batch. Views that share landmarks are off together, as the covariance between their poses says;
@@ -113,8 +114,9 @@ def locate(
         warn_caller(f"locate: {origin_doubt(target)}")
     if bool(found.ambiguous.any()):
         warnings.warn(f"locate: {found.ambiguity}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
-    if text := described(found.mismatch, views.names):
-        if found.landmarks is not None:
+    calibrated = found.lens_region is not None
+    if text := described(found.mismatch, views.names, calibrated):
+        if calibrated and found.landmarks is not None:
             text += " Pixels that were picked by hand are less exact than a detector's: pixel_sigma=0.5 says so"
         warn_caller(f"locate: {text}", CameraMismatchWarning)
     return found

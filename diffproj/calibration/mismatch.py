@@ -23,7 +23,8 @@ class Mismatch(NamedTuple):
 
     Attributes:
         ratio: the residuals of a view, in times those of the calibration `(*B, V)`: about 1 if all is well. Each is a
-            root mean square over degrees of freedom.
+            root mean square over degrees of freedom. Of a camera of which nothing else is known, in times what other
+            intrinsics would leave, NaN where there is no doubt.
         doubtful: whether that is no chance, and none of what the calibration leaves open `(*B, V)`.
         scale: the factor on deviations that makes the residuals of a doubtful view usual ones `(*B, V)`; 1 for others.
     """
@@ -33,8 +34,11 @@ class Mismatch(NamedTuple):
     scale: Tensor
 
 
-def described(found: Mismatch, names: tuple[str, ...]) -> str:
-    """What is to be said of the doubtful views, in a sentence; empty where there are none."""
+def described(found: Mismatch, names: tuple[str, ...], calibrated: bool = True) -> str:
+    """What is to be said of the doubtful views, in a sentence; empty where there are none.
+
+    `calibrated` is whether they were compared with a calibration, and not with a camera alone.
+    """
     which = found.doubtful.nonzero().tolist()
     if not which:
         return ""
@@ -42,12 +46,18 @@ def described(found: Mismatch, names: tuple[str, ...]) -> str:
     named = [f"{names[view]}{f' of camera {tuple(camera)}' * bool(camera)}" for *camera, view in which]
     listed = [f"{name} ({_times(ratio)})" for name, ratio in zip(named[:MAX_NAMES], ratios, strict=False)]
     more = f" and {len(which) - MAX_NAMES} more views" if len(which) > MAX_NAMES else ""
+    usual = "the calibration's" if calibrated else "what other intrinsics would leave"
     told = (
-        f"the residuals of {named[0]} are {_times(ratios[0])} the calibration's"
+        f"the residuals of {named[0]} are {_times(ratios[0])} {usual}"
         if len(which) == 1
-        else f"the residuals of {', '.join(listed)}{more} exceed the calibration's"
+        else f"the residuals of {', '.join(listed)}{more} exceed {usual}"
     )
-    return f"{told}: another camera, zoom or focus, or a resized, turned, mirrored or blurred photograph?"
+    if calibrated:
+        return f"{told}: another camera, zoom or focus, or a resized, turned, mirrored or blurred photograph?"
+    return (
+        f"{told}: are K and lens those of this camera, zoom and focus, in pixels of photographs of this size, are "
+        "these neither turned, cropped nor undistorted, and are all points of the target right?"
+    )
 
 
 def _times(ratio: float) -> str:

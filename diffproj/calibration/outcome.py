@@ -1,11 +1,13 @@
 """What `calibrate`, `refine` and `locate` share: from a start to the minimum, and from there to a `Calibration`."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
+from diffproj.calibration.adequacy import poses_only
 from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.compatibility import mismatch
 from diffproj.calibration.constraints import free_basis, held_at, make_prior, of_camera, of_points
@@ -14,8 +16,10 @@ from diffproj.calibration.data import Data
 from diffproj.calibration.eliminated import local_inverse
 from diffproj.calibration.entangled import Entangled
 from diffproj.calibration.fit import Fit, fit
+from diffproj.calibration.mismatch import Mismatch
 from diffproj.calibration.noise import Noise, level, noise_of
 from diffproj.calibration.options import Options
+from diffproj.calibration.other_intrinsics import mismatch_of_a_camera
 from diffproj.calibration.other_poses import other_poses
 from diffproj.calibration.parametrisation import SKEW, Parametrisation
 from diffproj.calibration.remarks import remarks
@@ -126,11 +130,22 @@ def outcome(
         _remarks=partial(remarks, found, status, doubt, data.views.names, landmarks is not None),
         landmarks=landmarks,
         uncertain=data.uncertain,
-        _mismatch=None if known is None else partial(mismatch, found, known, tuple(batch)),
+        _mismatch=_mismatch(found, status, known, tuple(batch)),
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)
     return calibration
+
+
+def _mismatch(
+    found: Fit, status: Tensor, known: Calibration | None, batch: tuple[int, ...]
+) -> Callable[[], Mismatch] | None:
+    """How to compare located views with what is known of their camera; `None` where intrinsics were found."""
+    if known is None or known.pixel_sigma is None:
+        return (
+            partial(mismatch_of_a_camera, found, status == Status.CONVERGED, batch) if poses_only(found.task) else None
+        )
+    return partial(mismatch, found, known, batch)
 
 
 def _covariance(found: Fit, data: Data, noise: Noise | None, known: Calibration | None, doubt: Entangled) -> Covariance:

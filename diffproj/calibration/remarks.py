@@ -10,6 +10,7 @@ from diffproj.calibration.adequacy import (
     EXACT_PX,
     LENS_WORDS,
     NOISY_PX,
+    PRINT_SHARE,
     RADIAL_SHARE,
     SHAPE_SHARE,
     SHAPE_VIEWS,
@@ -35,6 +36,8 @@ NOTABLE = 1.25
 """Times that noise that residuals must be for a word."""
 ANOTHER_CAMERA = "want another camera than"
 """What a remark says where the views fall into two groups."""
+UNEVEN_PRINT = "as if it were wider than high by more than it says, or less, or slanted"
+"""What a remark says of a print that a printer stretched."""
 BETTER = 0.8
 """Part of what another lens would explain that two groups must save to be named in its place."""
 MOST_NAMED = 5
@@ -86,8 +89,12 @@ def remarks(
     if len(which):
         left, groups = leftover(found, which, SIGNIFICANT), two_groups(found, which)
         for i, p in enumerate(which.tolist()):
+            saved = groups[p].saved if p in groups else 0.0
+            if not of_landmarks and _uneven_print(task, left, i, p, saved):
+                texts[p].append(_of_the_print(left, i))
+                continue
             sentence = _left_over(task, left, i, p, 0.0 if of_landmarks else float(sigma[p]))
-            if p in groups and groups[p].saved > BETTER * float(left.smooth.share[i]):
+            if p in groups and saved > BETTER * float(left.smooth.share[i]):
                 texts[p].append(_two_cameras(names, groups[p]))
                 sentence = "" if LENS_WORDS in sentence else sentence
             texts[p].extend(filter(None, [sentence]))
@@ -135,6 +142,23 @@ def _not_told(other: Simpler) -> str:
         f"these views hardly tell {', '.join(other.held)} from {other.name}: without {it} it is {other.there:.1f} px, "
         f"not {other.here:.1f}, at residuals {100 * other.growth:.1f} % larger; the error bars hold both; fix {it}, or "
         "take a simpler lens"
+    )
+
+
+def _uneven_print(task: Task, left: Leftover, i: int, p: int, saved: float) -> bool:
+    """Whether a print that is wider than high, or slanted, is what explains most of the residuals of camera `p`."""
+    if task.solid or int(task.used[p].any(-1).sum()) < SHAPE_VIEWS or not counts(left.print, i, PRINT_SHARE):
+        return False
+    others = ((left.radial, RADIAL_SHARE), (left.smooth, SMOOTH_SHARE), (left.shape, SHAPE_SHARE))
+    most = max((float(effect.share[i]) for effect, share in others if counts(effect, i, share)), default=0.0)
+    return float(left.print.share[i]) > max(most, saved)
+
+
+def _of_the_print(left: Leftover, i: int) -> str:
+    return (
+        f"the residuals repeat on the board, {UNEVEN_PRINT} ({100 * float(left.print.share[i]):.0f} % of their sum of "
+        "squares), which focal lengths take for their own: take shape='free', which finds that, or print it at 100 % "
+        "both ways and measure both sides of the whole board"
     )
 
 

@@ -204,11 +204,11 @@ class Calibration(Account, Copied, Recorded):
     def doubts(self) -> str:
         """What makes the poses doubtful, in words; empty where nothing does, or where it is not known.
 
-        Views that are `ambiguous`; of a calibration that `locate` found with another, views that this one does not fit:
-        see `mismatch`; and where poses alone were found, residuals that the `pixel_sigma` that was said does not
+        Views that are `ambiguous`; of what `locate` found, views that the calibration or the camera does not fit: see
+        `mismatch`; and where poses alone were found, residuals that the `pixel_sigma` that was said does not
         explain.
         """
-        misfit = mismatches.described(self.mismatch, self.views.names)
+        misfit = mismatches.described(self.mismatch, self.views.names, self.lens_region is not None)
         return "; ".join(filter(None, [self.ambiguity, misfit, self.contradiction]))
 
     @property
@@ -233,7 +233,9 @@ class Calibration(Account, Copied, Recorded):
 
         The photographs of another camera, zoom or focus are `doubtful`: their corners are not where this calibration
         sees them, by more than noise and what it leaves open. Their `ratio`, residuals in times the calibration's, need
-        not be large. The ratio is NaN and nothing is doubtful where there is nothing to compare with.
+        not be large. Of views that were located with a camera alone those are `doubtful` whose residuals other
+        intrinsics would explain nearly all of; their `ratio` is to what these would leave. The ratio is NaN where
+        there is nothing to compare with.
         """
         return self._mismatch() if self._mismatch is not None else mismatches.none_at_all(self.used)
 

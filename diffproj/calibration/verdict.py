@@ -47,7 +47,7 @@ FOCAL = INTRINSICS[:2]
 KNOWN_FOCAL = ', or give priors={"focal": (value, deviation)} where it is known roughly'
 LANDMARKS_REMEDY = (
     "are pixels and landmarks in the same order, all coordinates in one unit, and x and y not exchanged? "
-    "reject_outliers=True finds few wrong ones among many"
+    "reject_outliers=True with pixel_sigma finds few wrong ones among many"
 )
 LEFT_HANDED = (
     "the corners fit the mirror image of the landmarks and not the landmarks: their coordinates are left-handed; "
@@ -110,6 +110,9 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     for p in status.nonzero().flatten().tolist():
         if bool(none[p]):
             causes[p] = "no view shows at least 4 corners"
+        elif not bool(finite[p]) and held and bool(task.pixels[p][task.used[p]].isfinite().all()):
+            unmet = used[p] & ~solution.equations.c[p].isfinite()
+            causes[p] = _misfit(_joined_names(names, unmet if bool(unmet.any()) else used[p]), board, held)
         elif not bool(finite[p]):
             causes[p] = (
                 "the rays of some corners miss the board, beyond the lens's fold or the horizon: fit a lens with fewer "
@@ -136,10 +139,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
             sigma = f"{float(found.pixel_sigma()[p]):.1f} px in each coordinate"
             causes[p] = f"the residuals, {sigma}, {LENS_WORDS} over the image, {grave_remedy(found, p)}"
         elif bool(misfits[p].any()):
-            what, remedy = ("board", "are its columns and rows right, and are its corners in order?")
-            if isinstance(board, Landmarks):
-                what, remedy = ("landmarks", f"{LANDMARKS_REMEDY}{'; is the camera right?' * held}")
-            causes[p] = f"the corners of {_joined_names(names, misfits[p])} do not match the {what}: {remedy}"
+            causes[p] = _misfit(_joined_names(names, misfits[p]), board, held)
         elif bool(mirrored[p].any()):
             causes[p] = (
                 f"{_joined_names(names, mirrored[p])} show{'s' * (int(mirrored[p].sum()) == 1)} the board mirrored: "
@@ -160,6 +160,15 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
                 continue
             causes[p] = _undetermined(lacking, R[p, used[p]], _foreshortening(seen)[0, used[p]], free)
     return status, tuple(causes)
+
+
+def _misfit(views: str, board: object, held: bool) -> str:
+    """That the corners of these views fit no pose of the target."""
+    what, remedy = ("board", "are its columns and rows right, and are its corners in order?")
+    if isinstance(board, Landmarks):
+        what, remedy = ("landmarks", LANDMARKS_REMEDY)
+    camera = "; is the camera that of these photographs, of their zoom and their size?" if held else ""
+    return f"the corners of {views} do not match the {what}: {remedy}{camera}"
 
 
 def _swamped(found: Fit) -> Tensor:

@@ -33,15 +33,29 @@ def tensors_from_opencv(
         coefficients = None
     R = None
     if rvec is not None:
-        rotation_vector = _three("rvec", _vector("rvec", rvec, K))
-        if rotation_vector.shape[:-1].numel():
-            R = axis_angle_to_rotation_matrix(rotation_vector)
+        vectors = _three("rvec", _vector("rvec", rvec, K))
+        if vectors.shape[:-1].numel():
+            R = axis_angle_to_rotation_matrix(vectors)
             if has_values(R) and not bool(R.isfinite().all()):
                 raise ValueError("rvec: want angles in radians, got numbers too large for any")
         else:  # which Kornia refuses
-            R = rotation_vector.new_empty(*rotation_vector.shape, 3)
+            R = vectors.new_empty(*vectors.shape, 3)
     t = None if tvec is None else _three("tvec", _vector("tvec", tvec, K))
+    if R is not None and K.ndim == 2 and (t is None or t.ndim == 1):
+        _refuse_rotation(vectors)
     return K, coefficients, R, t
+
+
+def _refuse_rotation(vectors: Tensor) -> None:
+    """Refuse a rotation matrix in the place of a rotation vector: it would pass for three cameras."""
+    if vectors.shape[-2:] != (3, 3) or not has_values(vectors):
+        return
+    gram = vectors.detach() @ vectors.detach().mT
+    if bool(((gram - torch.eye(3, dtype=gram.dtype, device=gram.device)).abs() < 1e-5).all()):
+        raise ValueError(
+            "rvec: want rotation vectors, got what looks like a rotation matrix; cv2.Rodrigues(R)[0] is its vector, or "
+            "build dp.Camera(K, R, t)"
+        )
 
 
 def arrays_for_opencv(

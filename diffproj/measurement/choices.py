@@ -96,7 +96,7 @@ def doubts(calibration: Calibration, view: int) -> str:
     """What makes the pose of a view doubtful, in words; with a warning where it does not fit the calibration."""
     only, name = slice(view, view + 1), calibration.views.names[view : view + 1]
     found = mismatch.Mismatch(*(part[..., only] for part in calibration.mismatch))
-    misfit = mismatch.described(found, name)
+    misfit = mismatch.described(found, name, calibration.lens_region is not None)
     if misfit:
         warn_caller(f"measure: {misfit}", CameraMismatchWarning)
     two = ambiguity.described(calibration.ambiguous[..., only], name) if calibration.has_alternatives else ""

@@ -3,6 +3,7 @@
 import copy
 import json
 import pickle
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -503,3 +504,16 @@ def test_turns_are_known_of_a_camera_that_looks_straight_down() -> None:
 def test_what_cannot_be_is_refused_in_one_sentence(call: Any, text: str) -> None:
     with pytest.raises((TypeError, ValueError), match=text):
         call()
+
+
+def test_a_place_far_from_the_origin_wants_float64() -> None:
+    """In national grid coordinates float32 moves a mast by decimetres, which its priors said to know to centimetres."""
+    far = dp.Camera.mounted(60.0, 50.0, fov_deg=70.0, size=(1600, 1200)).to(torch.float64)
+    far = far.shifted(torch.tensor([-642700.0, -8304290, 0], dtype=torch.float64))
+    known = {"priors": {"height": 0.05}, "fixed": ("tilt", "roll", "heading", "position")}
+    with pytest.warns(UserWarning, match="float32: the scene is so far from the world's origin"):
+        dp.adjust(far.to(torch.float32), **known)  # type: ignore[arg-type]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dp.adjust(far, **known)  # type: ignore[arg-type]
+        dp.adjust(dp.Camera.mounted(60.0, 50.0, fov_deg=70.0, size=(1600, 1200)).to(torch.float32), **known)  # type: ignore[arg-type]

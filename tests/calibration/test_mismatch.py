@@ -153,7 +153,7 @@ def test_error_bars_hold_the_other_camera(calibration: dp.Calibration) -> None:
 
 
 def test_where_nothing_is_known_nothing_is_said(calibration: dp.Calibration) -> None:
-    for found in (calibration, located(RIGHT, BOARD, calibration.camera)[0]):  # type: ignore[arg-type]
+    for found in (calibration, located(LEFT, BOARD, calibration.camera)[0]):  # type: ignore[arg-type]
         assert found.mismatch.ratio.isnan().all()
         assert not found.mismatch.doubtful.any()
         assert not found.doubts

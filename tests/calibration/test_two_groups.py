@@ -100,3 +100,14 @@ def test_fewer_views_or_a_shape_that_is_free_are_not_judged() -> None:
     assert TOLD not in calibrated(seen, throw=False).remarks[0]
     seen = zoomed(pixels("left"), slice(6, None), 1.05)
     assert TOLD not in calibrated(seen, shape="free", throw=False).remarks[0]
+
+
+def test_few_that_were_cropped_or_zoomed_are_told_beside_noise() -> None:
+    """Where noise is most of the sum of squares, two groups are told by saving nearly all that there is to save."""
+    wide = dp.Camera(CAMERA.K * torch.tensor([[2.0], [2], [1]], dtype=CAMERA.dtype), None, None, CAMERA.distortion)
+    true = synthetic.random_cameras(dp.Camera(wide.K, distortion=wide.distortion, size=(1280, 960)), BOARD, 13, seed=1)
+    seen = synthetic.corner_views(true, BOARD, noise_px=0.15).pixels
+    for changed in (seen[3:7] + torch.tensor([40.0, 0.0]), (seen[3:7] - 640) * 1.03 + 640):
+        mixed = torch.cat([seen[:3], changed, seen[7:]])
+        (remark,) = dp.calibrate(dp.Views(mixed, size=(1400, 1000)), BOARD).remarks
+        assert f"view 4, view 5, view 6 and view 7 {TOLD}" in remark

@@ -354,3 +354,13 @@ def test_opencv_s_arrays_are_copied() -> None:
     assert camera.K[0, 0] == 500
     assert camera.distortion.coefficients[0] == 0.1
     assert torch.equal(camera.t, t)
+
+
+def test_a_rotation_matrix_is_no_rotation_vector() -> None:
+    """Taken for three vectors it gave three cameras, each turned some other way."""
+    K, matrix = np.diag([500.0, 500, 1]), cv2.Rodrigues(np.array([0.1, -0.2, 0.3]))[0]
+    for rotation in (matrix, np.eye(3), matrix.tolist()):
+        with pytest.raises(ValueError, match="rvec: want rotation vectors, got what looks like a rotation matrix"):
+            dp.Camera.from_opencv(K, None, rotation, [0, 0, 1])
+    assert dp.Camera.from_opencv(K, None, np.eye(3), np.zeros((3, 3))).batch_shape == (3,)
+    assert dp.Camera.from_opencv(K, None, 2 * np.eye(3)).batch_shape == (3,)
