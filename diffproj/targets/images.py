@@ -118,7 +118,7 @@ def grey(photograph: Photograph, orientation: Orientation = "sensor") -> Shaped[
 
     Raises:
         ValueError: the file is no image, the shape is none of the layouts, or floats are not in 0..1.
-        TypeError: the values are neither integers of 8 or 16 bits nor floats.
+        TypeError: the values are neither uint8, nor integers of 16 bits, nor floats.
         OSError: the file cannot be read.
     """
     label, source = photograph.label, photograph.source
@@ -198,4 +198,4 @@ def _scaled(label: str, image: np.ndarray) -> np.ndarray:
         if not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1):
             raise ValueError(f"{label}: want floats from 0 to 1, got {image.min():g} to {image.max():g}")
         return image.astype(np.float32) * np.float32(255)
-    raise TypeError(f"{label}: want integers of 8 or 16 bits or floats, got {image.dtype}")
+    raise TypeError(f"{label}: want uint8, integers of 16 bits, or floats, got {image.dtype}")
