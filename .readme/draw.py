@@ -26,5 +26,6 @@ if first_screen := report.screenshot(replace(calibration, unit="mm")):
 else:
     print("report.png: no Chromium, not drawn")
 folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
+folder.mkdir(parents=True, exist_ok=True)
 for name, content in pictures.items():
     (folder / name).write_bytes(content)

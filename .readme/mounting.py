@@ -49,7 +49,7 @@ def _picture(axes, camera) -> None:
     axes.text(float(right[0]) + 10, float(left[1] + right[1]) / 2, "roll", ha="left", va="center", color=INK)
     axes.text(float(middle[0]), float(middle[1]) + 50, "horizon", ha="center", color=INK, rotation=-ROLL)
     axes.plot(319.5, 239.5, "+", color=LIGHT)
-    axes.text(330, 250, "middle of the image", color=LIGHT, va="top", ha="center")
+    axes.text(319.5, 262, "middle of the image", color=LIGHT, va="top", ha="center")
     axes.set(title="the picture", aspect="equal", xlim=(-0.5, 639.5), ylim=(479.5, -0.5), xticks=[], yticks=[])
 
 

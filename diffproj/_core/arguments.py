@@ -334,8 +334,8 @@ def booleans(name: str, value: object, device: torch.device | None = None) -> Te
         except (TypeError, ValueError, RuntimeError):
             array = np.asarray(None)
         if array.dtype != np.bool_:
-            numbers = taken and array.dtype.kind in "fiu"
-            raise TypeError(f"{name}: want booleans, got {array.dtype if numbers else called(value)}")
+            numeric = taken and array.dtype.kind in "fiu"
+            raise TypeError(f"{name}: want booleans, got {array.dtype if numeric else called(value)}")
         found = torch.from_numpy(np.array(array, order="C", copy=True)).to(device)
     if found.dtype != torch.bool:
         raise TypeError(f"{name}: want booleans, got {found.dtype}")

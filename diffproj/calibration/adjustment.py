@@ -23,8 +23,6 @@ from diffproj.geometry.mounting import Mounting, mounting_from_rotation
 CONTRADICTION = 1e-3
 """Probability below which residuals so large for their deviations are no chance."""
 
-SHOWN = 5
-"""Numbers of cameras in a message."""
 NOTHING = 1e-12
 """Deviation, relative to the value, that is rounding: of what was held."""
 VERTICAL = 3.0
@@ -49,6 +47,8 @@ class Adjustment(Calibration):
         observations: what it was found from.
         parts: the residuals of each observation over their deviations `(*B, M, k)`.
         spare: how many more independent residuals and priors there are than unknowns.
+        cost: half the sum of squares of residuals and priors over their deviations, under robust losses what these make
+            of it.
         unknown: for each camera the names that nothing tells, `*B` flattened.
     """
 

@@ -217,7 +217,7 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
     if tilt < LOW_TILT:
         faults.append(f"the board was tilted by {tilt:.0f} degrees at most")
     if seen.unsure is not None and seen.unsure > UNSURE:
-        known = f"only to {100 * seen.unsure:.1g} %" if math.isfinite(seen.unsure) else "not at all"
+        known = f"only to {_percent(seen.unsure)} %" if math.isfinite(seen.unsure) else "not at all"
         faults.append(f"focal lengths and principal point are known {known} of the focal length")
     if covered is not None and float(covered.nanmean()) < SMALL_COVER:
         faults.append(

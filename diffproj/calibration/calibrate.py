@@ -52,10 +52,11 @@ def calibrate(
         target: a board such as `Chessboard`, `Landmarks`, or anything with `.points (N, 3)`; its unit is the world's.
             Of a `CircleGrid`, `Calibration.views` holds where the centres are seen, not their images' middles.
         distortion: which lens to fit: `"none"`, `"brown4"`, `"brown5"`, `"brown8"`, `"brown12"`, `"brown14"` or
-            `"fisheye"`. Or `"auto"`, for one camera: all of them but the longest are fitted side by side and compared
-            by their errors on corners held out; the simplest that is no worse than the best, as far as the views can
-            tell, is returned, and `Calibration.comparison` says how they fared.
-        options: `objective`, `bow`, `skew`, `fixed`, `tied_focal`, `priors`, `weights`, `pixel_sigma`, `loss`,
+            `"fisheye"`. Or `"auto"`, for one camera: `"none"`, `"brown5"`, `"fisheye"` and `"brown8"`, and the longer
+            ones where all of these leave something over, are fitted side by side and compared by their errors on
+            corners held out; the simplest that is no worse than the best, as far as the views can tell, is returned,
+            and `Calibration.comparison` says how they fared.
+        options: `objective`, `shape`, `skew`, `fixed`, `tied_focal`, `priors`, `weights`, `pixel_sigma`, `loss`,
             `reject_outliers`, `max_iterations`, `tolerance`, `progress` and `throw`: see `CalibrationOptions`. For a
             list of cameras, `weights` and `pixel_sigma` may be lists of as many, and `progress` counts cameras.
 

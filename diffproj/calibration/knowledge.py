@@ -176,7 +176,8 @@ def _known(names: PoseParameters, name: str, value: Any, tied_focal: bool) -> Kn
     if mean is not None and name == "height" and not bool((mean.detach() > 0).all()):
         raise ValueError(f"priors: want a height above the ground, more than 0, got {called(pair[0])}")
     if mean is not None and name == "tilt" and not bool((mean.detach().abs() <= MOST_TILT).all()):
-        raise ValueError(f"priors: want a tilt in degrees below the horizon, from -90 to 90, got {called(pair[0])}")
+        want = f"a tilt in degrees below the horizon, from {-MOST_TILT:g} to {MOST_TILT:g}"
+        raise ValueError(f"priors: want {want}, got {called(pair[0])}")
     if mean is not None:
         check_focal(name, mean, pair[0])
     return Known(name, tuple(where), mean, deviation)

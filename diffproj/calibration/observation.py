@@ -51,7 +51,7 @@ class Observed(Copied, Shown):
 
         Raises:
             TypeError: it is no camera.
-        ValueError: it has no values, on the device meta.
+            ValueError: it has no values, on the device meta.
         """
         camera = as_camera(camera)
         if camera.K.is_meta:

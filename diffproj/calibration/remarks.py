@@ -21,6 +21,7 @@ from diffproj.calibration.adequacy import (
     poses_only,
     wants_skew,
 )
+from diffproj.calibration.advice import TWO_CAMERAS
 from diffproj.calibration.entangled import Entangled, Simpler
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.leftover import Leftover, leftover
@@ -34,8 +35,6 @@ CONTRADICTION = 1e-4
 """Chance of the residuals under the noise that was given below which they contradict it."""
 NOTABLE = 1.25
 """Times that noise that residuals must be for a word."""
-ANOTHER_CAMERA = "want another camera than"
-"""What a remark says where the views fall into two groups."""
 UNEVEN_PRINT = "as if it were wider than high by more than it says, or less, or slanted"
 """What a remark says of a print that a printer stretched."""
 BETTER = 0.8
@@ -130,7 +129,7 @@ def _two_cameras(names: Sequence[str], group: TwoGroups) -> str:
     named = [names[view] for view in group.smaller]
     named = named if len(named) <= MOST_NAMED else [*named[:MOST_NAMED], f"{len(named) - MOST_NAMED} more"]
     return (
-        f"{', '.join(named[:-1])} and {named[-1]} {ANOTHER_CAMERA} the other views (with one for each group the "
+        f"{', '.join(named[:-1])} and {named[-1]} {TWO_CAMERAS} the other views (with one for each group the "
         f"residuals' sum of squares is {100 * group.saved:.0f} % smaller): was it one camera with one zoom and focus, "
         "no photograph turned, cropped or resized, and one flat board? Else calibrate the groups by themselves"
     )

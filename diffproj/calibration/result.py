@@ -310,7 +310,7 @@ class Calibration(Account, Copied, Recorded):
 
     @property
     def has_alternatives(self) -> bool:
-        """Whether other poses are known: not where the calibration came from a file of an earlier version."""
+        """Whether other poses are known: not where the calibration came from a file without them."""
         return self._others is not None
 
     @cached_property

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -125,8 +126,6 @@ def _calibrated(
     unit: str | None,
 ) -> list[dict[str, Any]]:
     """The lines of cameras that were searched."""
-    from dataclasses import replace
-
     begin = time.perf_counter()
     views = {name: one.views for name, one in cameras if one.views is not None}
     choices: dict[str, Any] = {name: getattr(options, name) for name in ("shape", "skew", "reject_outliers")}

@@ -182,7 +182,7 @@ def _about_deviations(told: dict[str, Any]) -> str:
     noise = f"{sigma:.2g} px for each landmark" if sigma is not None else "that of each landmark"
     if freedom is not None:
         noise += ", as the residuals tell" + (
-            f" from {counted(round(freedom), 'degree')} of freedom only" if freedom < 8 else ""
+            f" from {counted(round(freedom), 'degree')} of freedom only" if freedom < FEW else ""
         )
     survey = ", the landmarks' own deviations" if "landmarks" in told["deviations_include"] else ""
     survey += ", what --prior says" if told["priors"] else ""

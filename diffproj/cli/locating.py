@@ -156,9 +156,8 @@ def _adjusted(
     start = posed(start, [*options.prior, *options.fixed])
     freed = (*(name for name in free if name not in FOCAL[1:] or not tied), *(("focal",) if tied else ()))
     taken = {one.name for one in options.prior}
-    known = calibration
     adjusted = adjust(
-        start if known is None else replace(known, camera=start),
+        start if calibration is None else replace(calibration, camera=start),
         Seen(surveyed.landmarks, surveyed.pixels, pixel_sigma=sigma),
         priors={one.name: (one.value, one.deviation) for one in options.prior},
         fixed=tuple(one.name for one in options.fixed),

@@ -32,8 +32,9 @@ def run(options: argparse.Namespace) -> int:
     scene = scene_of(options)
     noise = _noise(options, scene)
     plane = plane_of(scene, options)
+    sigma = DETECTOR if noise.source == DETECTOR else noise.sigma
     if options.page is not None:
-        write_page(options, scene, plane, DETECTOR if noise.source == DETECTOR else noise.sigma)
+        write_page(options, scene, plane, sigma)
         if not given:
             page = str(options.page)
             if options.json:
@@ -42,7 +43,6 @@ def run(options: argparse.Namespace) -> int:
                 result(f"Written to {page}: open it in a browser")
             return 0
     pixels = torch.tensor([[pixel.u, pixel.v] for pixel in given], dtype=torch.float64, device="cpu")
-    sigma = DETECTOR if noise.source == DETECTOR else noise.sigma
     measured = measure(pixels, scene.calibration, plane, scene.view, sigma)
     found = document(scene, plane, noise, given, measured)
     found["warnings"] = options.warned

@@ -372,8 +372,7 @@ def _fits(camera: Camera, tensor: Tensor, length: int) -> bool:
     """Whether a tensor of vectors is just as the camera needs it."""
     K = camera.K
     return (
-        not torch.compiler.is_compiling()
-        and tensor.dtype is K.dtype
+        tensor.dtype is K.dtype
         and tensor.device == K.device
         and tensor.layout is torch.strided
         and not (tensor.is_nested or tensor.is_neg())

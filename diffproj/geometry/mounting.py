@@ -77,7 +77,7 @@ class Mounted(CameraParts):
         """A camera over level ground, as one measures it with a tape, a level and a compass.
 
         The world's x points east or to the right, y north or ahead, z up; the ground is z = 0. With no heading the
-        camera looks along y. Gradients flow to every number. The README has a figure.
+        camera looks along y. Gradients flow to every number. The guide draws it, under conventions.
 
         Args:
             height: of the centre of projection over the ground, in world units.

@@ -17,7 +17,6 @@ from diffproj.targets.target import Target
 
 FEWEST = 4
 """Views with corners below which none can be spared."""
-DEFAULT = 5
 CLOSE = 1.5
 """Times the fitted error up to which the held-out one is close to it."""
 

@@ -13,8 +13,9 @@ from diffproj._core.arguments import called, choice
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
+from diffproj.measurement.choices import HAND_PX
 from diffproj.report.document import Part, asset, data_uri, json_block, shortened
-from diffproj.report.measuring_model import PICKED, as_one, measuring_model
+from diffproj.report.measuring_model import as_one, measuring_model
 from diffproj.targets.images import Orientation, Photograph, as_8_bit, grey, listed
 
 SCRIPTS = ("lens", "camera", "statistics", "errors", "tools", "view", "plan", "panel", "page", "hands", "start")
@@ -30,7 +31,7 @@ def measuring_part(
     calibration: Calibration | Camera | PinholeCamera,
     plane: Plane | None = None,
     view: int | str | None = None,
-    pixel_sigma: float | str = PICKED,
+    pixel_sigma: float | str = HAND_PX,
     *,
     unit: str | None = None,
     orientation: Orientation = "sensor",

@@ -11,7 +11,7 @@ from diffproj._core.atomic import write_whole
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
-from diffproj.report.measuring_model import PICKED
+from diffproj.measurement.choices import HAND_PX
 from diffproj.targets.images import Orientation
 
 
@@ -21,7 +21,7 @@ def write_measuring_page(
     calibration: Calibration | Camera | PinholeCamera,
     plane: Plane | None = None,
     view: int | str | None = None,
-    pixel_sigma: float | str = PICKED,
+    pixel_sigma: float | str = HAND_PX,
     *,
     unit: str | None = None,
     orientation: Orientation = "sensor",

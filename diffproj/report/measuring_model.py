@@ -18,15 +18,12 @@ from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.lens.models import coefficients_of, model_of
-from diffproj.measurement.choices import chosen_view, detector_noise, doubts
+from diffproj.measurement.choices import HAND_PX, chosen_view, detector_noise, doubts
 from diffproj.measurement.doubt import NEGLIGIBLE
 from diffproj.measurement.lens_reach import STEP
 from diffproj.measurement.measure import at_view
 from diffproj.measurement.propagation import root
 from diffproj.targets.views import view_number
-
-PICKED = 0.5
-"""Standard deviation in px, along u and along v, of points that a person picks in a photograph."""
 
 
 def as_one(
@@ -168,7 +165,7 @@ def _noise(calibration: Calibration | Camera, view: int, pixel_sigma: float | st
             raise ValueError(f"pixel_sigma: want px, or 'detector' for the noise of the corners, got {pixel_sigma!r}")
         level = detector_noise(calibration, view) if isinstance(calibration, Calibration) else None
         if level is None or not math.isfinite(float(level)):
-            raise ValueError(f"pixel_sigma: want px, for this camera does not know its detector's noise: {PICKED:g}")
+            raise ValueError(f"pixel_sigma: want px, for this camera does not know its detector's noise: {HAND_PX:g}")
         return {"sigma": float(level), "pixels_too": True}
     return {"sigma": number("pixel_sigma", pixel_sigma, "a standard deviation in px", above=0), "pixels_too": False}
 

@@ -4,6 +4,7 @@ import itertools
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -187,11 +188,6 @@ def _outline(facts: Facts, place: str, tilt: tuple[float, float]) -> np.ndarray 
 
 def _tilted(tilt: tuple[float, float]) -> torch.Tensor:
     """The rotation of a board that is tilted so, see `tilts_of`."""
-    angle = math.radians(math.hypot(*tilt))
-    across, down = (part / max(1e-12, math.hypot(*tilt)) for part in tilt)
+    across, down = map(math.radians, tilt)
     # The normal goes from z towards (across, down): about the axis (-down, across, 0).
-    axis = torch.tensor([-down, across, 0.0], dtype=torch.float64, device="cpu")
-    x, y, z = axis.tolist()
-    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64, device="cpu")
-    unit = torch.eye(3, dtype=torch.float64, device="cpu")
-    return unit + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return torch.from_numpy(cv2.Rodrigues(np.array([-down, across, 0.0]))[0])

@@ -20,8 +20,6 @@ STYLE = asset("figures.css")
 WIDTH, HEIGHT = 420.0, 300.0
 LEFT, RIGHT, TOP, BOTTOM = 50.0, 12.0, 10.0, 42.0
 """What axes leave for ticks and labels."""
-CHARACTER = 6.3
-"""About the width of a character, for room that texts take."""
 
 
 @dataclass(frozen=True)

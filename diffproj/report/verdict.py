@@ -10,14 +10,13 @@ from diffproj._core.shown import rounded
 from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.distinct import alike, described
 from diffproj.geometry.plane import Plane
+from diffproj.measurement.choices import HAND_PX
 from diffproj.measurement.measure import measure
 from diffproj.report import svg
 from diffproj.report.document import Part, render
 from diffproj.report.facts import Facts
 from diffproj.report.suggestions import place_sketch, suggestions, tilt_sketch
 
-HAND_PX = 0.5
-"""Standard deviation of a coordinate that a hand picked on a screen."""
 HEADINGS = {
     "Good": ("good", "Good: the camera is known well"),
     "Weak": ("doubt", "Weak: the camera is known, but not well"),
@@ -72,9 +71,9 @@ def doubts(facts: Facts) -> list[str]:
     found = []
     if facts.converged:
         told = calibration.doubts
-        found += [text for text in calibration.remarks[0].split("; ") if text and text not in told]
-        found = _joined(found)
-        found += [told] if told else []
+        # Some parts begin in the middle of a sentence: they stay one text.
+        remarks = "; ".join(text for text in calibration.remarks[0].split("; ") if text not in told)
+        found += filter(None, [remarks, told])
         border = float(border_with_rays(calibration.camera.detach(), facts.size))
         if border < 1:
             found.append(
@@ -99,11 +98,6 @@ def doubts(facts: Facts) -> list[str]:
             "the file that it was read from holds no deviations, so nothing here says how sure the numbers are"
         )
     return [sentence(facts.in_words(text)) for text in found]
-
-
-def _joined(texts: list[str]) -> list[str]:
-    """Remarks: those that begin in the middle of a sentence belong to the one before."""
-    return ["; ".join(texts)] if texts else []
 
 
 def _figures(facts: Facts) -> list[tuple[str, str]]:

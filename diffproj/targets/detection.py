@@ -129,8 +129,8 @@ def detect(
         frames = whole_number("frames", frames, "a whole number from 1 on", least=1)
     listing = listed(photographs, frames)
     # One reading for size and corners: to decode a photograph takes as long as to find a board in it.
-    find = functools.partial(_find, target=target, orientation=raster)
-    found = results_of(find, listing, executor, progress)
+    search = functools.partial(_find, target=target, orientation=raster)
+    found = results_of(search, listing, executor, progress)
     size = _common_size(listing, [one.size for one in found])
     pairs = [(photograph, one.grid) for photograph, one in zip(listing, found, strict=True) if one.grid is not None]
     if not pairs:

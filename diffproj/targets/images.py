@@ -47,7 +47,6 @@ def listed(photographs: Source | Iterable[Source], frames: int | None = None) ->
     Args:
         photographs: a file, a folder (its photographs in natural order: `view2` before `view10`; hidden files are
             none), a pattern such as `photos/left*.jpg`, an array, a tensor, or a list of files, arrays and tensors.
-
         frames: of a video, each so-manieth frame; by default sharp ones from all its parts.
 
     Raises:
@@ -119,7 +118,7 @@ def grey(photograph: Photograph, orientation: Orientation = "sensor") -> Shaped[
 
     Raises:
         ValueError: the file is no image, the shape is none of the layouts, or floats are not in 0..1.
-        TypeError: the values are neither integers of 8 or 16 bits nor floats.
+        TypeError: the values are neither uint8, nor integers of 16 bits, nor floats.
         OSError: the file cannot be read.
     """
     label, source = photograph.label, photograph.source
@@ -199,4 +198,4 @@ def _scaled(label: str, image: np.ndarray) -> np.ndarray:
         if not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1):
             raise ValueError(f"{label}: want floats from 0 to 1, got {image.min():g} to {image.max():g}")
         return image.astype(np.float32) * np.float32(255)
-    raise TypeError(f"{label}: want integers of 8 or 16 bits or floats, got {image.dtype}")
+    raise TypeError(f"{label}: want uint8, integers of 16 bits, or floats, got {image.dtype}")

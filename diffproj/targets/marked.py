@@ -198,7 +198,7 @@ def _agreeing(grey: UInt8[np.ndarray, "h w"], board: MarkedBoard, border: int) -
 
 
 def _copies(grey: UInt8[np.ndarray, "h w"]) -> Iterator[UInt8[np.ndarray, "_h _w"]]:
-    """The image at sizes to search: itself; one of twice or half its size; dark and light exchanged."""
+    """The image at sizes to search: half of its own first where it is large; its own; twice that where it is not."""
     longest = max(grey.shape)
     if longest > WIDEST:
         yield cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)

@@ -41,7 +41,7 @@ MARGIN = 10.0
 FOOT = 14.0
 """Height in mm of the ruler and the words below the board."""
 
-INCH = 25.4
+INCH = UNITS["in"]
 
 
 def draw_target(

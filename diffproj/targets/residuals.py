@@ -1,6 +1,7 @@
 """What a camera leaves over of the views of a target: on the image, in pixels, or on the plane, in world units.
 
-The two functions at the end are the only places where "projected minus seen" and "put back minus known" are written.
+The three functions after the public two, "projected minus seen", "put back minus known" and "nearest minus known", are
+those by which calibrations, their validation and their derivatives count residuals.
 """
 
 import torch

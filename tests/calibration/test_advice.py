@@ -30,6 +30,8 @@ def test_few_views_and_copies() -> None:
     few = dp.calibrate(LEFT[[0, 4]], BOARD).verdict
     assert few.startswith("Weak: only 2 views differ")
     assert "Next: 8 more photographs" in few
+    tells_little = dp.calibrate(LEFT[[0, 6]], BOARD, "brown8").verdict
+    assert "principal point are known only to 12 % of the focal length" in tells_little
     copies = dp.calibrate(dp.Views(LEFT.pixels[[0, 0, 0, 0, 3, 4]], size=LEFT.size), BOARD).verdict
     assert copies.startswith("Weak: only 3 of 6 views differ")
 
