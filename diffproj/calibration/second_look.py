@@ -6,14 +6,14 @@ lens that stands for what the poses should explain. A camera is looked at again 
 * the solver did not converge, or took many steps, as it does in narrow valleys, or
 * where outliers were rejected, neighbouring corners are off in the same direction, as noise is not.
 
-Then starts compete. For focal lengths on a grid each view takes the better of its two poses, as a Gauss-Newton step
-predicts their costs; the grid's best focal lengths, with and without the lens's first estimate, are solved side
-by side, and what ends lowest is kept, or what is reached from it with the principal point on another side of the
-image's middle, or with views turned over (`turned_views`). Who is still lost then, with the principal point far outside
-the image, climbs a ladder of focal lengths (`focal_ladder`). A minimum is only ever replaced by a lower one.
+Then starts compete. The best focal lengths of a grid (`focal_grid`), with and without the lens's first estimate, are
+solved side by side, and what ends lowest is kept, or what is reached from it with the principal point on another side
+of the image's middle, or with views turned over (`turned_views`). Who is still lost then, with the principal point far
+outside the image, climbs a ladder of focal lengths (`focal_ladder`), or as a fisheye starts from a grid of principal
+points. A minimum is only ever replaced by a lower one, or by one as low where the solver came to an end.
 """
 
-import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,25 +21,17 @@ import torch
 from torch import Tensor
 
 from diffproj._core.numerics import spread_evenly
-from diffproj.calibration import closed_form
 from diffproj.calibration.fit import Fit, fit
+from diffproj.calibration.focal_grid import SAMPLE_VIEWS, start_at, starts_around, starts_on_grid
 from diffproj.calibration.focal_ladder import LADDER, climbed, far_out, moves_focal_length, moves_principal_point
 from diffproj.calibration.parametrisation import INTRINSICS, Parametrisation, Pose
 from diffproj.calibration.solver import Status
 from diffproj.calibration.start import Straightened
 from diffproj.calibration.task import Task
 from diffproj.calibration.turned_views import choices
-from diffproj.calibration.two_poses import predicted_costs, replaced
+from diffproj.calibration.two_poses import replaced
 from diffproj.lens.models import MODELS
 
-FOCAL_GRID = tuple(0.3 * 1.5**i for i in range(14))
-"""Focal lengths to look at, in units of the image's longer side: from a field of view of 118 degrees to one of 1."""
-FISHEYE_GRID = tuple(0.4 * 1.25**i for i in range(9))
-"""The same for a fisheye, in units of the longer side over pi."""
-BEST = 2
-"""Focal lengths of the grid that are solved to the end."""
-SAMPLE_VIEWS = 16
-"""Views of a camera that the grid and the correlation of residuals are judged by."""
 CORRELATED = 0.65
 """Correlation of the residuals of neighbouring corners from which on they are not noise. (A printed board that is off
 its grid by 0.08 mm gives 0.58 at an RMS of 0.16 px.)"""
@@ -116,18 +108,36 @@ def second_look(
             lenses.append(lenses[0].without_lens())
         if straight.lens == "none":
             lenses.append(lenses[0].elsewhere(task))
-        starts = [start for lens in lenses for start in _starts(task, first, lens)]
-        every = torch.arange(len(which), device=which.device).repeat(len(starts))
-        shared = torch.cat([shared for shared, _ in starts])
-        poses = tuple(torch.cat(parts) for parts in zip(*(poses for _, poses in starts), strict=True))
-        poorer = _poorer(task.part(every))
+        starts = [start for lens in lenses for start in starts_on_grid(task, first, lens)]
+    last = _lowest_of(task, starts, reject, steps)
+    found = lower_fit(found, last, which, reject)
+    if straight.lens == "fisheye":
+        found = _from_other_middles(found, straight, which, reject, steps)
     short: dict[str, Any] = steps | {"max_iterations": SHORT_FIT}
-    own = torch.ones(len(starts), len(which), dtype=torch.bool, device=which.device)
+    if moves_principal_point(task):
+        found = _with_other_sides(found, straight.middle[which], which, short, steps, reject)
+    if straight.lens == "none" and MODELS[straight.model].count:
+        found = _along_focal_lengths(found, straight, which, reject, steps)
+    return found if reject is not None else _with_views_turned_over(found, which, short, steps)
+
+
+def _lowest_of(task: Task, starts: Sequence[tuple[Tensor, Pose]], reject: float | None, steps: dict[str, Any]) -> Fit:
+    """The lowest fit of each of P cameras from any of the starts, with the first coefficient of the lens and then all.
+
+    Side by side, as one batch: the time of few views is that of the calls. Only the best goes on to the end.
+    """
+    P = len(task.used)
+    every = torch.arange(P, device=task.used.device).repeat(len(starts))
+    shared = torch.cat([shared for shared, _ in starts])
+    poses = tuple(torch.cat(parts) for parts in zip(*(poses for _, poses in starts), strict=True))
+    short: dict[str, Any] = steps | {"max_iterations": SHORT_FIT}
+    own = torch.ones(len(starts), P, dtype=torch.bool, device=every.device)
+    with torch.inference_mode():
+        poorer = _poorer(task.part(every))
     if poorer is not None:
         near = fit(poorer, shared, poses, **short).solution
         shared, poses = near.shared, near.local
         own = _first_of_alike(near.cost.reshape(own.shape))
-    # Side by side, as one batch: the time of few views is that of the calls. Only the best goes on to the end.
     kept = own.flatten()
     others = fit(task.part(every[kept]), shared[kept], tuple(z[kept] for z in poses), reject=reject, **short)
     number = (kept.cumsum(0) - 1).reshape(own.shape)
@@ -135,13 +145,32 @@ def second_look(
     for rank in range(1, len(starts)):
         rows = own[rank].nonzero().flatten()
         best = lower_fit(best, others.part(number[rank, rows]), rows, reject)
-    last = fit(task, best.solution.shared, best.solution.local, reject=reject, **steps)
-    found = lower_fit(found, last, which, reject)
-    if straight.lens == "none" and moves_principal_point(task):
-        found = _with_other_sides(found, straight.middle[which], which, short, steps, reject)
-    if straight.lens == "none" and MODELS[straight.model].count:
-        found = _along_focal_lengths(found, straight, which, reject, steps)
-    return found if reject is not None else _with_views_turned_over(found, which, short, steps)
+    return fit(task, best.solution.shared, best.solution.local, reject=reject, **steps)
+
+
+def _from_other_middles(
+    found: Fit, straight: Straightened, which: Tensor, reject: float | None, steps: dict[str, Any]
+) -> Fit:
+    """The fit of those of some cameras `(n,)` that are lost, from principal points far from the image's middle.
+
+    An image that was cut out of a fisheye's larger one may show none of its axis.
+    """
+    part = found.part(which)
+    if not moves_principal_point(part.task):
+        return found
+    rows = _lost(part)
+    if len(rows) == 0:
+        return found
+    with torch.inference_mode():
+        task = replace(part.task, used=part.task.used | part.rejected).part(rows)
+        starts = starts_around(task, part.solution.shared[rows], straight.part(which[rows]))
+    return lower_fit(found, _lowest_of(task, starts, reject, steps), which[rows], reject)
+
+
+def _lost(found: Fit) -> Tensor:
+    """The cameras `(n,)` that came to no end, or whose residuals are no noise."""
+    lost = (found.solution.status != Status.CONVERGED) | ~(correlation(found) <= CORRELATED)
+    return lost.nonzero().flatten()
 
 
 def _along_focal_lengths(
@@ -152,14 +181,14 @@ def _along_focal_lengths(
     part = Fit(replace(part.task, used=part.task.used | part.rejected), part.solution, part.rejected)
     if not moves_focal_length(part.task) or not moves_principal_point(part.task):
         return found
-    rows = ((part.solution.status != Status.CONVERGED) | ~(correlation(part) <= CORRELATED)).nonzero().flatten()
+    rows = _lost(part)
     if len(rows) > 0:
         rows = rows[far_out(part.part(rows), straight.part(which[rows]))]
     if len(rows) == 0:
         return found
     which, task = which[rows], part.task.part(rows)
     lens = straight.part(which).elsewhere(task)
-    starts = [_start_at(task, part.solution.shared[rows], lens, lens.longer * rung) for rung in LADDER]
+    starts = [start_at(task, part.solution.shared[rows], lens, lens.longer * rung) for rung in LADDER]
     shared = torch.stack([shared for shared, _ in starts])
     poses = tuple(torch.stack(parts) for parts in zip(*(poses for _, poses in starts), strict=True))
     return lower_fit(found, climbed(task, shared, poses, reject=reject, **steps), which, reject)
@@ -247,79 +276,17 @@ def _poorer(task: Task) -> Task | None:
     return task.holding(late)
 
 
-def _starts(task: Task, first: Tensor, straight: Straightened) -> list[tuple[Tensor, Pose]]:
-    """Shared parameters `(P, s)` and poses for the best focal lengths of the grid."""
-    P, V = task.used.shape[:2]
-    fisheye = straight.lens == "fisheye"
-    unit = straight.longer / math.pi if fisheye else straight.longer
-    grid = first.new_tensor(FISHEYE_GRID if fisheye else FOCAL_GRID) * unit
-    count = min(V, SAMPLE_VIEWS)
-    order = task.used.sum(-1).argsort(dim=-1, descending=True, stable=True)
-    sample = order[:, spread_evenly(V, count, order.device)]
-    costs = torch.stack([_profile(task, straight, grid[i].expand(P), sample) for i in range(len(grid))])
-    best = lowest(costs)
-    return [_start_at(task, first, straight, grid[best[rank]]) for rank in range(best.shape[0])]
-
-
-def _start_at(task: Task, first: Tensor, straight: Straightened, f: Tensor | float) -> tuple[Tensor, Pose]:
-    """Shared parameters `(P, s)` and poses at focal lengths `(P,)`; what is held, or tied, stays as first `(P, s)`."""
-    P, V = task.used.shape[:2]
-    f = f if isinstance(f, Tensor) else first.new_tensor(f).expand(P)
-    every = torch.arange(V, device=f.device).expand(P, V)
-    _, poses = _both_poses(task, straight, f, every)
-    shared = straight.shared(f, first.shape[-1])
-    if task.basis is not None:
-        T = task.basis
-        step = (T.mT @ (shared - first).unsqueeze(-1)) / T.square().sum(1).unsqueeze(-1)
-        shared = first + (T @ step).squeeze(-1)
-    return shared, poses
-
-
-def _profile(task: Task, straight: Straightened, f: Tensor, views: Tensor) -> Tensor:
-    """The cost `(P,)` of some views `(P, v)` at focal lengths `(P,)`, each at the better of its poses."""
-    costs, _ = _both_poses(task, straight, f, views)
-    costs = costs if task.shares is None else costs * task.shares.gather(1, views)
-    return torch.where(task.used.any(-1).gather(1, views), costs, 0.0).sum(-1)
-
-
-def _both_poses(task: Task, straight: Straightened, f: Tensor, views: Tensor) -> tuple[Tensor, Pose]:
-    """Predicted costs `(P, v)` of views `(P, v)` at the better of their two poses, and these."""
-    rays, inside = straight.rays(f)
-
-    def pick(whole: Tensor) -> Tensor:
-        index = views.reshape(*views.shape, *(1,) * (whole.ndim - 2)).expand(*views.shape, *whole.shape[2:])
-        return whole.gather(1, index)
-
-    used = pick(task.used)
-    H = closed_form.homographies(task.points, pick(rays), used & pick(inside))
-    one = closed_form.poses(H, task.points)
-    other = closed_form.other_pose(one[0], one[1], task.points)
-    robust = task.loss if task.objective == "image" else None
-    weights = None if task.weights is None else pick(task.weights)
-    plain = Task(task.points, pick(straight.pixels), used, straight.lens, loss=robust, weights=weights)
-    held = straight.held(f)
-    costs = [predicted_costs(plain, held, poses) for poses in (one, other)]
-    better = costs[1] < costs[0]
-    R = torch.where(better[..., None, None], other[0], one[0])
-    return torch.minimum(*costs), (R, torch.where(better[..., None], other[1], one[1]))
-
-
-def lowest(costs: Tensor) -> Tensor:
-    """Positions `(BEST, P)` on the grid `(G, P)` of its lowest local minima, then of its lowest nodes."""
-    padded = torch.nn.functional.pad(costs, (0, 0, 1, 1), value=torch.inf)
-    local = (costs <= padded[:-2]) & (costs <= padded[2:])
-    size = costs.nan_to_num(torch.inf, torch.inf)
-    rank = torch.where(local, torch.zeros_like(size), torch.ones_like(size))
-    order = size.argsort(dim=0, stable=True)
-    return order.gather(0, rank.gather(0, order).argsort(dim=0, stable=True))[:BEST]
-
-
 def lower_fit(found: Fit, other: Fit, which: Tensor, reject: float | None) -> Fit:
-    """The fit with the minima of some cameras `(n,)` replaced where the others are lower."""
+    """The fit with the minima of some cameras `(n,)` replaced where the others are lower.
+
+    Or as low, where the solver came to an end there and did not here: a long valley is left a hair above its lowest
+    place.
+    """
     before, now = found.solution.cost[which], other.solution.cost
+    ended = (found.solution.status[which] != Status.CONVERGED) & (other.solution.status == Status.CONVERGED)
     if reject is not None:
         before, now = _truncated(found, other, which, reject)
-    lower = now.isfinite() & ~(now >= before * (1 - LOWER))
+    lower = now.isfinite() & ~(now >= before * torch.where(ended, 1 + LOWER, 1 - LOWER))
     taken = which[lower]
     if len(taken) == 0:
         return found

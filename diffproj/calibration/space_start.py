@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.data import Data
+from diffproj.calibration.focal_grid import focal_lengths, lowest
 from diffproj.calibration.parametrisation import Parametrisation, Pose
-from diffproj.calibration.second_look import FISHEYE_GRID, FOCAL_GRID, lowest
 from diffproj.calibration.start import Straightened, best_pose, candidate_poses
 from diffproj.calibration.two_poses import view_costs
 
@@ -21,9 +21,7 @@ def space_starts(
     middle = data.pixels.new_tensor([(size[0] - 1) / 2, (size[1] - 1) / 2]).expand(len(data.pixels), 2)
     zero = torch.zeros_like(middle[:, 0])
     straight = Straightened(parameters.lens, data.pixels, middle, zero, size, zero + 1)
-    fisheye = straight.lens == "fisheye"
-    unit = straight.longer / torch.pi if fisheye else straight.longer
-    grid = middle.new_tensor(FISHEYE_GRID if fisheye else FOCAL_GRID) * unit
+    grid = focal_lengths(middle, straight)
     task = data.task(straight.lens)
     poses, costs = [], []
     for f in grid:

@@ -165,6 +165,10 @@ class Straightened:
         """The same with no lens estimated."""
         return replace(self, lam=torch.zeros_like(self.lam))
 
+    def around(self, middle: Tensor) -> "Straightened":
+        """The same with no lens estimated, and with other principal points `(P, 2)`."""
+        return replace(self.without_lens(), middle=middle)
+
     def elsewhere(self, task: Task) -> "Straightened":
         """The same with no lens estimated, and with principal point and ratio of focal lengths by Zhang's equations."""
         H = closed_form.homographies(task.points, self.seen, task.used)

@@ -31,18 +31,18 @@ def tensors_from_opencv(
     coefficients = None if dist is None else _vector("dist", dist, K)
     if coefficients is not None and coefficients.shape[-1] == 0:
         coefficients = None
+    t = None if tvec is None else _three("tvec", _vector("tvec", tvec, K))
     R = None
     if rvec is not None:
         vectors = _three("rvec", _vector("rvec", rvec, K))
+        if K.ndim == 2 and (t is None or t.ndim == 1):
+            _refuse_rotation(vectors)
         if vectors.shape[:-1].numel():
             R = axis_angle_to_rotation_matrix(vectors)
             if has_values(R) and not bool(R.isfinite().all()):
                 raise ValueError("rvec: want angles in radians, got numbers too large for any")
         else:  # which Kornia refuses
             R = vectors.new_empty(*vectors.shape, 3)
-    t = None if tvec is None else _three("tvec", _vector("tvec", tvec, K))
-    if R is not None and K.ndim == 2 and (t is None or t.ndim == 1):
-        _refuse_rotation(vectors)
     return K, coefficients, R, t
 
 

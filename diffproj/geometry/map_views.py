@@ -141,9 +141,8 @@ class MapViews:
                         torch.cross(third, first, -1),
                         torch.cross(first, second, -1),
                     )
-                    normal = sum(
-                        torch.mul(a.unsqueeze(-1), b) for a, b in zip(in_camera.unbind(-1), turned, strict=True)
-                    )
+                    x, y, z = in_camera.unsqueeze(-2).unbind(-1)
+                    normal = x * turned[0] + y * turned[1] + z * turned[2]
                     aside = normal[..., :2].abs().amax(-1) > 1e3 * rounding(self.matrix.dtype) * normal[..., 2].abs()
                 if bool(aside.any()):
                     raise ValueError("axes: want those of plane_axes(plane) for a plane that is not level, got None")

@@ -1,5 +1,7 @@
 """How starts are compared, and of two fits that reject different corners the lower one is kept."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -7,9 +9,10 @@ from torch import Tensor
 import diffproj as dp
 from diffproj import synthetic
 from diffproj.calibration.fit import Fit
+from diffproj.calibration.focal_grid import BEST, lowest
 from diffproj.calibration.parametrisation import POSE
-from diffproj.calibration.second_look import ALIKE, BEST, _first_of_alike, lower_fit, lowest
-from diffproj.calibration.solver import Solution, equations_at
+from diffproj.calibration.second_look import ALIKE, LOWER, _first_of_alike, lower_fit
+from diffproj.calibration.solver import Solution, Status, equations_at
 from diffproj.calibration.task import Task
 
 D = torch.float64
@@ -64,3 +67,23 @@ def test_a_fit_is_no_better_for_the_corners_it_rejects(reject: float | None) -> 
     first, rejected = (wrong, many) if reject is None else (shared, none)
     torch.testing.assert_close(kept.solution.shared[0], first[0])
     assert torch.equal(kept.rejected[0], rejected[0])
+
+
+@pytest.mark.parametrize(("part", "taken"), [(-0.5, True), (0.5, True), (2.0, False)])
+def test_of_two_fits_as_low_the_one_that_came_to_an_end_is_kept(part: float, taken: bool) -> None:
+    """Of an image cut out far from the axis: the lowest place was found twice, and refused as the first never ended."""
+    camera = dp.Camera(torch.tensor([[600.0, 0, 310], [0, 640, 250], [0, 0, 1]], dtype=D), size=(640, 480))
+    cameras = synthetic.random_cameras(camera, BOARD, 3, seed=2)
+    views = synthetic.corner_views(cameras, BOARD, noise_px=0.2, seed=2)
+    task = Task(BOARD.points, views.pixels.unsqueeze(0), views.visible.unsqueeze(0), "none")
+    ended = fit_of(task, SHARED, (cameras.R.unsqueeze(0), cameras.t.unsqueeze(0)), torch.zeros_like(task.used))
+    cost = ended.solution.cost
+    lost = replace(
+        ended,
+        solution=ended.solution._replace(status=torch.tensor([Status.MAX_ITERATIONS]), cost=cost * (1 - part * LOWER)),
+    )
+    kept = lower_fit(lost, ended, torch.arange(1), None)
+    assert bool(kept.solution.status[0] == Status.CONVERGED) is taken
+    assert lower_fit(ended, lost, torch.arange(1), None).solution.status.tolist() == [
+        Status.MAX_ITERATIONS if part > 1 else Status.CONVERGED
+    ]
