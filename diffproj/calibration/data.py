@@ -23,6 +23,8 @@ OUTSIDE = 0.02
 """Part of the image's size by which a corner may lie outside of it, by noise or a cut-off board."""
 BOARD_SIZE = "do columns and rows of the board fit?"
 """The remedy where a board's views have another number of corners."""
+BLOCK = 1024
+"""How many points at a time are compared with all others."""
 
 
 class Data:
@@ -214,10 +216,21 @@ def _check_points(points: Tensor) -> None:
             "other evidence"
         )
     points = points - points.mean(0)  # far from the origin squares of coordinates cancel
-    apart = torch.cdist(points, points) + torch.eye(len(points), dtype=points.dtype, device=points.device).mul(1e300)
     extent = points.abs().amax()
-    if bool(apart.amin() <= 1e-9 * extent):
-        i, j = divmod(int(apart.argmin()), len(points))
+    if (pair := _alike(points, 1e-9 * extent)) is not None:
+        i, j = pair
         raise ValueError(f"target: want points that are all distinct, got {len(points)} with {i} and {j} alike")
     if float(torch.linalg.svdvals(points)[1]) <= 1e-9 * float(extent):
         raise ValueError("target: want points that do not lie on one line")
+
+
+def _alike(points: Tensor, least: Tensor) -> tuple[int, int] | None:
+    """Two points no farther apart than that; block by block, for all distances of a scan would not fit into memory."""
+    for first in range(0, len(points), BLOCK):
+        # By products, as it does for speed, it would leave points that are the same 1e-8 apart.
+        apart = torch.cdist(points[first : first + BLOCK], points, compute_mode="donot_use_mm_for_euclid_dist")
+        apart.diagonal(first).fill_(torch.inf)
+        if bool(apart.amin() <= least):
+            i, j = divmod(int(apart.argmin()), len(points))
+            return first + i, j
+    return None

@@ -63,7 +63,7 @@ def own_frame(points: Float[Tensor, "n 3"]) -> OwnFrame:
     middle = points.mean(0)
     if bool((points[:, 2] == 0).all()):
         return OwnFrame(middle, None)
-    axes = torch.linalg.svd(points - middle, full_matrices=True).Vh
+    axes = torch.linalg.svd(points - middle, full_matrices=len(points) < 3).Vh
     return OwnFrame(middle, torch.cat([axes[:2], torch.linalg.cross(axes[0], axes[1]).unsqueeze(0)]))
 
 
