@@ -31,9 +31,8 @@ def tensors_from_opencv(
     coefficients = None if dist is None else _vector("dist", dist, K)
     if coefficients is not None and coefficients.shape[-1] == 0:
         coefficients = None
-    R = None
-    if rvec is not None:
-        vectors = _three("rvec", _vector("rvec", rvec, K))
+    R, vectors = None, None if rvec is None else _three("rvec", _vector("rvec", rvec, K))
+    if vectors is not None:
         if vectors.shape[:-1].numel():
             R = axis_angle_to_rotation_matrix(vectors)
             if has_values(R) and not bool(R.isfinite().all()):
@@ -41,7 +40,7 @@ def tensors_from_opencv(
         else:  # which Kornia refuses
             R = vectors.new_empty(*vectors.shape, 3)
     t = None if tvec is None else _three("tvec", _vector("tvec", tvec, K))
-    if R is not None and K.ndim == 2 and (t is None or t.ndim == 1):
+    if vectors is not None and K.ndim == 2 and (t is None or t.ndim == 1):
         _refuse_rotation(vectors)
     return K, coefficients, R, t
 
