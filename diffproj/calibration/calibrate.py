@@ -98,7 +98,7 @@ def calibrate_and_tell(
     return each_calibrated(cameras, target, distortion, chosen, _of_one_camera(target, distortion), told=True)
 
 
-def _of_one_camera(target: Target, distortion: Any) -> Callable[[Views, Options], Calibration]:
+def _of_one_camera(target: Target, distortion: LensModel | Literal["auto"]) -> Callable[[Views, Options], Calibration]:
     """What calibrates one camera, or a batch of them."""
 
     def one_camera(views: Views, chosen: Options) -> Calibration:
