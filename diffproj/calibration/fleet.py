@@ -7,16 +7,22 @@ which something does not fit together, so that the error is of one camera.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
 
 from diffproj._core.arguments import Array, called, tensor_of
 from diffproj.calibration.data import BOARD_SIZE, Data
+from diffproj.calibration.entangled import Entangled
+from diffproj.calibration.fit import Fit
 from diffproj.calibration.one_lens import fitted
 from diffproj.calibration.options import Options
 from diffproj.calibration.outcome import outcome
+from diffproj.calibration.remarks import remarks
 from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.calibration.solver import Status
 from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.target import Target, points_of
 from diffproj.targets.views import Views, as_views
@@ -37,6 +43,7 @@ def each_calibrated(
     distortion: Any,
     chosen: Options,
     one_camera: Callable[[Views, Options], Calibration],
+    told: bool = False,
 ) -> list[Outcome]:
     """The calibration of each camera, or why there is none, in their order.
 
@@ -46,6 +53,7 @@ def each_calibrated(
         distortion: the lens, or `"auto"`.
         chosen: the options.
         one_camera: what calibrates one camera.
+        told: work out the remarks on all of them, side by side; each at its first call if not.
 
     Raises:
         TypeError: an element is no `dp.Views`, or an option is of another type.
@@ -62,7 +70,7 @@ def each_calibrated(
     for batch in _batches(cameras):
         many = None
         if len(batch) > 1 and not alone:
-            many = _side_by_side([cameras[i] for i in batch], target, distortion, [options[i] for i in batch])
+            many = _side_by_side([cameras[i] for i in batch], target, distortion, [options[i] for i in batch], told)
         for place, number in enumerate(batch):
             try:
                 found[number] = one_camera(cameras[number], options[number]) if many is None else many[place]
@@ -118,7 +126,7 @@ def _batches(cameras: Sequence[Views]) -> Iterator[list[int]]:
 
 
 def _side_by_side(
-    cameras: Sequence[Views], target: Target, distortion: Any, options: Sequence[Options]
+    cameras: Sequence[Views], target: Target, distortion: Any, options: Sequence[Options], told: bool
 ) -> list[Outcome] | None:
     """Each camera as it would be alone; `None` where something does not fit together."""
     most = max(map(len, cameras))
@@ -137,7 +145,23 @@ def _side_by_side(
             results.append(outcome("calibrate", own, found.alone(row, len(views)), views.size, chosen.throw))
         except CalibrationError as error:
             results.append(error)
-    return results
+    return _with_remarks(results, found, cameras) if told else results
+
+
+def _with_remarks(results: Sequence[Outcome], found: Fit, cameras: Sequence[Views]) -> list[Outcome]:
+    """The same with the remarks on each, from the fit of all."""
+    ends = [int(one.status) if isinstance(one, Calibration) else int(Status.DIVERGED) for one in results]
+    status = torch.tensor(ends, device=found.solution.status.device)
+    texts = remarks(found, status, Entangled(found, status), [views.names for views in cameras])
+    return [
+        replace(one, _remarks=partial(_same, (text,))) if isinstance(one, Calibration) else one
+        for one, text in zip(results, texts, strict=True)
+    ]
+
+
+def _same(known: Any) -> Any:
+    """What a calibration calls for what it computes late; a function of the module, so that it can be pickled."""
+    return known
 
 
 def _filled(values: torch.Tensor, most: int, filling: float | bool) -> torch.Tensor:

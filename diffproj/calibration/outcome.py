@@ -127,7 +127,7 @@ def outcome(
         rig=None if known is None else known.rig,
         _covariance=partial(_covariance, found, data, before, known, doubt),
         _others=partial(_others, found, data, before),
-        _remarks=partial(remarks, found, status, doubt, data.views.names, landmarks is not None),
+        _remarks=partial(remarks, found, status, doubt, [data.views.names] * len(status), landmarks is not None),
         landmarks=landmarks,
         uncertain=data.uncertain,
         _mismatch=_mismatch(found, status, known, tuple(batch)),

@@ -46,7 +46,7 @@ NO_DENOMINATOR = {"brown8": "'brown5'"} | dict.fromkeys(("brown12", "brown14"), 
 
 
 def remarks(
-    found: Fit, status: Tensor, doubt: Entangled, names: Sequence[str], of_landmarks: bool = False
+    found: Fit, status: Tensor, doubt: Entangled, names: Sequence[Sequence[str]], of_landmarks: bool = False
 ) -> tuple[str, ...]:
     """The remarks on each of P cameras, in one text; empty where there are none, or it did not converge.
 
@@ -54,7 +54,7 @@ def remarks(
         found: the fit.
         status: of each camera `(P,)`.
         doubt: what the views hardly tell apart.
-        names: of the views.
+        names: of the views of each camera.
         of_landmarks: whether the corners are landmarks, which people click and survey.
     """
     task = found.task
@@ -94,7 +94,7 @@ def remarks(
                 continue
             sentence = _left_over(task, left, i, p, 0.0 if of_landmarks else float(sigma[p]))
             if p in groups and saved > BETTER * float(left.smooth.share[i]):
-                texts[p].append(_two_cameras(names, groups[p]))
+                texts[p].append(_two_cameras(names[p], groups[p]))
                 sentence = "" if LENS_WORDS in sentence else sentence
             texts[p].extend(filter(None, [sentence]))
     return tuple("; ".join(text) for text in texts)

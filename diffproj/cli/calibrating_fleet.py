@@ -19,7 +19,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from diffproj.calibration.calibrate import calibrate
+from diffproj.calibration.calibrate import calibrate_and_tell
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.fleet_file import append, done_before, line_of
 from diffproj.cli.fleet_folder import Folder, Searched, on_one_core, searched
@@ -130,7 +130,7 @@ def _calibrated(
     views = {name: one.views for name, one in cameras if one.views is not None}
     choices: dict[str, Any] = {name: getattr(options, name) for name in ("shape", "skew", "reject_outliers")}
     try:
-        found = calibrate(list(views.values()), board, options.distortion, **choices) if views else []
+        found = calibrate_and_tell(list(views.values()), board, options.distortion, **choices) if views else []
         ends: dict[str, Calibration | CalibrationError | ValueError] = dict(zip(views, found, strict=True))
     except ValueError as error:  # what speaks against every one of them
         ends = dict.fromkeys(views, error)

@@ -5,6 +5,7 @@ import torch
 
 import diffproj as dp
 from diffproj.calibration import fleet
+from diffproj.calibration.calibrate import calibrate_and_tell
 
 BOARD = dp.Chessboard()
 
@@ -117,3 +118,19 @@ def test_wrong_lists() -> None:
         dp.calibrate([left, dp.Views(torch.rand(3, 20, 2), size=(640, 480))], BOARD)
     with pytest.raises(TypeError, match="views: want dp.Views, got"):
         dp.calibrate([], BOARD)
+
+
+def test_remarks_worked_out_side_by_side_are_those_of_each_alone() -> None:
+    """Of cameras of unlike numbers of views; one with a word to be said, and one that fails."""
+    left, right = dp.example_views("left"), dp.example_views("right")
+    moved = torch.where(torch.arange(len(left)).reshape(-1, 1, 1) < 4, left.pixels + 20, left.pixels)
+    two = dp.Views(moved, left.visible, left.names, size=left.size)
+    cameras = [left, right[:11], two, left[0]]
+    told = calibrate_and_tell(cameras, dp.Chessboard(), "brown4")
+    for one, other in zip(told, dp.calibrate(cameras, dp.Chessboard(), "brown4"), strict=True):
+        assert type(one) is type(other)
+        if isinstance(one, dp.Calibration) and isinstance(other, dp.Calibration):
+            assert one.remarks == other.remarks
+            assert one.verdict == other.verdict
+    assert isinstance(told[2], dp.Calibration)
+    assert told[2].remarks[0]
