@@ -1,7 +1,5 @@
 """Whether the views tell a tilted sensor, a thin prism and skew from a principal point that lies elsewhere.
 
-And whether those of a fisheye through which little of the field is seen tell its later terms from one.
-
 All of them bend the image to one side, each a little differently. Together they can carry the principal point a hundred
 pixels away for a hair of the error: along such a valley the image hardly changes. Its deviation tells a part of it:
 it is that of the place where the fit ended, in a valley that is curved; and the little that the board is uneven moves
@@ -14,6 +12,9 @@ to the other, the mean square of the error of the parameters that were kept is
     C + d d^T
 
 if the simpler camera is the right one, and no more if it is not.
+
+Of a fisheye that sees little of its field, and so hardly knows its principal point, the later terms of the lens are
+asked about in the same way.
 """
 
 from dataclasses import dataclass, replace
