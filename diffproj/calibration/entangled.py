@@ -12,6 +12,9 @@ to the other, the mean square of the error of the parameters that were kept is
     C + d d^T
 
 if the simpler camera is the right one, and no more if it is not.
+
+Of a fisheye that sees little of its field, and so hardly knows its principal point, the later terms of the lens are
+asked about in the same way.
 """
 
 from dataclasses import dataclass, replace
@@ -35,6 +38,11 @@ ONE_SIDED = (("tau_x", "tau_y"), ("s1", "s2", "s3", "s4"), (SKEW,))
 """Groups of parameters that bend the image to one side, as a shift of the principal point does."""
 DENOMINATOR = ("k4", "k5", "k6")
 """The terms below the line of a rational lens."""
+LATE = ("k2", "k3", "k4")
+"""The terms of a fisheye that little of the image tells of, so that seen through a long lens they stand for noise."""
+ADRIFT = 0.05
+"""Deviation of the principal point, relative to how far corners are spread in the image, from which on these are
+doubted."""
 FAR = 2.0
 """Deviations of an intrinsic parameter beyond which its error bar does not cover another value."""
 
@@ -75,13 +83,21 @@ class Entangled:
     @cached_property
     def simpler(self) -> dict[int, Simpler]:
         """The simplest camera that the corners fit about as well, by the number of the camera, where it is another."""
-        groups = _free_groups(self.found)
-        if not groups:
+        groups, free = _free_groups(self.found), _free(self.found)
+        fisheye = not MODELS[self.found.task.lens].perspective
+        late = tuple(name for name in LATE if fisheye and name in free)
+        if not groups and not late:
             return {}
+        told: dict[int, Simpler] = {}
         with torch.no_grad():
             sound = (self.status == Status.CONVERGED) & (self.found.pixel_sigma() > EXACT_PX)
+            if late:
+                which = (sound & _adrift(self.found)).nonzero().flatten()
+                told |= _simpler(self.found.part(which), which.tolist(), [late]) if len(which) else {}
             which = sound.nonzero().flatten()
-            return _simpler(self.found.part(which), which.tolist(), groups) if len(which) else {}
+            if groups and len(which):
+                told |= _simpler(self.found.part(which), which.tolist(), groups)
+        return told
 
     @cached_property
     def needless(self) -> dict[int, float]:
@@ -133,6 +149,14 @@ def _simpler(found: Fit, numbers: list[int], groups: list[tuple[str, ...]]) -> d
         if len(left) == 0:
             break
     return told
+
+
+def _adrift(found: Fit) -> Tensor:
+    """Which cameras hardly know their principal point `(P,)`."""
+    seen = torch.where(found.task.used.unsqueeze(-1), found.task.pixels, torch.nan).flatten(1, 2)
+    spread = (seen - seen.nanmean(1, keepdim=True)).square().nanmean(1).sqrt()
+    deviations = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, 2:4].sqrt()
+    return (deviations > ADRIFT * spread).any(-1)
 
 
 def _free(found: Fit) -> list[str]:

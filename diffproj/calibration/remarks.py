@@ -137,10 +137,10 @@ def _two_cameras(names: Sequence[str], group: TwoGroups) -> str:
 
 def _not_told(other: Simpler) -> str:
     it = "them" if len(other.held) > 1 else "it"
+    grown = f"{100 * other.growth:.1f} % larger" if other.growth > 0 else "no larger"
     return (
         f"these views hardly tell {', '.join(other.held)} from {other.name}: without {it} it is {other.there:.1f} px, "
-        f"not {other.here:.1f}, at residuals {100 * other.growth:.1f} % larger; the error bars hold both; fix {it}, or "
-        "take a simpler lens"
+        f"not {other.here:.1f}, at residuals {grown}; the error bars hold both; fix {it}, or take a simpler lens"
     )
 
 

@@ -286,7 +286,8 @@ def lower_fit(found: Fit, other: Fit, which: Tensor, reject: float | None) -> Fi
     ended = (found.solution.status[which] != Status.CONVERGED) & (other.solution.status == Status.CONVERGED)
     if reject is not None:
         before, now = _truncated(found, other, which, reject)
-    lower = now.isfinite() & ~(now >= before * torch.where(ended, 1 + LOWER, 1 - LOWER))
+    margin = torch.full_like(before, 1 - LOWER).masked_fill(ended, 1 + LOWER)
+    lower = now.isfinite() & ~(now >= before * margin)
     taken = which[lower]
     if len(taken) == 0:
         return found

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import diffproj as dp
+from diffproj import synthetic
 
 BOARD = dp.Chessboard()
 HARDLY = "these views hardly tell"
@@ -63,3 +64,22 @@ def test_what_is_held_or_known_is_not_in_doubt() -> None:
     assert HARDLY not in dp.calibrate(views, BOARD, "brown12", fixed=prism).message
     known = dict.fromkeys(prism, 1e-4)
     assert HARDLY not in dp.calibrate(views, BOARD, "brown12", priors=known, weights=torch.tensor(30.0)).message
+
+
+@pytest.mark.slow
+def test_the_later_terms_of_a_fisheye_that_sees_little_of_the_field() -> None:
+    """Through a long lens they stood for noise, and moved the principal point by up to 7 deviations."""
+    K = torch.tensor([[3400.0, 0, 316], [0, 3400, 236], [0, 0, 1]], dtype=torch.float64)
+    lens = dp.KannalaBrandt(torch.zeros(4, dtype=torch.float64))
+    camera = dp.Camera(K, distortion=lens, size=(640, 480))
+    seen = []
+    for seed in range(8):
+        cameras = synthetic.random_cameras(camera, BOARD, 12, distance=(10, 30), seed=seed)
+        seen.append(synthetic.corner_views(cameras, BOARD, noise_px=0.2, seed=seed))
+    pixels, visible = (torch.stack([getattr(views, part) for views in seen]) for part in ("pixels", "visible"))
+    views = dp.Views(pixels, visible, size=(640, 480))
+    found = dp.calibrate(views, BOARD, "fisheye", throw=False)
+    simple = dp.calibrate(views, BOARD, "fisheye", throw=False, fixed=("k2", "k3", "k4"))
+    assert bool((found.converged & simple.converged).all()), found.message
+    assert any(f"{HARDLY} k2, k3, k4 from c_" in text for text in found.remarks)
+    assert off(found, simple) < 3
