@@ -233,7 +233,9 @@ def interleaved(components: Sequence[Tensor]) -> Tensor:
 
 
 def side_by_side(components: Sequence[Tensor]) -> Tensor:
-    """The same vectors, each component in one piece of memory: for what takes them apart again at once."""
+    """The same for what takes them apart again at once: without derivatives, each component in one piece of memory."""
+    if wants_derivative(*components):
+        return torch.stack(list(components), dim=-1)
     return torch.stack(list(components)).movedim(0, -1)
 
 

@@ -44,7 +44,7 @@ from diffproj.geometry.grid import checked_size, inside
 from diffproj.geometry.intrinsics import check_intrinsics, pixel_to_normalized, through_pinhole
 from diffproj.geometry.placement import Placed
 from diffproj.geometry.rotations import check_pose
-from diffproj.lens.compiling import coordinates, derivative_wanted
+from diffproj.lens.compiling import coordinates
 from diffproj.lens.protocol import Lens
 
 SQUARED = 0.45
@@ -307,7 +307,7 @@ class Camera(
     ) -> tuple[Float[Tensor, "*batch n 2"], Bool[Tensor, "*batch n"]]:
         """Pixels that were checked, on the normalised plane, still distorted `(*B, N, 2)`, and which are finite."""
         center = self.K[..., :2, 2].unsqueeze(-1).unbind(-2)
-        u, v = pixels.unbind(-1) if derivative_wanted(pixels, self.K) else coordinates(pixels)
+        u, v = pixels.unbind(-1) if wants_derivative(pixels, self.K) else coordinates(pixels)
         limit = torch.finfo(pixels.dtype).max ** SQUARED
         offset = [u - center[0], v - center[1]]
         if all_within(pixels, limit):  # the usual case
