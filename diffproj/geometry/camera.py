@@ -22,6 +22,7 @@ from torch.utils._pytree import tree_leaves
 from diffproj._core.arguments import Array, instance, meeting
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
+    all_within,
     broadcast_batches,
     check_same_kind,
     check_tensor,
@@ -43,7 +44,7 @@ from diffproj.geometry.grid import checked_size, inside
 from diffproj.geometry.intrinsics import check_intrinsics, pixel_to_normalized, through_pinhole
 from diffproj.geometry.placement import Placed
 from diffproj.geometry.rotations import check_pose
-from diffproj.lens.compiling import coordinates, derivative_wanted
+from diffproj.lens.compiling import coordinates
 from diffproj.lens.protocol import Lens
 
 SQUARED = 0.45
@@ -306,10 +307,13 @@ class Camera(
     ) -> tuple[Float[Tensor, "*batch n 2"], Bool[Tensor, "*batch n"]]:
         """Pixels that were checked, on the normalised plane, still distorted `(*B, N, 2)`, and which are finite."""
         center = self.K[..., :2, 2].unsqueeze(-1).unbind(-2)
-        u, v = pixels.unbind(-1) if derivative_wanted(pixels, self.K) else coordinates(pixels)
-        finite = torch.maximum(u.abs(), v.abs()) < torch.finfo(pixels.dtype).max ** SQUARED
+        u, v = pixels.unbind(-1) if wants_derivative(pixels, self.K) else coordinates(pixels)
+        limit = torch.finfo(pixels.dtype).max ** SQUARED
         offset = [u - center[0], v - center[1]]
-        if not (has_values(finite) and finite.device.type == "cpu" and bool(finite.all())):
+        if all_within(pixels, limit):  # the usual case
+            finite = torch.ones_like(u, dtype=torch.bool)
+        else:
+            finite = torch.maximum(u.abs(), v.abs()) < limit
             offset = [torch.where(finite, part, 0.0) for part in offset]
         return side_by_side(linear(entries(pixel_to_normalized(self.K)), offset)), finite
 

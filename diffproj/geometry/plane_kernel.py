@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._core.numerics import entries, interleaved, linear
+from diffproj._core.numerics import all_true, entries, interleaved, linear
 from diffproj._core.torch_private import has_storage
 from diffproj.geometry.plane_kernel_short import divided, gradient, is_short
 
@@ -88,7 +88,7 @@ def _divided(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Te
     points = p.new_empty((*p.shape[:-1], 3))
     torch.div(numerators, denominator, out=points.mT)
     denominator = denominator.squeeze(-2)
-    if p.device.type == "cpu" and bool(valid.all()):  # the usual case; elsewhere looking waits
+    if all_true(valid):  # the usual case
         return points, valid, denominator, None
     hidden = ~valid
     points.masked_fill_(hidden.unsqueeze(-1), 0.0)

@@ -62,10 +62,9 @@ def _scale(library: Any, M: Any, b: Any, height: Any, t: Any, offset: Any, dtype
     """The factor of M `(*B, 1, 1)`, the row s `(*B, 1, 3)`, and how far all is from the world's origin `(*B,)`."""
     largest = np.maximum.reduce if library is np else torch.amax
     reach = abs(offset) + _length(b) * _length(t)
-    least = rounding(dtype) * reach
-    sign = (height > least) * 1.0 - (height < -least) * 1.0
     # A quarter, so that no pixel is large enough for a sum of three products to overflow.
-    factor = (sign * 0.25 / largest(abs(M), (-2, -1)))[..., None, None]
+    factor = library.where(height < 0, -0.25, 0.25) / largest(abs(M), (-2, -1))  # not copysign, which ONNX lacks
+    factor = library.where(abs(height) > rounding(dtype) * reach, factor, 0.0)[..., None, None]
     # Of the terms of b . p, and of what b was built from: where b is to be 0, it is what rounding left.
     size = abs(M[..., 3:, :] * factor)
     size = rounding(dtype) * (size + torch.finfo(dtype).eps * largest(size, -1)[..., None])

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj._core.arguments import Array
-from diffproj._core.numerics import in_blocks, least_depth, rounding, side_by_side
+from diffproj._core.numerics import all_true, in_blocks, least_depth, rounding, side_by_side
 from diffproj.lens import brown_domain
 from diffproj.lens.brown_equations import COUNTS, Terms, bend, by_coefficients, radial, tilted
 from diffproj.lens.brown_gradient import follows_gradient, recorded, with_gradient
@@ -118,7 +118,8 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
         def backward(points: Tensor) -> tuple[Tensor, Tensor]:
             coefficients = self._usable(plan.domain)
             x, y, valid = search(coefficients.detach(), plan, points.detach())
-            x, y = torch.where(valid, x, 0), torch.where(valid, y, 0)
+            if not all_true(valid):
+                x, y = torch.where(valid, x, 0), torch.where(valid, y, 0)
             if not derivative_wanted(points, coefficients):
                 return side_by_side([x, y]), valid
             if follows_gradient(points, coefficients):

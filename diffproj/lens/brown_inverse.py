@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._core.numerics import has_values, in_float64
+from diffproj._core.numerics import all_true, has_values, in_float64
 from diffproj.lens.brown_equations import Terms, bend_off, newton_direction, residual, term_growth
 from diffproj.lens.brown_global import EDGE_MARGIN, Pair, global_newton
 from diffproj.lens.compiling import coordinates, length_of, with_batch_in_front
@@ -75,6 +75,8 @@ def search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, Te
     limit = (plan.reach * plan.reach).clamp_max(torch.finfo(x.dtype).max).unsqueeze(-1)
     possible = rho_squared <= limit if possible is None else possible & (rho_squared <= limit)
     solved = _solves(terms, target, rho_squared, plan.domain, plan.noise, x, y) & possible
+    if all_true(solved):  # the usual case
+        return x, y, solved
     batch = points.shape[:-2]
     lens = coefficients.expand(*batch, -1), plan.domain.expand(batch), plan.noise.expand(batch)
     left = possible & ~solved

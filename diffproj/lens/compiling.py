@@ -34,8 +34,7 @@ def coordinates(points: Tensor) -> tuple[Tensor, Tensor]:
     a loop with stride 2 is not vectorised and runs at a quarter of the speed.
     """
     compiling = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
-    together = points.stride(-1) == 1 and not _transforming()
-    if compiling and points.device.type == "cpu" and together:
+    if compiling and points.device.type == "cpu" and not _transforming():
         points = _deinterleaved(points).movedim(0, -1)
     x, y = points.unbind(-1)
     if points.device.type == "cpu" and not torch.compiler.is_compiling():

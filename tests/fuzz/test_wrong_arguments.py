@@ -732,6 +732,7 @@ NOT_CALLED = {
     "PlaneMap.unchecked",
     "PlaneMap.quietly",  # as the constructor
     "Camera.warped_by",
+    "BrownConrady.undistort_apart",  # as undistort
     "torchvision_warp",  # which needs torchvision, and has a test of its own
     "Covariance.from_fields",  # of files
     "RigCalibration.from_fields",
