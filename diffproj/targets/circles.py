@@ -38,6 +38,9 @@ WORSE, FAINTER, VAGUER = 1.15, 0.85, 1.4
 """What is left over, the contrast and the standard deviation, relative to the view's median, beyond which a circle is
 held to its neighbours tightly: it is in another light than they."""
 
+DROWNED, CUT = 0.45, 0.2
+"""Contrast relative to the median below which a circle is not taken where glare cuts off so many of its pixels."""
+
 TIGHT = Limits(deviations=4.0, loose=0.002, least=0.04)
 """How far off such a circle may lie."""
 
@@ -257,6 +260,7 @@ def _refined(
     dark = fit.contrast
     worst = min(MISFIT, max(ORDINARY, UNUSUAL * float(np.median(fit.misfit))))
     good = (fit.misfit < worst) & (fit.sigma < VAGUE) & (dark > 0.2 * np.median(dark)) & (dark > 2)
+    good &= (dark > DROWNED * np.median(dark)) | (fit.cut < CUT)
     good &= np.linalg.norm(fit.ellipses.centres - start.centres, axis=-1) < 0.3 * major + 1
     height, width = image.shape
     reach = np.sqrt(np.linalg.inv(fit.ellipses.axes @ fit.ellipses.axes).diagonal(axis1=1, axis2=2)) + 1

@@ -64,12 +64,14 @@ class FittedEllipses(NamedTuple):
         misfit: `(N,)`, root mean square of what the model leaves over, relative to half the step from dark to light.
         contrast: `(N,)`, half the step from light to dark; positive for dark ellipses.
         sigma: `(N,)` px, standard deviation of a coordinate as the grey values' scatter implies it.
+        cut: `(N,)`, share of the pixels that are as bright as a sensor can tell.
     """
 
     ellipses: Ellipses
     misfit: Float[np.ndarray, " n"]
     contrast: Float[np.ndarray, " n"]
     sigma: Float[np.ndarray, " n"]
+    cut: Float[np.ndarray, " n"]
 
 
 def dark_ellipses(grey: UInt8[np.ndarray, "h w"]) -> Ellipses:
@@ -196,7 +198,8 @@ def fit_ellipses(image: Shaped[np.ndarray, "h w"], start: Ellipses, room: Float[
         damping = torch.where(better[:, None], damping * 0.1, damping * 10).clamp(1e-9, 1e6)
         if bool((moved[:, :2].abs().amax(-1) < CLOSE).all()) and bool((moved[:, 5].abs() < 0.05).all()):
             break
-    return _judged(unknowns, (weight * error * error).sum(-1), slopes, weight, held, base)
+    cut = (weight * ((grey >= BRIGHTEST) | (grey <= 0))).sum(-1) / total
+    return _judged(unknowns, (weight * error * error).sum(-1), slopes, weight, held, base)._replace(cut=cut.numpy())
 
 
 def _modelled(unknowns: Tensor, place: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
@@ -261,4 +264,4 @@ def _judged(
     spread = (inverse * scale.unsqueeze(-1) * scale.unsqueeze(-2)).diagonal(dim1=-2, dim2=-1)[:, :2].mean(-1)
     sigma = rms * spread.clamp_min(0).sqrt().numpy()
     failed = ~(np.isfinite(centres).all(-1) & np.isfinite(axes).all((-1, -2)) & (np.linalg.det(axes) > 0))
-    return FittedEllipses(Ellipses(centres, axes), np.where(failed, np.inf, misfit), half, sigma)
+    return FittedEllipses(Ellipses(centres, axes), np.where(failed, np.inf, misfit), half, sigma, np.zeros(len(half)))

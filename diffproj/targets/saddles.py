@@ -52,8 +52,9 @@ def saddle_points(image: Shaped[np.ndarray, "h w"]) -> Saddles:
     # Few large arrays, written again and again, stay in the processor's cache.
     spare = image.astype(np.float32)
     smooth = cv2.GaussianBlur(spare, (0, 0), BLUR)
-    xx, yy, xy = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, dst=spare, ksize=3), *(
-        cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((0, 2), (1, 1))
+    xx, yy, xy = (
+        cv2.Sobel(smooth, cv2.CV_32F, 2, 0, dst=spare, ksize=3),
+        *(cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((0, 2), (1, 1))),
     )
     strength = cv2.subtract(cv2.multiply(xy, xy, dst=xy), cv2.multiply(xx, yy, dst=xx), dst=xy)
     # Without noise, pixels around one corner may be equally strong: by a hair, the last of them shall be the peak.

@@ -124,7 +124,10 @@ def matched(grid: Float[np.ndarray, "r c 2"], board: Chessboard) -> Float[np.nda
 
 def _goes_on(occupied: Bool[np.ndarray, "r c"], i: int, j: int, board: Chessboard) -> bool:
     """Whether most of a line of corners just outside the board is there."""
-    for lines, start, count in ((occupied[:, j : j + board.columns], i, board.rows), (occupied[i : i + board.rows].T, j, board.columns)):
+    for lines, start, count in (
+        (occupied[:, j : j + board.columns], i, board.rows),
+        (occupied[i : i + board.rows].T, j, board.columns),
+    ):
         for line in (start - 1, start + count):
             if 0 <= line < len(lines) and lines[line].mean() >= FULL:
                 return True
