@@ -34,6 +34,19 @@ LIMITS = Limits(deviations=4.0, loose=0.01, least=0.15)
 """How far off its neighbours' surface a circle may lie: glare and the edge of a shadow draw a middle aside, and misfit
 little. Of 800 circles in plain light none was farther."""
 
+WORSE, FAINTER, VAGUER = 1.15, 0.85, 1.4
+"""What is left over, the contrast and the standard deviation, relative to the view's median, beyond which a circle is
+held to its neighbours tightly: it is in another light than they."""
+
+DROWNED, CUT = 0.45, 0.2
+"""Contrast relative to the median below which a circle is not taken where glare cuts off so many of its pixels."""
+
+TIGHT = Limits(deviations=4.0, loose=0.002, least=0.04)
+"""How far off such a circle may lie."""
+
+ROUNDS = 6
+"""Most rounds in which circles that lie off are hidden, those farthest off first: they draw the others' surface."""
+
 LONGEST = 1600
 """Longer side in px of the copy in which circles are sought first."""
 
@@ -107,9 +120,17 @@ def _numbered(ellipses: Ellipses, board: CircleGrid) -> Int[np.ndarray, " n"] | 
             seen = np.where(order[:, None] >= 0, ellipses.centres[order], np.nan)
             if _whole(order >= 0, board) and not _goes_on(there, board) and _fits(places, seen):
                 orders.append((float(np.linalg.norm(_first(places, seen))), order))
-        if orders:
+        # With a side's circles hidden, an asymmetric grid may look like itself turned: then nobody knows which it is.
+        if orders and all(_alike(order, orders[0][1], board) for _, order in orders):
             return min(orders, key=lambda pair: pair[0])[1]
     return None
+
+
+def _alike(order: Int[np.ndarray, " n"], other: Int[np.ndarray, " n"], board: CircleGrid) -> bool:
+    """Whether one order is the other after a turn that leaves the board as it is."""
+    grid = order.reshape(board.shape)
+    turns = (np.rot90(grid, 4 // board.turns * k).reshape(-1) for k in range(board.turns))
+    return any(bool((turned == other).all()) for turned in turns)
 
 
 def _lattice_places(board: CircleGrid) -> Int[np.ndarray, "n 2"]:
@@ -239,19 +260,25 @@ def _refined(
     dark = fit.contrast
     worst = min(MISFIT, max(ORDINARY, UNUSUAL * float(np.median(fit.misfit))))
     good = (fit.misfit < worst) & (fit.sigma < VAGUE) & (dark > 0.2 * np.median(dark)) & (dark > 2)
+    good &= (dark > DROWNED * np.median(dark)) | (fit.cut < CUT)
     good &= np.linalg.norm(fit.ellipses.centres - start.centres, axis=-1) < 0.3 * major + 1
     height, width = image.shape
     reach = np.sqrt(np.linalg.inv(fit.ellipses.axes @ fit.ellipses.axes).diagonal(axis1=1, axis2=2)) + 1
     low, high = fit.ellipses.centres - reach, fit.ellipses.centres + reach
     good &= ((low >= 0) & (high <= np.array([width, height]) - 1)).all(axis=-1)
-    known = np.full((len(board), 2), np.nan)
+    known, doubted = np.full((len(board), 2), np.nan), np.zeros(len(board), dtype=bool)
     known[there[good]] = fit.ellipses.centres[good]
+    if good.any():
+        left, usual = fit.misfit * dark, fit.sigma * np.sqrt(major)
+        doubted[there] = (left > WORSE * np.median(left[good])) | (dark < FAINTER * np.median(dark[good]))
+        doubted[there] |= usual > VAGUER * np.median(usual[good])
     seen = np.isfinite(known[:, 0])
-    for _ in range(3):
-        off, limit = off_surface(board.places * board.spacing, known, seen, board.apart, LIMITS)
-        wrong = seen & (off > limit)
-        if not wrong.any():
+    for _ in range(ROUNDS):
+        places = board.places * board.spacing
+        (off, loose), (_, tight) = (off_surface(places, known, seen, board.apart, k) for k in (LIMITS, TIGHT))
+        excess = np.where(seen, off / np.where(doubted, tight, loose), 0.0)
+        if not (excess > 1).any():
             break
-        seen &= ~wrong
+        seen &= excess <= max(1.0, 0.5 * excess.max())
     known[~seen] = np.nan
     return known if _whole(seen, board) else None

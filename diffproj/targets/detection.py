@@ -63,8 +63,10 @@ def detect(
     known by itself, however the board is turned.
 
     A `CircleGrid` is found as dark ellipses on a lattice, or light ones on dark, of which up to a quarter may be
-    hidden. The pixels are the middles of the ellipses; `calibrate` knows that a centre is seen elsewhere. Its order is
-    never mirrored, and where the board looks the same when turned (`CircleGrid.turns`), the rule for chessboards holds.
+    hidden; those that glare or a shadow draws aside are. The pixels are the middles of the ellipses; `calibrate` knows
+    that a centre is seen elsewhere. Its order is never mirrored, and where the board looks the same when turned
+    (`CircleGrid.turns`), the rule for chessboards holds. Where it does so only since some circles are hidden, it counts
+    as not found.
 
     A `Chessboard` is found as a pattern of saddle points of brightness, in copies of several sizes, and where only a
     part of it is found so, by OpenCV's detectors. Its dark and light may be exchanged, as in thermal images. Each

@@ -26,6 +26,17 @@ CLOSE = 3e-3
 WIDE, FAR = 1.3, 3.0
 """How far beyond the ellipse pixels are fitted: relative to its size, and at least so many px."""
 
+BRIGHTEST = 255.0
+"""Grey value that a sensor does not exceed: glare is cut off there, and at 0 where the image is inverted."""
+
+CUT_OFF = 0.03
+"""How much the model counts where it exceeds what is cut off: nothing else would hold it where all pixels are."""
+
+SHADE, SHADE_SPREAD, SCATTER = -0.5, 0.5, 0.03
+"""By how much weaker light's gradient is expected in the dark, relative to that around it, give or take: a shadow is
+weaker there as all light is (-0.9), and glare is not (0). Where the light is even, nothing else tells. The grey values'
+scatter that this is weighed against, relative to half the step from dark to light."""
+
 _ANGLES = np.arange(16) * (2 * np.pi / 16)
 
 
@@ -53,12 +64,14 @@ class FittedEllipses(NamedTuple):
         misfit: `(N,)`, root mean square of what the model leaves over, relative to half the step from dark to light.
         contrast: `(N,)`, half the step from light to dark; positive for dark ellipses.
         sigma: `(N,)` px, standard deviation of a coordinate as the grey values' scatter implies it.
+        cut: `(N,)`, share of the pixels that are as bright as a sensor can tell.
     """
 
     ellipses: Ellipses
     misfit: Float[np.ndarray, " n"]
     contrast: Float[np.ndarray, " n"]
     sigma: Float[np.ndarray, " n"]
+    cut: Float[np.ndarray, " n"]
 
 
 def dark_ellipses(grey: UInt8[np.ndarray, "h w"]) -> Ellipses:
@@ -129,8 +142,9 @@ def _distinct(ellipses: Ellipses) -> np.ndarray:
 def fit_ellipses(image: Shaped[np.ndarray, "h w"], start: Ellipses, room: Float[np.ndarray, " n"]) -> FittedEllipses:
     """Fit each dark ellipse with its blur and a gradient of the light.
 
-    The grey value is `a + b Phi(d / s) + g . x`, `d` the distance from the ellipse, positive inside, and `s` the blur.
-    By symmetry, neither blur nor curvature moves the centre.
+    The grey value is `a + g . x + (b + k g . x) Phi(d / s)`, `d` the distance from the ellipse, positive inside, `s`
+    the blur, and `k` how the light's gradient differs inside; cut off where a sensor saturates. By symmetry, neither
+    blur nor curvature moves the centre.
 
     Args:
         image: `(H, W)`, uint8 or float32.
@@ -154,26 +168,29 @@ def fit_ellipses(image: Shaped[np.ndarray, "h w"], start: Ellipses, room: Float[
     total = weight.sum(-1).clamp_min(1)
     a, b, c = start.axes[:, 0, 0], start.axes[:, 0, 1], start.axes[:, 1, 1]
     shape = np.column_stack([start.centres - base, a, b, c, np.full(count, 0.8)])
-    light = np.zeros((count, 4))
+    light = np.column_stack([np.zeros((count, 4)), np.full(count, SHADE)])
     unknowns = torch.from_numpy(np.column_stack([shape, light]))
     dark, _ = _modelled(unknowns, place)
     mean, share = (weight * grey).sum(-1) / total, (weight * dark).sum(-1) / total
     off = weight * (dark - share[:, None])
     step = (off * (grey - mean[:, None])).sum(-1) / (off * dark).sum(-1).clamp_min(1e-3)
     unknowns[:, 6], unknowns[:, 7] = mean - step * share, step
+    held = (0.5 * SCATTER / SHADE_SPREAD * step).square()
     damping = torch.full((count, 1), 1e-3, dtype=torch.float64, device="cpu")
     error, slopes = _residuals(unknowns, grey, place)
-    cost = (weight * error * error).sum(-1)
+    cost = (weight * error * error).sum(-1) + held * (unknowns[:, 10] - SHADE).square()
     for _ in range(STEPS):
         weighted = slopes * weight.unsqueeze(1)
         normal, gradient = weighted @ slopes.mT, (weighted @ error.unsqueeze(-1)).squeeze(-1)
+        normal[:, 10, 10] += held
+        gradient[:, 10] -= held * (unknowns[:, 10] - SHADE)
         scale = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).rsqrt()
         scaled = normal * scale.unsqueeze(-1) * scale.unsqueeze(-2) + torch.diag_embed(damping.expand_as(scale))
         moved = (torch.linalg.solve_ex(scaled, gradient * scale)[0] * scale).nan_to_num()
         proposed = unknowns + moved
         proposed[:, 5].clamp_(0.3, 8.0)
         new_error, new_slopes = _residuals(proposed, grey, place)
-        new_cost = (weight * new_error * new_error).sum(-1)
+        new_cost = (weight * new_error * new_error).sum(-1) + held * (proposed[:, 10] - SHADE).square()
         better = new_cost < cost
         unknowns = torch.where(better[:, None], proposed, unknowns)
         error, cost = torch.where(better[:, None], new_error, error), torch.where(better, new_cost, cost)
@@ -181,7 +198,8 @@ def fit_ellipses(image: Shaped[np.ndarray, "h w"], start: Ellipses, room: Float[
         damping = torch.where(better[:, None], damping * 0.1, damping * 10).clamp(1e-9, 1e6)
         if bool((moved[:, :2].abs().amax(-1) < CLOSE).all()) and bool((moved[:, 5].abs() < 0.05).all()):
             break
-    return _judged(unknowns, cost, slopes, weight, base)
+    cut = (weight * ((grey >= BRIGHTEST) | (grey <= 0))).sum(-1) / total
+    return _judged(unknowns, (weight * error * error).sum(-1), slopes, weight, held, base)._replace(cut=cut.numpy())
 
 
 def _modelled(unknowns: Tensor, place: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
@@ -199,31 +217,37 @@ def _modelled(unknowns: Tensor, place: Tensor) -> tuple[Tensor, tuple[Tensor, ..
 
 
 def _residuals(unknowns: Tensor, grey: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
-    """Seen minus modelled grey values `(N, P)`, and the model's derivatives by its unknowns `(N, 10, P)`.
+    """Seen minus modelled grey values `(N, P)`, and the model's derivatives by its unknowns `(N, 11, P)`.
 
     The edge's slope of the radius is held where derivatives are taken, which changes no minimum worth a word.
     """
     dark, (x, y, q, r, radius, along_u, along_v, steep, distance, blur) = _modelled(unknowns, place)
-    white, step, light_u, light_v = unknowns[:, 6:, None].unbind(1)
-    error = grey - (white + step * dark + light_u * x + light_v * y)
-    slope = step * torch.exp(-0.5 * distance * distance) * ((2 * torch.pi) ** -0.5 / blur) / steep
+    white, step, light_u, light_v, shade = unknowns[:, 6:, None].unbind(1)
+    light, share = light_u * x + light_v * y, 1 + shade * dark
+    model = white + step * dark + light * share
+    # What is cut off says little more than that the light is at least so strong.
+    cut = ((grey >= BRIGHTEST) & (model > BRIGHTEST)) | ((grey <= 0) & (model < 0))
+    counts = torch.where(cut, CUT_OFF, 1.0)
+    error = (grey - model) * counts
+    slope = (step + shade * light) * torch.exp(-0.5 * distance * distance) * ((2 * torch.pi) ** -0.5 / blur) / steep
     slopes = (
-        slope * along_u - light_u,
-        slope * along_v - light_v,
+        slope * along_u - light_u * share,
+        slope * along_v - light_v * share,
         -slope * q * x / radius,
         -slope * (q * y + r * x) / radius,
         -slope * r * y / radius,
         -slope * steep * distance,
         torch.ones_like(dark),
         dark,
-        x,
-        y,
+        x * share,
+        y * share,
+        light * dark,
     )
-    return error, torch.stack(slopes, dim=1)
+    return error, torch.stack(slopes, dim=1) * counts.unsqueeze(1)
 
 
 def _judged(
-    unknowns: Tensor, cost: Tensor, slopes: Tensor, weight: Tensor, base: Shaped[np.ndarray, "n 2"]
+    unknowns: Tensor, cost: Tensor, slopes: Tensor, weight: Tensor, held: Tensor, base: Shaped[np.ndarray, "n 2"]
 ) -> FittedEllipses:
     """The fitted ellipses in px, how well they fit, and how far their centres may be off."""
     centres = base + unknowns[:, :2].numpy()
@@ -234,9 +258,10 @@ def _judged(
     misfit = rms / np.maximum(np.abs(half), 1e-3)
     weighted = slopes * weight.unsqueeze(1)
     normal = weighted @ slopes.mT
+    normal[:, 10, 10] += held
     scale = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).rsqrt()
     inverse = torch.linalg.pinv(normal * scale.unsqueeze(-1) * scale.unsqueeze(-2), hermitian=True)
     spread = (inverse * scale.unsqueeze(-1) * scale.unsqueeze(-2)).diagonal(dim1=-2, dim2=-1)[:, :2].mean(-1)
     sigma = rms * spread.clamp_min(0).sqrt().numpy()
     failed = ~(np.isfinite(centres).all(-1) & np.isfinite(axes).all((-1, -2)) & (np.linalg.det(axes) > 0))
-    return FittedEllipses(Ellipses(centres, axes), np.where(failed, np.inf, misfit), half, sigma)
+    return FittedEllipses(Ellipses(centres, axes), np.where(failed, np.inf, misfit), half, sigma, np.zeros(len(half)))
