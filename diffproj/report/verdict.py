@@ -72,8 +72,7 @@ def doubts(facts: Facts) -> list[str]:
     found = []
     if facts.converged:
         told = calibration.doubts
-        found += [text for text in calibration.remarks[0].split("; ") if text and text not in told]
-        found = _joined(found)
+        found += [remark.sentence for remark in calibration.findings[0] if remark.sentence not in told]
         found += [told] if told else []
         border = float(border_with_rays(calibration.camera.detach(), facts.size))
         if border < 1:
@@ -99,11 +98,6 @@ def doubts(facts: Facts) -> list[str]:
             "the file that it was read from holds no deviations, so nothing here says how sure the numbers are"
         )
     return [sentence(facts.in_words(text)) for text in found]
-
-
-def _joined(texts: list[str]) -> list[str]:
-    """Remarks: those that begin in the middle of a sentence belong to the one before."""
-    return ["; ".join(texts)] if texts else []
 
 
 def _figures(facts: Facts) -> list[tuple[str, str]]:
