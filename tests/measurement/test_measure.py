@@ -392,6 +392,6 @@ def test_a_pixel_out_of_all_bounds_leaves_the_others_as_they_are(far: float, len
     torch.testing.assert_close(found.deviations[1], alone.deviations[0], rtol=1e-12, atol=0)
     told = torch.where(found.valid.unsqueeze(-1), found.deviations, 0.0)
     assert not bool(told.isnan().any())
-    assert bool((told[found.valid][..., :2].amax(-1) > 1e60)[::2].all())
+    assert bool((told[[0, 2], :2].amax(-1) > 1e60)[found.valid[[0, 2]]].all())
     (gradient,) = torch.autograd.grad(found.deviations[1].sum(), leaf)
     assert bool(gradient.isfinite().all())
