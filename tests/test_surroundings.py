@@ -3,11 +3,10 @@
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache
 from itertools import cycle, islice
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -356,29 +355,29 @@ def in_threads(shared: Shared, wanted: dict[str, list[Any]], rounds: int) -> Non
 
 
 def in_pairs(shared: Shared, slow: dict[str, list[Any]], quick: dict[str, list[Any]]) -> None:
-    """Six threads make the slow calls, each of them in two threads at the same moment, beside two other ones; the rest
-    go round the quick calls, from two places, until the slow ones are made.
+    """Three pairs of threads make the slow calls, both of a pair the same one at the same moment; two more threads go
+    round the quick calls, from two places, until the slow ones are made.
     """
-    waiting = SimpleQueue[str]()
-    for name in (name for name in slow for _ in range(2)):
-        waiting.put(name)
-    names = list(quick)
+    waiting = iter(slow)
+
+    def same(name: str) -> None:
+        check_same(name, CALLS[name](shared), (slow | quick)[name])
 
     def pairs() -> None:
-        while not waiting.empty():
-            with suppress(Empty):
-                name = waiting.get_nowait()
-                check_same(name, CALLS[name](shared), slow[name])
+        for name in waiting:
+            twin = pool.submit(same, name)
+            same(name)
+            twin.result()
 
     def around(place: int) -> None:
-        for name in islice(cycle(names), place, None):
+        for name in islice(cycle(quick), place, None):
             if all(one.done() for one in slowly):
                 break
-            check_same(name, CALLS[name](shared), quick[name])
+            same(name)
 
     with often_switched(), ThreadPoolExecutor(THREADS) as pool:
-        slowly = [pool.submit(pairs) for _ in range(THREADS - 2)]
-        quickly = [pool.submit(around, place) for place in (0, len(names) // 2)]
+        slowly = [pool.submit(pairs) for _ in range(THREADS // 2 - 1)]
+        quickly = [pool.submit(around, place) for place in (0, len(quick) // 2)]
         for one in (*slowly, *quickly):
             one.result()
 

@@ -16,6 +16,7 @@ from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.distinct import alike, described
 from diffproj.calibration.parametrisation import BOW, SKEW, Parametrisation
+from diffproj.calibration.remark import Remarks
 from diffproj.calibration.shape import AXES
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
@@ -81,7 +82,7 @@ class Account(Shown):
             ...
 
         @cached_property
-        def remarks(self) -> tuple[str, ...]:
+        def findings(self) -> tuple[Remarks, ...]:
             """See `Calibration`."""
             ...
 
@@ -157,7 +158,7 @@ class Account(Shown):
             unsure = float(spread.amax() / self.shared[0])
         if self.landmarks is not None:
             spare = None if self.degrees_of_freedom is None else float(self.degrees_of_freedom)
-            return advice.of_landmarks(int(self.used.any(0).sum()), unsure, self._scatter, spare, self.remarks[0])
+            return advice.of_landmarks(int(self.used.any(0).sum()), unsure, self._scatter, spare, self.findings[0])
         found = advice.judged(
             advice.Evidence(
                 self.cameras,
@@ -168,7 +169,7 @@ class Account(Shown):
                 self._scatter,
                 self.view_rms,
                 self.views.names,
-                self.remarks[0],
+                self.findings[0],
             )
         )
         if self.displacements is None:
@@ -232,7 +233,7 @@ class Account(Shown):
                 f"{'image':<16}{100 * (1 - share):.0f} % of its border lies beyond the fold of the lens: no rays"
             )
         doubts = "" if self.status else self.doubts
-        remarks = [text for text in self.remarks[0].split("; ") if text not in doubts] + [doubts]
+        remarks = [remark.sentence for remark in self.findings[0] if remark.sentence not in doubts] + [doubts]
         return "\n".join([*lines, self._ends()[0], *filter(None, remarks), self.verdict])
 
     def _shape(self) -> str:

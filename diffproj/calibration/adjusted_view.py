@@ -40,5 +40,5 @@ def of_view(
         skew=adjusted.skew,
         landmarks=landmarks.names,
         _covariance=partial(getattr, adjusted, "covariance"),
-        _remarks=partial(getattr, adjusted, "contradicted"),
+        _remarks=partial(getattr, adjusted, "contradictions"),
     )

@@ -15,6 +15,7 @@ from diffproj.calibration.evidence import jacobian
 from diffproj.calibration.observation import Observation
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.pose_parameters import MOUNTING
+from diffproj.calibration.remark import Kind, Remark, Remarks, text_of
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.solver import Status
 from diffproj.geometry.cayley import turned
@@ -93,15 +94,20 @@ class Adjustment(Calibration):
     @property
     def contradicted(self) -> tuple[str, ...]:
         """For each camera what residuals speak against its deviations, `*B` flattened; empty where none do."""
+        return tuple(map(text_of, self.contradictions))
+
+    @property
+    def contradictions(self) -> tuple[Remarks, ...]:
+        """The same with its kind."""
         if self.cost is None or self.spare is None:
-            return ("",) * max(1, self.status.numel())
+            return ((),) * max(1, self.status.numel())
         half = self.spare.clamp(min=1).to(self.cost) / 2
         chance = torch.special.gammaincc(half, self.cost.detach().clamp(min=0))
         chance = torch.where(self.spare > 0, chance, 1.0).flatten()
-        found = []
+        found: list[Remarks] = []
         for camera, (c, ratio) in enumerate(zip(chance.tolist(), self.consistency.flatten().tolist(), strict=True)):
             if not c < CONTRADICTION:
-                found.append("")
+                found.append(())
                 continue
             each = [
                 (float(part.detach().reshape(-1, *part.shape[-2:])[camera].square().mean().sqrt()), type(one).__name__)
@@ -109,10 +115,9 @@ class Adjustment(Calibration):
                 if part.numel()
             ]
             worst = f", most of all {max(each)[1]} ({max(each)[0]:.1f} times)" if len(each) > 1 else ""
-            found.append(
-                f"the residuals are {ratio:.1f} times what the deviations say{worst}: deviations are too small, or "
-                "pieces of evidence contradict each other"
-            )
+            reason = f"the residuals are {ratio:.1f} times what the deviations say{worst}"
+            sentence = f"{reason}: deviations are too small, or pieces of evidence contradict each other"
+            found.append((Remark(sentence, Kind.CONTRADICTION, reason),))
         return tuple(found)
 
     @property

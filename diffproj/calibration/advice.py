@@ -6,7 +6,6 @@ residuals leave something over. The limits are rules of thumb; error bars hold w
 """
 
 import math
-import re
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj.calibration.region import in_region
+from diffproj.calibration.remark import OF_THE_CAMERA, Kind, Remarks
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.grid import pixel_grid
 
@@ -35,16 +35,6 @@ COARSE_PX = 0.5
 """Scatter of a corner's coordinate above that of a detector in sharp photographs, 0.05 to 0.3 px."""
 ODD = 3.0
 """Times the median RMS of all views from which on a view is named."""
-OTHER_LENS = "another lens"
-"""What a remark says of residuals that another lens would explain."""
-TWO_CAMERAS = "want another camera than"
-"""What a remark says of views that fall into two groups."""
-UNEVEN_PRINT = "or slanted"
-"""What a remark says of a board that was printed wider than high."""
-BENT = "as if it were bent"
-"""What a remark says of a board that is not flat."""
-CONTRADICTED = re.compile(r"[^;:,]*times what[^;:,]*")
-"""What a remark says where residuals contradict the deviations that were given."""
 POSES_ONLY = "Poses only, the camera was given"
 ACROSS, DOWN = ("left", "", "right"), ("top", "", "bottom")
 
@@ -63,7 +53,7 @@ class Evidence:
         sigma: of a corner's coordinate in px.
         view_rms: `(V,)` in px.
         names: of the views.
-        remarks: what the residuals leave over, in words; empty where nothing.
+        remarks: what the residuals leave over.
     """
 
     cameras: Camera
@@ -74,27 +64,17 @@ class Evidence:
     sigma: float
     view_rms: Float[Tensor, " v"]
     names: tuple[str, ...]
-    remarks: str
+    remarks: Remarks
 
     @property
-    def other_lens(self) -> bool:
-        """Whether the residuals are those of another lens."""
-        return OTHER_LENS in self.remarks
+    def kinds(self) -> set[Kind]:
+        """What the remarks say."""
+        return {remark.kind for remark in self.remarks}
 
     @property
-    def two_cameras(self) -> bool:
-        """Whether they fall into two groups that want different cameras."""
-        return TWO_CAMERAS in self.remarks
-
-    @property
-    def uneven_print(self) -> bool:
-        """Whether the board was printed wider than high, or slanted."""
-        return UNEVEN_PRINT in self.remarks
-
-    @property
-    def bent(self) -> bool:
-        """Whether the board is bent."""
-        return BENT in self.remarks
+    def other_model(self) -> bool:
+        """Whether the residuals are those of another lens, or of a K with skew."""
+        return not self.kinds.isdisjoint(OF_THE_CAMERA)
 
 
 @dataclass(frozen=True)
@@ -141,7 +121,7 @@ def judged(seen: Evidence) -> Judgement:
     more = ENOUGH_VIEWS - round(seen.different) if seen.different < FEW_VIEWS else 0
     if more:
         remedies.append(f"{more} more photographs, the board at other places, distances and tilts")
-    tilted = tilt < LOW_TILT or (seen.unsure is not None and seen.unsure > UNSURE and not seen.other_lens)
+    tilted = tilt < LOW_TILT or (seen.unsure is not None and seen.unsure > UNSURE and not seen.other_model)
     if tilted:
         remedies.append("the board tilted by 20 to 50 degrees, about both axes")
     elif one_axis:
@@ -149,28 +129,29 @@ def judged(seen: Evidence) -> Judgement:
     bare = [] if covered is None else _bare(covered)
     if bare:
         remedies.append(f"the board in the {_listed(bare)} of the image, up to the edge")
-    if seen.sigma > COARSE_PX and not seen.other_lens:
+    if seen.sigma > COARSE_PX and not seen.other_model:
         remedies.append("sharper photographs: more light, a camera at rest, a flat print")
     odd = _odd(seen)
     if odd:
         remedies.append(f"another look at {_listed(odd)}, whose corners fit far worse than the others'")
-    if seen.other_lens:
+    if seen.other_model:
         first = "first" if remedies else "no photograph yet, but"
-        remedies.insert(0, f"{first} the lens model that the remark on the residuals names")
-    if seen.two_cameras:
+        model = "lens model" if Kind.OTHER_LENS in seen.kinds else "skew"
+        remedies.insert(0, f"{first} the {model} that the remark on the residuals names")
+    if Kind.TWO_CAMERAS in seen.kinds:
         remedies.insert(
             0,
             "first another look at the views that the remark names, for one camera with one zoom must have taken all",
         )
-    if seen.uneven_print:
+    if Kind.UNEVEN_PRINT in seen.kinds:
         remedies.insert(0, "no other photograph yet, but shape='free', or a board whose sides were measured both ways")
-    if seen.bent:
+    if Kind.BENT in seen.kinds:
         remedies.insert(0, "no other photograph yet, but shape='bow', or a board glued to something flat")
     word, reasons = ("Weak", faults) if faults else ("Good", _praise(seen, tilt, covered))
     return Judgement(word, tuple(reasons), tuple(remedies), tuple(bare), tilted or one_axis, more)
 
 
-def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | None, remarks: str) -> Judgement:
+def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | None, remarks: Remarks) -> Judgement:
     """The same of a camera that was calibrated on so many landmarks.
 
     Args:
@@ -178,7 +159,7 @@ def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | 
         unsure: the largest deviation of focal length or principal point, relative to the focal length, where known.
         sigma: of a landmark's pixel coordinate in px.
         spare: degrees of freedom, where known.
-        remarks: what the residuals leave over, in words; empty where nothing.
+        remarks: what the residuals leave over.
     """
     faults, remedies = [], []
     if unsure is not None and unsure > UNSURE_OF_LANDMARKS:
@@ -188,10 +169,9 @@ def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | 
     if spare is not None and spare < FEW_SPARE:
         faults.append(f"pixel coordinates outnumber unknowns by {spare:.0f} only, so they hardly test each other")
         remedies.append("more landmarks, near and far, in all parts of the image")
-    if OTHER_LENS in remarks:
-        faults.append("this lens model does not fit the lens")
-    if contradicted := CONTRADICTED.search(remarks):
-        faults.append(contradicted.group().strip())
+    faults += _reasons(remarks, *OF_THE_CAMERA)
+    if contradicted := _reasons(remarks, Kind.CONTRADICTION):
+        faults += contradicted
         remedies.append("a look at wrong landmarks and wrong priors, or larger deviations for them")
     if not faults:
         known = [f"focal length and principal point are known to {100 * unsure:.1g} %"] if unsure else []
@@ -206,10 +186,8 @@ def _percent(part: float) -> str:
 
 def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
     """What makes it weak."""
-    faults = []
+    faults = _reasons(seen.remarks, Kind.CONTRADICTION)
     count = int(seen.used.sum())
-    if contradicted := CONTRADICTED.search(seen.remarks):
-        faults.append(contradicted.group().strip())
     if seen.different < FEW_VIEWS:
         alike = f" of {count}" if round(seen.different) < count else ""
         number = f"only {round(seen.different)}{alike}"
@@ -223,19 +201,16 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
         faults.append(
             f"its corners cover {100 * float(covered.nanmean()):.0f} % of the image, the lens is a guess beyond"
         )
-    if seen.sigma > COARSE_PX and not seen.other_lens:
+    if seen.sigma > COARSE_PX and not seen.other_model:
         faults.append(
             f"the corners scatter by {seen.sigma:.2g} px in each coordinate, in sharp photographs by 0.05 to 0.3"
         )
-    if seen.two_cameras:
-        faults.append("its views fall into two groups that want different cameras")
-    if seen.uneven_print:
-        faults.append("the board is not as wide and as high as it says")
-    if seen.bent:
-        faults.append("the board is bent")
-    if seen.other_lens:
-        faults.append("this lens model does not fit the lens")
-    return faults
+    return [*faults, *_reasons(seen.remarks, Kind.TWO_CAMERAS, Kind.UNEVEN_PRINT, Kind.BENT, *OF_THE_CAMERA)]
+
+
+def _reasons(remarks: Remarks, *kinds: Kind) -> list[str]:
+    """The reasons that remarks of these kinds give, in their order."""
+    return [remark.reason for kind in kinds for remark in remarks if remark.kind == kind]
 
 
 def _praise(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:

@@ -27,6 +27,7 @@ from diffproj.calibration.other_poses import APART
 from diffproj.calibration.outcome import outcome
 from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.pose_parameters import TURNS
+from diffproj.calibration.remark import Kind, Remark, Remarks
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Solution, Status, equations_at
 from diffproj.calibration.surveyed import in_common, whitening
@@ -330,9 +331,9 @@ def _others(data: Data, whole: Fit, ends: Sequence[Found]) -> OtherPoses:
     return OtherPoses(*(part.reshape(*data.batch, *part.shape[1:]) for part in parts))
 
 
-def _remarks(data: Data, task: Task, found: Found, plain: Calibration) -> tuple[str, ...]:
+def _remarks(data: Data, task: Task, found: Found, plain: Calibration) -> tuple[Remarks, ...]:
     """Those on the residuals; and where residuals and priors together contradict the deviations."""
-    told = list(plain.remarks)
+    told = list(plain.findings)
     if not task.known.priors:
         return tuple(told)
     seen = data.used.any(-1)
@@ -341,8 +342,9 @@ def _remarks(data: Data, task: Task, found: Found, plain: Calibration) -> tuple[
     for p in ((chance < CONTRADICTION) & (left > 0)).nonzero().flatten().tolist():
         if not told[p] and plain.converged.flatten()[p]:
             times = float((2 * cost[p] / left[p]).sqrt())
-            told[p] = (
-                f"residuals and priors are {times:.2g} times what their deviations say, more than chance allows: look "
-                "for a wrong prior or landmark, or give larger deviations"
+            reason = f"residuals and priors are {times:.2g} times what their deviations say"
+            sentence = (
+                f"{reason}, more than chance allows: look for a wrong prior or landmark, or give larger deviations"
             )
+            told[p] = (Remark(sentence, Kind.CONTRADICTION, reason),)
     return tuple(told)

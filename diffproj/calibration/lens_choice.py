@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import tensor_of
-from diffproj.calibration.adequacy import LENS_WORDS
 from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.constraints import of_points
 from diffproj.calibration.held_out import Errors, folds_of, without_corners, without_views
 from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.options import Options
 from diffproj.calibration.parametrisation import BOW, INTRINSICS
+from diffproj.calibration.remark import OF_THE_CAMERA
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.verdict import ONE_VIEW
 from diffproj.lens.models import MODELS, LensModel
@@ -160,7 +160,7 @@ def _lacks_views(candidate: _Candidate) -> bool:
 
 def _inadequate(candidate: _Candidate) -> bool:
     """Whether its residuals themselves ask for another lens."""
-    return LENS_WORDS in candidate.fit.remarks[0]
+    return any(remark.kind in OF_THE_CAMERA for remark in candidate.fit.findings[0])
 
 
 def _difference(candidate: _Candidate, best: _Candidate) -> tuple[float, float]:

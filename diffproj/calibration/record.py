@@ -11,6 +11,7 @@ from diffproj.calibration.ambiguity import OtherPoses
 from diffproj.calibration.covariance import Covariance
 from diffproj.calibration.fields import codes, mask, present, tensor
 from diffproj.calibration.mismatch import Mismatch
+from diffproj.calibration.remark import Kind, Remark, Remarks
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
 from diffproj.targets.views import Views
@@ -61,6 +62,11 @@ class Recorded:
             "skew": self.skew,
             "causes": list(self.causes),
             "remarks": list(self.remarks),
+            "findings": [
+                {"camera": camera, **remark._asdict()}
+                for camera, remarks in enumerate(self.findings)
+                for remark in remarks
+            ],
             "names": list(self.views.names),
             "size": self.views.size,
             **{name: None if found is None else found.tolist() for name, found in lists.items()},
@@ -130,7 +136,7 @@ class Recorded:
             displacements=tensor(fields, "displacements", (*batch, N, 3)) if present(fields, "displacements") else None,
             _covariance=None if covariance is None else partial(_same, covariance),
             _others=None if others is None else partial(_same, others),
-            _remarks=partial(_same, _texts("remarks", fields["remarks"])) if "remarks" in fields else None,
+            _remarks=_findings(fields, max(1, status.numel())),
             _mismatch=_mismatch(fields.get("mismatch"), (*batch, V)),
         )
         _check_rms(fields, found.rms)
@@ -175,6 +181,26 @@ def _mismatch(fields: dict[str, Any] | None, shape: tuple[int, ...]) -> Callable
         return None
     ratio, scale = (tensor(fields, name, shape, least=0, gaps=True) for name in ("ratio", "scale"))
     return partial(_same, Mismatch(ratio, mask(fields, "doubtful", shape), scale))
+
+
+def _findings(fields: dict[str, Any], cameras: int) -> Callable[[], tuple[Remarks, ...]] | None:
+    """The remarks one by one; of a file without their kinds, each camera's text as one."""
+    if "findings" not in fields and "remarks" not in fields:
+        return None
+    found: list[list[Remark]] = [[] for _ in range(cameras)]
+    if "findings" in fields:
+        for given in fields["findings"]:
+            if not isinstance(given, dict) or given["camera"] not in range(cameras) or given["kind"] not in list(Kind):
+                raise ValueError(f"findings: want camera, kind ({', '.join(Kind)}), sentence and reason, got {given!r}")
+            sentence, reason = _texts("findings", (given["sentence"], given["reason"]))
+            found[given["camera"]].append(Remark(sentence, Kind(given["kind"]), reason))
+    else:
+        texts = _texts("remarks", fields["remarks"])
+        if len(texts) != cameras:
+            raise ValueError(f"remarks: want {cameras}, one for each camera, got {len(texts)}")
+        for remarks, text in zip(found, texts, strict=True):
+            remarks += [Remark(text)] * bool(text)
+    return partial(_same, tuple(map(tuple, found)))
 
 
 def _later(fields: dict[str, Any], name: str, shape: tuple[int, ...]) -> Tensor | None:

@@ -1,4 +1,4 @@
-"""The remarks on a calibration that converged: what is to be known of it, in one text a camera."""
+"""The remarks on a calibration that converged: what is to be known of each camera."""
 
 from collections.abc import Sequence
 
@@ -25,6 +25,7 @@ from diffproj.calibration.advice import TWO_CAMERAS
 from diffproj.calibration.entangled import Entangled, Simpler
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.leftover import Leftover, leftover
+from diffproj.calibration.remark import OF_THE_CAMERA, Kind, Remark, Remarks
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
 from diffproj.calibration.two_groups import TwoGroups, two_groups
@@ -35,8 +36,6 @@ CONTRADICTION = 1e-4
 """Chance of the residuals under the noise that was given below which they contradict it."""
 NOTABLE = 1.25
 """Times that noise that residuals must be for a word."""
-UNEVEN_PRINT = "as if it were wider than high by more than it says, or less, or slanted"
-"""What a remark says of a print that a printer stretched."""
 BETTER = 0.8
 """Part of what another lens would explain that two groups must save to be named in its place."""
 MOST_NAMED = 5
@@ -47,8 +46,8 @@ NO_DENOMINATOR = {"brown8": "'brown5'"} | dict.fromkeys(("brown12", "brown14"), 
 
 def remarks(
     found: Fit, status: Tensor, doubt: Entangled, names: Sequence[Sequence[str]], of_landmarks: bool = False
-) -> tuple[str, ...]:
-    """The remarks on each of P cameras, in one text; empty where there are none, or it did not converge.
+) -> tuple[Remarks, ...]:
+    """The remarks on each of P cameras; none on one that did not converge.
 
     Args:
         found: the fit.
@@ -62,27 +61,32 @@ def remarks(
     held = torch.zeros_like(converged)
     if task.prior is not None and task.prior.known is not None:
         held = (task.prior.precision != task.prior.known).any(-1).any(-1)
-    texts: list[list[str]] = [[] for _ in status]
+    said: list[list[Remark]] = [[] for _ in status]
     for p in (converged & held).nonzero().flatten().tolist():
-        texts[p].append(
-            "k4, k5 and k6 are held near those of a poorer lens, for without that the lens folds inside the image"
+        said[p].append(
+            Remark(
+                "k4, k5 and k6 are held near those of a poorer lens, for without that the lens folds inside the image"
+            )
         )
     for p, growth in doubt.needless.items():
         if not bool(held[p]):
-            texts[p].append(
-                f"k4, k5 and k6 stand for noise, without them the residuals are {100 * growth:.1f} % larger: "
-                f"{NO_DENOMINATOR[task.lens]} fits as well"
+            said[p].append(
+                Remark(
+                    f"k4, k5 and k6 stand for noise, without them the residuals are {100 * growth:.1f} % larger: "
+                    f"{NO_DENOMINATOR[task.lens]} fits as well"
+                )
             )
     for p, other in doubt.simpler.items():
-        texts[p].append(_not_told(other))
+        said[p].append(Remark(_not_told(other)))
     for p in (converged & _unsure_focal(found)).nonzero().flatten().tolist():
-        texts[p].append(_unsure(found, p))
+        said[p].append(Remark(_unsure(found, p)))
     for p in (converged & _contradicts_noise(found)).nonzero().flatten().tolist():
-        times = float(found.variance_of_residuals()[p].sqrt())
-        texts[p].append(
-            f"the residuals are {times:.2g} times what pixel_sigma says, more than chance allows: the deviations are "
-            "too small; look for wrong landmarks or corners, or give a larger pixel_sigma"
+        reason = f"the residuals are {float(found.variance_of_residuals()[p].sqrt()):.2g} times what pixel_sigma says"
+        sentence = (
+            f"{reason}, more than chance allows: the deviations are too small; look for wrong landmarks or corners, "
+            "or give a larger pixel_sigma"
         )
+        said[p].append(Remark(sentence, Kind.CONTRADICTION, reason))
     sigma = found.pixel_sigma().detach()
     which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
     if len(which):
@@ -90,14 +94,14 @@ def remarks(
         for i, p in enumerate(which.tolist()):
             saved = groups[p].saved if p in groups else 0.0
             if not of_landmarks and _uneven_print(task, left, i, p, saved):
-                texts[p].append(_of_the_print(left, i))
+                said[p].append(_of_the_print(left, i))
                 continue
-            sentence = _left_over(task, left, i, p, 0.0 if of_landmarks else float(sigma[p]))
+            remark = _left_over(task, left, i, p, 0.0 if of_landmarks else float(sigma[p]))
             if p in groups and saved > BETTER * float(left.smooth.share[i]):
-                texts[p].append(_two_cameras(names[p], groups[p]))
-                sentence = "" if LENS_WORDS in sentence else sentence
-            texts[p].extend(filter(None, [sentence]))
-    return tuple("; ".join(text) for text in texts)
+                said[p].append(_two_cameras(names[p], groups[p]))
+                remark = None if remark is not None and remark.kind in OF_THE_CAMERA else remark
+            said[p] += [] if remark is None else [remark]
+    return tuple(map(tuple, said))
 
 
 def _unsure_focal(found: Fit) -> Tensor:
@@ -125,14 +129,15 @@ def _contradicts_noise(found: Fit) -> Tensor:
     return rare & (squares > NOTABLE**2 * spare)
 
 
-def _two_cameras(names: Sequence[str], group: TwoGroups) -> str:
+def _two_cameras(names: Sequence[str], group: TwoGroups) -> Remark:
     named = [names[view] for view in group.smaller]
     named = named if len(named) <= MOST_NAMED else [*named[:MOST_NAMED], f"{len(named) - MOST_NAMED} more"]
-    return (
-        f"{', '.join(named[:-1])} and {named[-1]} {TWO_CAMERAS} the other views (with one for each group the "
-        f"residuals' sum of squares is {100 * group.saved:.0f} % smaller): was it one camera with one zoom and focus, "
-        "no photograph turned, cropped or resized, and one flat board? Else calibrate the groups by themselves"
+    sentence = (
+        f"{', '.join(named[:-1])} and {named[-1]} want another camera than the other views (with one for each group "
+        f"the residuals' sum of squares is {100 * group.saved:.0f} % smaller): was it one camera with one zoom and "
+        "focus, no photograph turned, cropped or resized, and one flat board? Else calibrate the groups by themselves"
     )
+    return Remark(sentence, Kind.TWO_CAMERAS, "its views fall into two groups that want different cameras")
 
 
 def _not_told(other: Simpler) -> str:
@@ -153,35 +158,47 @@ def _uneven_print(task: Task, left: Leftover, i: int, p: int, saved: float) -> b
     return float(left.print.share[i]) > max(most, saved)
 
 
-def _of_the_print(left: Leftover, i: int) -> str:
-    return (
-        f"the residuals repeat on the board, {UNEVEN_PRINT} ({100 * float(left.print.share[i]):.0f} % of their sum of "
-        "squares), which focal lengths take for their own: take shape='free', which finds that, or print it at 100 % "
-        "both ways and measure both sides of the whole board"
+def _of_the_print(left: Leftover, i: int) -> Remark:
+    return Remark(
+        "the residuals repeat on the board, as if it were wider than high by more than it says, or less, or slanted "
+        f"({100 * float(left.print.share[i]):.0f} % of their sum of squares), which focal lengths take for their own: "
+        "take shape='free', which finds that, or print it at 100 % both ways and measure both sides of the whole board",
+        Kind.UNEVEN_PRINT,
+        "the board is not as wide and as high as it says",
     )
 
 
-def _left_over(task: Task, left: Leftover, i: int, p: int, sigma: float) -> str:
-    """The sentence on the residuals of camera `p`, number `i` of those that were tested; empty where they are noise."""
+def _left_over(task: Task, left: Leftover, i: int, p: int, sigma: float) -> Remark | None:
+    """The remark on the residuals of camera `p`, number `i` of those that were tested; none where they are noise."""
     if wants_skew(task, left, i):
         part = f"{100 * float(left.skew.share[i]):.0f} % of their sum of squares"
-        return f"the residuals {LENS_WORDS} over the image, as through a K with skew ({part}): take skew=True"
+        return Remark(
+            f"the residuals {LENS_WORDS} over the image, as through a K with skew ({part}): take skew=True",
+            Kind.SKEW,
+            "a K without skew does not fit the camera",
+        )
     for radial, effect, share in ((True, left.radial, RADIAL_SHARE), (False, left.smooth, SMOOTH_SHARE)):
         if counts(effect, i, share):
             where = "with the distance from the principal point" if radial else "over the image"
             part = f"{100 * float(effect.share[i]):.0f} % of their sum of squares"
             remedy = other_lens(task, p, radial)
-            return f"the residuals {LENS_WORDS} {where}, as through another lens ({part}): {remedy}"
+            return Remark(
+                f"the residuals {LENS_WORDS} {where}, as through another lens ({part}): {remedy}",
+                Kind.OTHER_LENS,
+                "this lens model does not fit the lens",
+            )
     if int(task.used[p].any(-1).sum()) >= SHAPE_VIEWS and counts(left.shape, i, SHAPE_SHARE):
         if counts(left.bow, i, BOW_PART * float(left.shape.share[i])):
-            return "the residuals repeat on the board, as if it were bent: take shape='bow'"
-        return (
+            return Remark(
+                "the residuals repeat on the board, as if it were bent: take shape='bow'", Kind.BENT, "the board is bent"
+            )
+        return Remark(
             f"the residuals repeat on the board, whose corners lie {float(left.moved[i]):.2g} world units (RMS) "
             "off the target's: take shape='free', which finds where they are, or a flatter or better print"
         )
     if sigma > NOISY_PX:
-        return (
+        return Remark(
             f"the corners scatter by {sigma:.1f} px in each coordinate, in sharp photographs by 0.1 to 0.3: "
             "look for blur and for wrong corners"
         )
-    return ""
+    return None

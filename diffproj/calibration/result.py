@@ -23,6 +23,7 @@ from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.positions import Positions, positions
 from diffproj.calibration.record import Recorded
 from diffproj.calibration.region import covered_region
+from diffproj.calibration.remark import Remarks, text_of
 from diffproj.calibration.shape_names import Shape
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
@@ -109,7 +110,7 @@ class Calibration(Account, Copied, Recorded):
     rig: str | None = None
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
-    _remarks: Callable[[], tuple[str, ...]] | None = None
+    _remarks: Callable[[], tuple[Remarks, ...]] | None = None
     _mismatch: Callable[[], Mismatch] | None = None
 
     @property
@@ -246,7 +247,12 @@ class Calibration(Account, Copied, Recorded):
         That its lens had to be kept from folding; that the residuals are no noise, but change smoothly over the image,
         repeat on the board, or are large; and what to try. Computed at the first call.
         """
-        return self._remarks() if self._remarks is not None else ("",) * max(1, self.status.numel())
+        return tuple(map(text_of, self.findings))
+
+    @cached_property
+    def findings(self) -> tuple[Remarks, ...]:
+        """The same one by one, each with its `kind`."""
+        return self._remarks() if self._remarks is not None else ((),) * max(1, self.status.numel())
 
     @property
     def posed(self) -> Bool[Tensor, "*batch v"]:

@@ -45,6 +45,9 @@ from diffproj.measurement.propagation import Noise
 from diffproj.measurement.sight import Sight
 from diffproj.targets.views import view_number
 
+LOST = 1e100
+"""Derivatives of a point, in world units, from which on squares may overflow: nothing is known of where it is."""
+
 
 def measure(
     pixels: Float[Tensor, "*#batch n 2"] | Array,
@@ -125,14 +128,17 @@ def measure(
     tangents = plane.tangents()
     T = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)  # (*B, N, 3, 2)
     D = torch.where(valid[..., None, None], T @ _inverse2(by_point @ T), 0.0)
+    lost = valid & ~((D.abs().sum((-2, -1)) > 0) & ((D @ by_theta).abs().sum((-2, -1)) < LOST))
+    if bool(lost.any()):
+        D, by_theta, by_point = (torch.where(lost[..., None, None], 0.0, z) for z in (D, by_theta, by_point))
     region = calibration.region if isinstance(calibration, Calibration) else None
     blocks, covariances = [-D @ by_theta], [D.new_zeros(*batch, 0, 0) if known is None else known]
-    beyond = torch.zeros_like(valid)
+    beyond = lost
     if region is not None and known is not None:
         extrapolated = valid & ~in_region(pixels, region)
         factor = lens_reach.stretch(extrapolated, pixels, points, camera, parameters, plane, known, middle, blocks[0])
-        beyond = factor.isinf()
-        factor = torch.where(beyond, 1.0, factor)[..., None, None]
+        beyond = lost | factor.isinf()
+        factor = torch.where(factor.isinf(), 1.0, factor)[..., None, None]
         blocks, by_theta = [factor * blocks[0]], factor * by_theta
     if plane_covariance is not None:
         n = plane.unit_normal.unsqueeze(-2).expand_as(points)

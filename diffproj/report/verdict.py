@@ -71,9 +71,8 @@ def doubts(facts: Facts) -> list[str]:
     found = []
     if facts.converged:
         told = calibration.doubts
-        # Some parts begin in the middle of a sentence: they stay one text.
-        remarks = "; ".join(text for text in calibration.remarks[0].split("; ") if text not in told)
-        found += filter(None, [remarks, told])
+        found += [remark.sentence for remark in calibration.findings[0] if remark.sentence not in told]
+        found += [told] if told else []
         border = float(border_with_rays(calibration.camera.detach(), facts.size))
         if border < 1:
             found.append(

@@ -175,6 +175,8 @@ def test_stack(make: Callable[..., Batched], dim: int) -> None:
     for tensor, want in zip(tensors(joined), tensors(item), strict=True):
         assert all(torch.equal(part, want) for part in tensor.unbind(dim % 2))
     assert type(item).stack([make(), item]).batch_shape == (2, 3)
+    with pytest.raises(ValueError, match="dim: want an axis from -2 to 1, got 2"):
+        type(item).stack([item, item], 2)
 
 
 @every

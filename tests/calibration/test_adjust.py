@@ -490,6 +490,7 @@ def test_turns_are_known_of_a_camera_that_looks_straight_down() -> None:
         (lambda: dp.VanishingPoints(["x"]), "pixels: want pixels or segments, got neither"),
         (lambda: dp.VanishingPoints("x", pixels=[[1.0, 2.0]]), "directions: want one for each line"),
         (lambda: dp.Seen(LANDMARKS[:2], seen()[:2], [1.0, -2.0]), "more than 0 and finite, got -2 at 1"),
+        (lambda: dp.Lengths([[1.0, 2], [3, 4]], [[1.0, 1]], 1.0, 0.1), "ends: want one for each of 2 starts, got 1"),
         (
             lambda: dp.Lengths([[1.0, 2], [3, 4]], [[1.0, 1], [3, 4]], 1.0, 0.1),
             "ends: want other pixels .* at 1; leave",

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import diffproj as dp
+from diffproj.lens.models import LensModel
 
 D = torch.float64
 BOARD = dp.Chessboard()
@@ -21,6 +22,7 @@ def test_good_views(calibration: dp.Calibration) -> None:
     assert calibration.verdict.startswith(
         "Good: 13 views differ, cover 56 % of the image and are tilted by up to 41 deg"
     )
+    assert "focal lengths and principal point are known to 0.2 % of the focal length" in calibration.verdict
     assert "Better still: the board in the top left and bottom left of the image" in calibration.verdict
     assert calibration.summary().splitlines()[-1] == calibration.verdict
     assert "top right" in dp.calibrate(dp.example_views("right"), BOARD).verdict
@@ -75,6 +77,54 @@ def test_what_is_no_calibration(calibration: dp.Calibration) -> None:
         _ = both.verdict
 
 
-def test_a_file_keeps_it(calibration: dp.Calibration, tmp_path: Path) -> None:
+@pytest.mark.parametrize("model", ["brown5", "none"])
+def test_a_file_keeps_it(model: LensModel, tmp_path: Path) -> None:
+    """With what its remarks say, of a lens that does not fit."""
+    calibration = dp.calibrate(LEFT, BOARD, model)
     dp.save_camera(tmp_path / "camera.json", calibration)
-    assert dp.load_calibration(tmp_path / "camera.json").verdict == calibration.verdict
+    found = dp.load_calibration(tmp_path / "camera.json")
+    assert (found.verdict, found.remarks) == (calibration.verdict, calibration.remarks)
+
+
+def test_of_a_file_that_has_remarks_alone_these_are_read(calibration: dp.Calibration) -> None:
+    fields = calibration.to_fields()
+    del fields["findings"]
+    assert dp.Calibration.from_fields(fields, calibration.camera).remarks == calibration.remarks != ("",)
+    with pytest.raises(ValueError, match="remarks: want 1, one for each camera, got 2"):
+        dp.Calibration.from_fields(fields | {"remarks": ["a", "b"]}, calibration.camera)
+
+
+@pytest.mark.parametrize(
+    ("kind", "next_"),
+    [
+        ("other lens", "Next: first the lens model that the remark on the residuals names; "),
+        ("skew", "Next: first the skew that the remark on the residuals names; "),
+        ("two cameras", "Next: first another look at the views that the remark names"),
+        ("contradiction", "Next: the board in the top left"),
+    ],
+)
+def test_advice_goes_by_what_a_remark_says_and_not_by_its_words(
+    calibration: dp.Calibration, kind: str, next_: str
+) -> None:
+    remark = {"camera": 0, "kind": kind, "sentence": "in other words", "reason": "it is so"}
+    found = dp.Calibration.from_fields(calibration.to_fields() | {"findings": [remark]}, calibration.camera)
+    assert found.remarks == ("in other words",)
+    assert found.verdict.startswith(f"Weak: it is so. {next_}")
+
+
+def test_words_alone_give_no_advice(calibration: dp.Calibration) -> None:
+    words = "as through another lens, 3 times what want another camera than"
+    remark = {"camera": 0, "kind": "other", "sentence": words, "reason": ""}
+    found = dp.Calibration.from_fields(calibration.to_fields() | {"findings": [remark]}, calibration.camera)
+    assert found.verdict == calibration.verdict
+
+
+def test_a_k_with_skew_is_named() -> None:
+    cameras = dp.calibrate(LEFT, BOARD).cameras
+    K = cameras.K.clone()
+    K[..., 0, 1] = 30.0
+    pixels, _ = dp.Camera(K, cameras.R, cameras.t, cameras.distortion).project(BOARD.points)
+    views = dp.Views(pixels + 0.1 * torch.randn(pixels.shape, dtype=D), size=LEFT.size)
+    verdict = dp.calibrate(views, BOARD).verdict
+    assert "a K without skew does not fit the camera. Next: first the skew that the remark on the res" in verdict
+    assert dp.calibrate(views, BOARD, skew=True).verdict.startswith("Good")

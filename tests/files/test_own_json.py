@@ -52,6 +52,17 @@ DAMAGE = [
     ("calibration/pixels/0/0/0", float("nan"), "pixels: want finite numbers"),
     ("calibration/pixels/0/0/0", "300", "pixels: want numbers"),
     ("calibration/names", ["a"], "names: want 4"),
+    (
+        "calibration/findings",
+        [{"camera": 4, "kind": "skew", "sentence": "", "reason": ""}],
+        "findings: want camera, kind",
+    ),
+    ("calibration/findings", [{"camera": 0, "kind": "s", "sentence": "", "reason": ""}], "findings: want camera, kind"),
+    (
+        "calibration/findings",
+        [{"camera": 0, "kind": "skew", "sentence": 1, "reason": ""}],
+        "findings: want a list of te",
+    ),
     ("calibration/names/0", 7, "names: want a list of texts"),
     ("calibration/points/0", [0.0, 0.0], "points: want"),
     ("calibration/R/0/0/0", 0.5, "R: want rotation matrices"),
@@ -111,7 +122,7 @@ def test_a_gap_in_the_covariance_is_no_error_bar_of_zero(tmp_path: Path, documen
 
 def test_version_1_is_read(tmp_path: Path, calibration: dp.Calibration, document: dict[str, Any]) -> None:
     old = json.loads(json.dumps(document | {"version": 1}))
-    for key in ("remarks", "other_poses", "shares", "degrees_of_freedom", "lens_region", "skew"):
+    for key in ("remarks", "findings", "other_poses", "shares", "degrees_of_freedom", "lens_region", "skew"):
         del old["calibration"][key]
     del old["calibration"]["covariance"]["dispersion"]
     (tmp_path / "old.json").write_text(json.dumps(old))

@@ -191,8 +191,8 @@ def tried(call: Any, spoilt_ones: dict[str, Any]) -> str | None:
     def stop(_: int, __: FrameType | None) -> None:
         raise HangError
 
-    previous = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(SECONDS)
+    previous = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -202,8 +202,8 @@ def tried(call: Any, spoilt_ones: dict[str, Any]) -> str | None:
     except Exception as error:
         return _about(error, call, spoilt_ones)
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, previous)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, previous)
     if any(x._version != versions[id(x)] for x in given.values() if id(x) in versions):
         return "writes to its argument"
     return unsound(answer)

@@ -79,3 +79,14 @@ def test_hand_picked_lengths_are_covered() -> None:
 
     assert 0.93 < covered(0.5) < 0.97
     assert covered("detector") < 0.5
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.5, 3.0])
+def test_deviations_and_covariances_of_pixels_say_the_same(calibration: dp.Calibration, sigma: float) -> None:
+    each = torch.full((2, 2), sigma, dtype=D)
+    spread = [
+        dp.measure(CLICKS, calibration, Z, view=0, pixel_sigma=given).covariance
+        for given in (sigma, each, torch.diag_embed(each.square()))
+    ]
+    for found in spread[1:]:
+        torch.testing.assert_close(found, spread[0], rtol=1e-12, atol=0)

@@ -378,3 +378,20 @@ def test_joint_covariance_of_many_is_that_of_each(calibration: dp.Calibration) -
     for each in range(2):
         alone = dp.measure(pixels[each], calibration, Z, view=0, pixel_sigma=0.5)
         torch.testing.assert_close(together.joint()[each], alone.joint(), rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("far", [1e100, 1e200, 1e300, 1e308])
+@pytest.mark.parametrize("lens", ["none", "brown5"])
+def test_a_pixel_out_of_all_bounds_leaves_the_others_as_they_are(far: float, lens: str) -> None:
+    """Its own errors are infinite, where it has a ray, and never NaN."""
+    calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard(), lens)  # type: ignore[arg-type]
+    pixels = torch.tensor([[far, 60.0], [100.0, 80.0], [-far, far]], dtype=D)
+    options = {"view": 0, "pixel_sigma": 0.1, "plane_covariance": 1e-6 * torch.eye(4, dtype=D)}
+    leaf = pixels.clone().requires_grad_()
+    found, alone = (dp.measure(p, calibration, Z, **options) for p in (leaf, pixels[1:2]))
+    torch.testing.assert_close(found.deviations[1], alone.deviations[0], rtol=1e-12, atol=0)
+    told = torch.where(found.valid.unsqueeze(-1), found.deviations, 0.0)
+    assert not bool(told.isnan().any())
+    assert bool((told[[0, 2], :2].amax(-1) > 1e60)[found.valid[[0, 2]]].all())
+    (gradient,) = torch.autograd.grad(found.deviations[1].sum(), leaf)
+    assert bool(gradient.isfinite().all())

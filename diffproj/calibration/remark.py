@@ -1,0 +1,49 @@
+"""`Remark`: a sentence on a calibration together with what it says, for the advice that depends on it."""
+
+from collections.abc import Iterable
+from enum import StrEnum
+from typing import NamedTuple
+
+
+class Kind(StrEnum):
+    """What a remark says, as far as a verdict depends on it."""
+
+    OTHER = "other"
+    OTHER_LENS = "other lens"
+    """The residuals are those of another lens."""
+    SKEW = "skew"
+    """The residuals are those of a K with skew, which was held."""
+    TWO_CAMERAS = "two cameras"
+    """The views fall into two groups that want different cameras."""
+    UNEVEN_PRINT = "uneven print"
+    """The board was printed wider than high, or slanted."""
+    BENT = "bent board"
+    """The board is bent."""
+    CONTRADICTION = "contradiction"
+    """The residuals contradict the deviations that were given."""
+
+
+class Remark(NamedTuple):
+    """A remark on one camera.
+
+    Attributes:
+        sentence: what people read.
+        kind: what it says.
+        reason: the same in a few words, as a reason for a verdict; empty where a verdict does not depend on it.
+    """
+
+    sentence: str
+    kind: Kind = Kind.OTHER
+    reason: str = ""
+
+
+OF_THE_CAMERA = (Kind.OTHER_LENS, Kind.SKEW)
+"""Those that another model of the camera is a remedy for."""
+
+Remarks = tuple[Remark, ...]
+"""Those on one camera."""
+
+
+def text_of(remarks: Iterable[Remark]) -> str:
+    """All of them in one text; empty where there are none."""
+    return "; ".join(remark.sentence for remark in remarks)
