@@ -21,7 +21,6 @@ from diffproj.calibration.adequacy import (
     poses_only,
     wants_skew,
 )
-from diffproj.calibration.advice import TWO_CAMERAS
 from diffproj.calibration.entangled import Entangled, Simpler
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.leftover import Leftover, leftover

@@ -136,13 +136,8 @@ class MapViews:
                     in_camera = torch.cat([(K[..., :2, :2] * b[..., :2, None]).sum(-2), b[..., 2:]], dim=-1)
                     # By the inverse of R, times its determinant: R is a rotation to the rounding of float32 at best.
                     first, second, third = R.unbind(-2)
-                    turned = (
-                        torch.cross(second, third, -1),
-                        torch.cross(third, first, -1),
-                        torch.cross(first, second, -1),
-                    )
-                    x, y, z = in_camera.unsqueeze(-2).unbind(-1)
-                    normal = x * turned[0] + y * turned[1] + z * turned[2]
+                    across = [torch.linalg.cross(a, b) for a, b in ((second, third), (third, first), (first, second))]
+                    normal = (torch.stack(across, dim=-2) * in_camera.unsqueeze(-1)).sum(-2)
                     aside = normal[..., :2].abs().amax(-1) > 1e3 * rounding(self.matrix.dtype) * normal[..., 2].abs()
                 if bool(aside.any()):
                     raise ValueError("axes: want those of plane_axes(plane) for a plane that is not level, got None")

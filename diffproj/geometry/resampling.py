@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from diffproj._core.numerics import block_points
+from diffproj._core.torch_private import has_no_values
 from diffproj.geometry.grid import pixel_grid
 
 LookUp = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
@@ -54,6 +55,8 @@ def resampled(
     if samples is not None:
         total, share = _mean(source, look_up_of(None), corners, samples)
         return (total, share > 0) if samples == (1, 1) else _finished(total, share)
+    if has_no_values(like) or has_no_values(source):
+        raise ValueError("samples: want how many a pixel takes, got None where no values say it; samples=1 is fastest")
     with torch.no_grad():
         u, v, valid = look_up_of(None)(*_apart(corners + 0.5))
         if 0 in (*source.shape[:-3], *valid.shape[:-1], *u.shape[:-1]):  # of no images

@@ -120,16 +120,22 @@ class FixedMap(GeometryModule):
         if torch.compiler.is_compiling():
             return False
         buffers, made = self._buffers, self._made
-        if all(_is_as_marked(buffers[name], made[name]) for name in made_from):
+        for name in made_from:  # asked in each call
+            tensor, version = made[name]
+            if buffers[name] is not tensor or (version >= 0 and tensor._version != version):
+                break
+        else:
             return False
-        written = all(id(buffers[name]) == made[name][0] for name in (*made_from, result))
-        if not _is_as_marked(buffers[result], made[result]):  # all of it, as by DistributedDataParallel
+        written = all(buffers[name] is made[name][0] for name in (*made_from, result))
+        tensor, version = made[result]
+        if buffers[result] is not tensor or (
+            version >= 0 and tensor._version != version
+        ):  # all of it, as by DistributedDataParallel
             if written:
                 self._mark_all()
             return False
         if not written:
             return True
-        self._mark_all()
         self.rebuild()
         return False
 
@@ -148,7 +154,8 @@ class FixedMap(GeometryModule):
 
     def __getstate__(self) -> dict[str, Any]:
         self._is_outdated(OF_MATRIX, "matrix")  # built again here, for the marks are not those of a copy
-        return self.__dict__.copy()
+        self._current_lens()
+        return self.__dict__ | {"_made": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
@@ -173,16 +180,12 @@ OF_MATRIX = ("K", "R", "t", "normal", "offset")
 PLAN = tuple(Plan.__annotations__)
 """The names of the parts of a plan."""
 
-_Mark = tuple[int, int]
+_Mark = tuple[Tensor, int]
 
 
 def _mark(tensor: Tensor) -> _Mark:
-    """Which tensor it is, and how often it was written to, as far as that is known."""
-    return id(tensor), 0 if tensor.is_inference() else tensor._version
-
-
-def _is_as_marked(tensor: Tensor | None, mark: _Mark) -> bool:
-    return tensor is not None and id(tensor) == mark[0] and _mark(tensor)[1] == mark[1]
+    """Which tensor it is, and how often it was written to; -1 of one whose writes PyTorch does not count."""
+    return tensor, -1 if tensor.is_inference() else tensor._version
 
 
 def _rebuild(fixed: FixedMap, _: Any) -> None:

@@ -10,7 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.arguments import first_of
-from diffproj._core.numerics import broadcast_batches
+from diffproj._core.numerics import broadcast_batches, has_values
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane
@@ -71,7 +71,7 @@ def plane_residuals(
         (True, True)
     """
     camera, points = _posed(camera, views, target)
-    if not points.is_meta and bool((off := points.detach()[:, 2] != 0).any()):
+    if has_values(points) and bool((off := points.detach()[:, 2] != 0).any()):
         got = first_of(points, off)
         raise ValueError(f"target: want points on z = 0, got {got}; image_residuals takes them wherever they are")
     return put_back_minus_known(camera, points.to(camera.K), views.pixels.to(camera.K), views.visible)

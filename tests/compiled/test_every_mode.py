@@ -20,6 +20,10 @@ LEARNED = dp.PlaneProjector(CAMERA, PLANE, ("focal", "distortion", "pose", "plan
 BANK = dp.PlaneProjector(dp.stack([CAMERA, CAMERA.shifted([5.0, 0, 0])]), PLANE)
 FISHEYE = dp.Camera(K, R, CAMERA.t, dp.KannalaBrandt(torch.tensor([0.05, -0.01, 0.002, 0.0])), (640, 480))
 LENSES = dp.ProjectorBank([CAMERA, FISHEYE], PLANE)
+PINHOLE = dp.Camera(K, R, CAMERA.t, size=(640, 480))
+BOARD = dp.Landmarks(torch.rand(6, 3, generator=torch.Generator().manual_seed(3)) * torch.tensor([100.0, 100, 0]))
+VIEWS = dp.Views(torch.rand(2, 6, 2, generator=torch.Generator().manual_seed(2)) * torch.tensor([640.0, 480]))
+RIG = dp.LearnableRig({"left": CAMERA, "right": FISHEYE.shifted([5.0, 0, 0])})
 EXTENT = (-100.0, -100.0, 100.0, 100.0)
 EXTENTS = torch.tensor([[-100.0, -100, 100, 100], [-50, 0, 150, 90]])
 
@@ -29,6 +33,24 @@ Map = Callable[[Tensor], tuple[Tensor, ...]]
 def lost(pixels: Tensor) -> tuple[Tensor, ...]:
     points, valid = FROZEN(pixels)
     return (dp.PlaneLoss(dp.Huber(5.0), pull=1.0)(points, 0 * points, valid, miss=FROZEN.miss(pixels)),)
+
+
+def moved(points: Tensor, camera: dp.Camera = CAMERA) -> dp.Camera:
+    """Two cameras that stand elsewhere."""
+    return camera.shifted(points[..., 0, :])
+
+
+def turned(points: Tensor) -> Tensor:
+    """Two rotations."""
+    return dp.rotation_from_euler(*(points[..., 0, :] / 200).unbind(-1))
+
+
+def extrinsics(points: Tensor) -> Tensor:
+    return torch.cat([turned(points), points[..., :1, :].mT], dim=-1)
+
+
+def parts(*cameras: dp.Camera) -> tuple[Tensor, ...]:
+    return tuple(tensor for camera in cameras for tensor in (camera.R, camera.t, camera.K))
 
 
 MAPS: dict[str, tuple[str, Map]] = {
@@ -57,6 +79,39 @@ MAPS: dict[str, tuple[str, Map]] = {
     "map's resolution": ("pixels", lambda x: TO_PLANE.resolution(x)),
     "with reach": ("pixels", lambda x: TO_PLANE.with_reach(x)),
     "in image": ("pixels", lambda x: (CAMERA.in_image(x),)),
+    "image residuals": ("points", lambda x: dp.image_residuals(moved(x), VIEWS, BOARD)),
+    "plane residuals": ("points", lambda x: dp.plane_residuals(moved(x), VIEWS, BOARD)),
+    "homography": (
+        "points",
+        lambda x: (dp.PlaneMap(moved(x, PINHOLE), PLANE).homography(dp.plane_axes(PLANE.like(K))),),
+    ),
+    "shifted": ("points", lambda x: parts(moved(x))),
+    "at": ("points", lambda x: parts(CAMERA.at(turned(x), x[..., 1, :]))),
+    "from extrinsics": ("points", lambda x: parts(dp.Camera.from_extrinsics(extrinsics(x), K, "opengl", "world"))),
+    "from matrix": (
+        "points",
+        lambda x: parts(dp.Camera.from_matrix((K[..., None] * extrinsics(x)[:, None]).sum(-2), (640, 480))),
+    ),
+    "to extrinsics": ("points", lambda x: (moved(x).world_to_cam("opengl"), moved(x).cam_to_world("pytorch3d"))),
+    "warped": (
+        "pixels",
+        lambda x: parts(CAMERA.warped(torch.eye(3) + 1e-3 * torch.nn.functional.pad(x[:, :2], (0, 1, 0, 1)))),
+    ),
+    "resized": ("points", lambda x: parts(moved(x).resized((320, 240)), moved(x).cropped(9, 9, 99, 99))),
+    "upright": ("points", lambda x: parts(moved(x).upright())),
+    "center": ("points", lambda x: (moved(x).center,)),
+    "looking at": (
+        "points",
+        lambda x: parts(dp.Camera.looking_at(x[..., 0, :] + 9.0, -x[..., 1, :], focal=500.0, size=(640, 480))),
+    ),
+    "mounting": ("points", lambda x: tuple(moved(x).mounting()[:3])),
+    "euler angles": ("points", lambda x: dp.euler_from_rotation(turned(x))),
+    "plane through points": (
+        "points",
+        lambda x: (dp.Plane.from_points(x).normal, *dp.plane_axes(dp.Plane.from_points(x))),
+    ),
+    "learned rig": ("points", lambda x: tuple(RIG()[name].project(x)[0] for name in RIG)),
+    "bank's miss": ("pixels", lambda x: (LENSES.miss(x, camera=torch.tensor([1, 0])),)),
     "rectify by extents": ("image", lambda x: dp.rectify(x, SMALL, PLANE, EXTENTS, size=(20, 16), samples=1)),
     "rectify": ("image", lambda x: dp.rectify(x, SMALL, PLANE, EXTENT, 10.0, samples=1)),
     "render": ("image", lambda x: dp.render(x, SMALL, PLANE, EXTENT, size=(16, 12), samples=2)),

@@ -584,7 +584,14 @@ def _uses(t: Things) -> dict[str, Call]:
         "ProjectorBank": Call(
             dp.ProjectorBank, {"cameras": [c, dp.Camera(t.K, c.R, c.t)], "plane": n, "learn": ("focal",)}
         ),
-        "ProjectorBank()": Call(dp.ProjectorBank([c, c], n), {"pixels": p.expand(2, *p.shape), "camera": [0, 1]}),
+        "ProjectorBank()": Call(
+            dp.ProjectorBank([c, c], n),
+            {"pixels": p.expand(2, *p.shape), "camera": [0, 1], "warp": torch.eye(3, dtype=D), "plane": n},
+        ),
+        "ProjectorBank.miss": Call(
+            dp.ProjectorBank([c, c], n).miss,
+            {"pixels": p.expand(2, *p.shape), "camera": [0, 1], "warp": torch.eye(3, dtype=D), "plane": n},
+        ),
         "PlaneProjector.miss": Call(projector.miss, {"pixels": p, "warp": torch.eye(3, dtype=D), "plane": n}),
         "PlaneProjector() learned": Call(dp.PlaneProjector(c, n, learn="focal"), {"pixels": p}),
         "FixedMap": Call(FixedMap, {"camera": c, "plane": n}),

@@ -96,6 +96,11 @@ def test_the_homography_is_the_map(camera: dp.Camera, pixels: torch.Tensor) -> N
         assert torch.equal(w > 0, valid)
     with pytest.raises(ValueError, match="axes: want those of plane_axes"):
         dp.PlaneMap(camera, tilted).homography()
+    rounded = camera.to(torch.float32).to(D)  # its R is a rotation to 1e-7, and level is level
+    H = dp.PlaneMap(rounded, dp.Plane.z(7.0)).homography()
+    s, t, w = H @ torch.nn.functional.pad(pixels, (0, 1), value=1.0).T
+    points, _ = dp.back_project(pixels, rounded, dp.Plane.z(7.0))
+    torch.testing.assert_close(torch.stack([s / w, t / w], dim=-1), points[:, :2], rtol=1e-10, atol=1e-8)
 
 
 def test_cv2_and_kornia_warp_by_it_as_rectify_does(camera: dp.Camera) -> None:

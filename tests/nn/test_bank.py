@@ -114,6 +114,16 @@ def test_a_bank_of_different_lenses(cameras: dp.Camera, pixels: torch.Tensor) ->
         want, seen = dp.back_project(samples[i], several[c], dp.Plane.z(2.0))
         torch.testing.assert_close(points[i], want, rtol=1e-10, atol=1e-8)
         assert torch.equal(valid[i], seen)
+    warps = torch.eye(3, dtype=D).repeat(5, 1, 1)
+    warps[:, 0, 2] = torch.arange(5.0)
+    for warp, plane in ((warps, None), (warps[1], dp.Plane.z(1.0)), (None, dp.Plane.z(torch.arange(5.0, dtype=D)))):
+        moved, seen = bank(samples, chosen, warp=warp, plane=plane)
+        missed = bank.miss(samples, chosen, warp=warp, plane=plane)
+        for i, c in enumerate(chosen):
+            one = several[c] if warp is None else several[c].warped(warp if warp.ndim == 2 else warp[i])
+            own = dp.Plane.z(2.0) if plane is None else plane[i] if plane.batch_shape else plane
+            torch.testing.assert_close(moved[i], dp.back_project(samples[i], one, own)[0], rtol=1e-10, atol=1e-8)
+        assert torch.equal(missed > 0, ~seen)
     points.sum().backward()
     assert all(parameter.grad.isfinite().all() for parameter in bank.parameters())
     again = dp.ProjectorBank(several, dp.Plane.z(0.0), ("focal", "distortion"))
@@ -123,6 +133,9 @@ def test_a_bank_of_different_lenses(cameras: dp.Camera, pixels: torch.Tensor) ->
         dp.ProjectorBank([cameras], dp.Plane.z(0.0))
     with pytest.raises(ValueError, match="camera: want numbers from 0 to 3"):
         bank(samples, camera=[0, 1, 2, 3, 4])
+    none = torch.rand(0, 10, 2, dtype=D)
+    assert bank(none, camera=[])[0].shape == (0, 10, 3)
+    assert bank.miss(none, camera=[]).shape == (0, 10)
 
 
 class Samples(torch.utils.data.Dataset):

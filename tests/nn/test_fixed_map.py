@@ -160,6 +160,44 @@ def test_a_functional_call_takes_the_state_as_it_is_given(
         assert torch.equal(mine(pixels)[0], before)
 
 
+@pytest.mark.parametrize("part", ["K", "t", "offset", "coefficients"])
+def test_a_part_that_is_swapped_or_written_alone_is_the_maps(
+    part: str, lens_camera: dp.Camera, pixels: torch.Tensor, plane: dp.Plane
+) -> None:
+    mine, factor = dp.PlaneProjector(lens_camera, plane), 0.9
+    before, value = mine(pixels)[0], getattr(mine.geometry, part).clone().requires_grad_()
+
+    def other(value: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        parts = {name: getattr(mine.geometry, name) for name in ("K", "t", "coefficients", "normal", "offset")}
+        parts[part] = value * factor if part != "K" else value * torch.tensor([[factor], [1.0], [1.0]], dtype=D)
+        lens = dp.BrownConrady(parts["coefficients"])
+        camera = dp.Camera(parts["K"], lens_camera.R, parts["t"], lens, lens_camera.size)
+        return dp.back_project(pixels, camera, dp.Plane(parts["normal"], parts["offset"]))[0], parts[part]
+
+    want, changed = other(value)
+    assert (want - before).abs().max() > 1e-2
+    swapped, _ = torch.func.functional_call(mine, {f"geometry.{part}": changed}, (pixels,))
+    torch.testing.assert_close(swapped, want, rtol=1e-12, atol=1e-10)
+    ours, right = (torch.autograd.grad(points.sum(), value, retain_graph=True)[0] for points in (swapped, want))
+    torch.testing.assert_close(ours, right, rtol=1e-9, atol=1e-9)
+    assert torch.equal(mine(pixels)[0], before)  # as before the call
+    with torch.no_grad():
+        getattr(mine.geometry, part).copy_(changed)
+    copied = copy.deepcopy(mine)
+    for projector in (copied, mine, mine):
+        torch.testing.assert_close(projector(pixels)[0], want, rtol=1e-12, atol=1e-10)
+
+
+def test_written_as_a_whole_and_then_in_part(lens_camera: dp.Camera, pixels: torch.Tensor, plane: dp.Plane) -> None:
+    mine, theirs = dp.PlaneProjector(lens_camera, plane), dp.PlaneProjector(lens_camera.shifted([0.0, 0, 9]), plane)
+    written(mine, theirs)
+    assert torch.equal(mine(pixels)[0], theirs(pixels)[0])
+    with torch.no_grad():
+        mine.geometry.t.mul_(2)
+    far = lens_camera.at(lens_camera.R, mine.geometry.t)
+    torch.testing.assert_close(mine(pixels)[0], dp.back_project(pixels, far, plane)[0], rtol=1e-12, atol=1e-10)
+
+
 @pytest.mark.parametrize("behind_lens", [False, True])
 def test_the_map_is_built_again_in_the_precision_that_it_moves_to(
     behind_lens: bool, camera: dp.Camera, lens_camera: dp.Camera, pixels: torch.Tensor, plane: dp.Plane
