@@ -90,7 +90,7 @@ def remarks(
     which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
     if len(which):
         left, groups = leftover(found, which, SIGNIFICANT), two_groups(found, which)
-        for i, p in enumerate(which.tolist()):
+        for i, p in enumerate(map(int, which.tolist())):
             saved = groups[p].saved if p in groups else 0.0
             if not of_landmarks and _uneven_print(task, left, i, p, saved):
                 said[p].append(_of_the_print(left, i))
@@ -189,7 +189,9 @@ def _left_over(task: Task, left: Leftover, i: int, p: int, sigma: float) -> Rema
     if int(task.used[p].any(-1).sum()) >= SHAPE_VIEWS and counts(left.shape, i, SHAPE_SHARE):
         if counts(left.bow, i, BOW_PART * float(left.shape.share[i])):
             return Remark(
-                "the residuals repeat on the board, as if it were bent: take shape='bow'", Kind.BENT, "the board is bent"
+                "the residuals repeat on the board, as if it were bent: take shape='bow'",
+                Kind.BENT,
+                "the board is bent",
             )
         return Remark(
             f"the residuals repeat on the board, whose corners lie {float(left.moved[i]):.2g} world units (RMS) "
