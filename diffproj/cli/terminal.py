@@ -44,6 +44,7 @@ WORDS = (
     (r"\bformat='", "--to '"),
     (r"\bpixel_sigma=", "--pixel-sigma "),
     (r"\bskew=True", "--skew"),
+    (r"\breject_outliers=True with pixel_sigma", "--reject-outliers with --pixel-sigma"),
     (r"\breject_outliers=True", "--reject-outliers"),
     (r"give legacy=True", "give --legacy"),
     (r"give legacy=False", "leave --legacy out"),
