@@ -234,7 +234,8 @@ def test_wrong_arguments_are_named() -> None:
     ):
         dp.LearnableRig(given | {"items": given["items"].to(torch.float32)})
     with pytest.raises(
-        ValueError, match="learn: want parts of focal, .* or one camera's, as items.pose, got 'rear.pose'"
+        ValueError,
+        match="learn: want parts of focal, .* or one of the rig's cameras and its part, as items.pose, got 'rear.pose'",
     ):
         dp.LearnableRig(given, ("rear.pose",))
     with pytest.raises(ValueError, match=r"learn: want 'moments' for a rig that is given moments=\(R, t\), got none"):
