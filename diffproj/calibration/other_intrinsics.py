@@ -25,8 +25,10 @@ SHARE_TOGETHER, PX_TOGETHER, VIEWS_TOGETHER = 0.65, 0.15, 3
 SHARE_ALONE, PX_ALONE = 0.8, 0.4
 """Part of the sum of squares, and pixels of a coordinate (RMS), that other intrinsics must explain: of all views
 together, from three on, and of one alone, where a board that is not flat looks much the same."""
-RARE = 3.09
-"""Standard deviations that a normal variable exceeds by chance in 0.1 % of all cases."""
+RARE = 3.72
+"""Standard deviations that a normal variable exceeds by chance in 0.01 % of all cases."""
+FEWEST_LEFT = 3
+"""Degrees of freedom that other intrinsics must leave: with fewer, as of six landmarks, not much could be told."""
 SINGULAR = 1e-7
 """Eigenvalue of the normal matrix, relative to the largest, below which nothing is told in this direction."""
 PARAMETERS_OF_K = 4
@@ -82,7 +84,7 @@ class _Explained:
         """Whether that is no chance, and as much as that."""
         rank, left = self.rank.clamp(min=1), self.left.clamp(min=1)
         rare = f_deviations(self.share / rank / ((1 - self.share) / left), rank, left) > RARE
-        return rare & (self.left > 0) & (self.share > share) & (self.px > px)
+        return rare & (self.left >= FEWEST_LEFT) & (self.share > share) & (self.px > px)
 
 
 def _weighted(found: Fit) -> Tensor:
