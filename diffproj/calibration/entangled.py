@@ -13,8 +13,8 @@ to the other, the mean square of the error of the parameters that were kept is
 
 if the simpler camera is the right one, and no more if it is not.
 
-Of a fisheye that sees little of its field, and so hardly knows its principal point, the later terms of the lens are
-asked about in the same way.
+Of a camera that hardly knows its principal point, as through a long lens, the lens itself is asked about likewise:
+terms that stand for noise bend the image about any point that suits them, and seem to know it well.
 """
 
 from dataclasses import dataclass, replace
@@ -41,8 +41,13 @@ DENOMINATOR = ("k4", "k5", "k6")
 LATE = ("k2", "k3", "k4")
 """The terms of a fisheye that little of the image tells of, so that seen through a long lens they stand for noise."""
 ADRIFT = 0.05
-"""Deviation of the principal point, relative to how far corners are spread in the image, from which on these are
+"""Deviation of the principal point, relative to how far corners are spread in the image, from which on the lens is
 doubted."""
+LONG = 12.0
+"""Focal length, relative to that spread, from which on it is doubted too, however well the point seems to be known."""
+ALIKE = 1.05
+"""Times the residuals that those through a simpler lens may be at most, to fit about as well. (Of few views that err
+together, the corners could seem not to notice any.)"""
 FAR = 2.0
 """Deviations of an intrinsic parameter beyond which its error bar does not cover another value."""
 
@@ -83,20 +88,19 @@ class Entangled:
     @cached_property
     def simpler(self) -> dict[int, Simpler]:
         """The simplest camera that the corners fit about as well, by the number of the camera, where it is another."""
-        groups, free = _free_groups(self.found), _free(self.found)
-        fisheye = not MODELS[self.found.task.lens].perspective
-        late = tuple(name for name in LATE if fisheye and name in free)
-        if not groups and not late:
+        groups, lenses = _together(_free_groups(self.found)), _poorer_lenses(self.found)
+        if not groups and not lenses:
             return {}
         told: dict[int, Simpler] = {}
         with torch.no_grad():
             sound = (self.status == Status.CONVERGED) & (self.found.pixel_sigma() > EXACT_PX)
-            if late:
-                which = (sound & _adrift(self.found)).nonzero().flatten()
-                told |= _simpler(self.found.part(which), which.tolist(), [late]) if len(which) else {}
             which = sound.nonzero().flatten()
             if groups and len(which):
                 told |= _simpler(self.found.part(which), which.tolist(), groups)
+            if lenses:
+                sound[list(told)] = False
+                which = (sound & _adrift(self.found)).nonzero().flatten()
+                told |= _simpler(self.found.part(which), which.tolist(), lenses, True) if len(which) else {}
         return told
 
     @cached_property
@@ -129,34 +133,41 @@ class Entangled:
         return replace(covariance, shared=covariance.shared + step.unsqueeze(-1) * step.unsqueeze(-2))
 
 
-def _simpler(found: Fit, numbers: list[int], groups: list[tuple[str, ...]]) -> dict[int, Simpler]:
+def _simpler(found: Fit, numbers: list[int], choices: list[tuple[str, ...]], every: bool = False) -> dict[int, Simpler]:
+    """The first of some choices of what is held that the corners hardly notice, where the camera is another one then.
+
+    With `every`, the first of all choices with which it is another one.
+    """
     told: dict[int, Simpler] = {}
     deviations = covariance_of(found).shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, : len(INTRINSICS)]
     left = torch.arange(len(numbers), device=deviations.device)
-    for held in _together(groups):
+    for held in choices:
         whole = found.part(left)
         without = _without(whole, held)
         same = (without.solution.status == Status.CONVERGED) & (_noticed(whole, without, held) < SIGNIFICANT)
+        if every:
+            same &= without.solution.cost <= ALIKE**2 * whole.solution.cost
         step = without.solution.shared - whole.solution.shared
         off = step[:, : len(INTRINSICS)].abs() / deviations[left]
         off = torch.where(deviations[left] > 0, off, 0.0)
         growth = (without.solution.cost / whole.solution.cost).sqrt() - 1
-        for i in (same & (off.amax(-1) > FAR)).nonzero().flatten().tolist():
+        other = same & (off.amax(-1) > FAR)
+        for i in other.nonzero().flatten().tolist():
             k = int(off[i].argmax())
             here, there = (float(fitted.solution.shared[i, k]) for fitted in (whole, without))
             told[numbers[int(left[i])]] = Simpler(held, INTRINSICS[k], here, there, float(growth[i]), step[i])
-        left = left[~same]
+        left = left[~(other if every else same)]
         if len(left) == 0:
             break
     return told
 
 
 def _adrift(found: Fit) -> Tensor:
-    """Which cameras hardly know their principal point `(P,)`."""
+    """Which cameras hardly know their principal point, or have so long a lens that they may only seem to `(P,)`."""
     seen = torch.where(found.task.used.unsqueeze(-1), found.task.pixels, torch.nan).flatten(1, 2)
     spread = (seen - seen.nanmean(1, keepdim=True)).square().nanmean(1).sqrt()
     deviations = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, 2:4].sqrt()
-    return (deviations > ADRIFT * spread).any(-1)
+    return (deviations > ADRIFT * spread).any(-1) | (found.solution.shared[:, :2].abs() > LONG * spread).any(-1)
 
 
 def _free(found: Fit) -> list[str]:
@@ -175,6 +186,19 @@ def _free_groups(found: Fit) -> list[tuple[str, ...]]:
     free = _free(found)
     groups = [tuple(name for name in group if name in free) for group in ONE_SIDED]
     return [group for group in groups if group]
+
+
+def _poorer_lenses(found: Fit) -> list[tuple[str, ...]]:
+    """What to hold for a lens with ever more terms, from none on."""
+    free, task = _free(found), found.task
+    terms = tuple(name for name in task.parameters.coefficient_names if name in free)
+    if not MODELS[task.lens].perspective:
+        choices = [terms, tuple(name for name in terms if name in LATE)]
+    else:
+        radial = tuple(name for name in terms if name[0] == "k" and name != "k1")
+        shifts = tuple(name for name in terms if name in ("p1", "p2"))
+        choices = [terms, tuple(name for name in terms if name != "k1"), radial, shifts]
+    return list(dict.fromkeys(filter(None, choices)))
 
 
 def _together(groups: list[tuple[str, ...]]) -> list[tuple[str, ...]]:

@@ -4,7 +4,8 @@ From one start in closed form the solver may end in a side valley: a focal lengt
 lens that stands for what the poses should explain. A camera is looked at again where its first minimum is doubtful:
 
 * the solver did not converge, or took many steps, as it does in narrow valleys, or
-* where outliers were rejected, neighbouring corners are off in the same direction, as noise is not.
+* where outliers were rejected, neighbouring corners are off in the same direction, as noise is not, or
+* a view fits far worse than the others, as one does that is turned over where a long lens bends to the rest.
 
 Then starts compete. The best focal lengths of a grid (`focal_grid`), with and without the lens's first estimate, are
 solved side by side, and what ends lowest is kept, or what is reached from it with the principal point on another side
@@ -29,12 +30,15 @@ from diffproj.calibration.solver import Status
 from diffproj.calibration.start import Straightened
 from diffproj.calibration.task import Task
 from diffproj.calibration.turned_views import choices
-from diffproj.calibration.two_poses import replaced
+from diffproj.calibration.two_poses import mean_squares, replaced
 from diffproj.lens.models import MODELS
 
 CORRELATED = 0.65
 """Correlation of the residuals of neighbouring corners from which on they are not noise. (A printed board that is off
 its grid by 0.08 mm gives 0.58 at an RMS of 0.16 px.)"""
+UNEVEN, TELLING = 4.0, 8
+"""Times the median over views that the mean square of the residuals of one must be to fit far worse, and from how many
+corners on that tells."""
 MANY_STEPS = 12
 """Steps of the solver from which on a minimum is looked at again."""
 SHORT_FIT = 40
@@ -56,7 +60,14 @@ def doubtful(found: Fit, steps_tell: bool, long_valley: bool = False) -> Tensor:
     if long_valley:  # along which any start takes many steps, or does not come to an end
         return ~(correlation(found) <= CORRELATED)
     suspicious = solution.iterations > MANY_STEPS if steps_tell else correlation(found) > CORRELATED
-    return suspicious | (solution.status != Status.CONVERGED)
+    return suspicious | _uneven(found) | (solution.status != Status.CONVERGED)
+
+
+def _uneven(found: Fit) -> Tensor:
+    """Which cameras have a view that fits far worse than the others `(P,)`."""
+    squares = mean_squares(found.task, found.solution.equations.c)
+    squares = torch.where(found.task.used.sum(-1) >= TELLING, squares, torch.nan)
+    return (squares > UNEVEN * squares.nanmedian(-1, keepdim=True).values).any(-1)
 
 
 def correlation(found: Fit) -> Tensor:

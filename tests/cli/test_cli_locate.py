@@ -439,7 +439,10 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
             ("few.csv", "--landmarks: want at least 4 with a pixel, got 3 in few.csv"),
             ("line.csv", "line.csv: want points that do not lie on one line"),
             ("alike.csv", "alike.csv: want points that are all distinct, got 6 with 'mast' and 'again' alike"),
-            ("mixed.csv", "mixed.csv: the corners of mixed do not match the landmarks: .* --reject-outliers with --pixel-sigma finds few"),
+            (
+                "mixed.csv",
+                "mixed.csv: the corners of mixed do not match the landmarks: .* --reject-outliers with --pixel-sigma finds few",
+            ),
             ("outside.csv", r"outside.csv: want corners inside the photographs of 3840 x 2160 px, got \(9707"),
             ("degrees.csv", "--landmarks: degrees.csv: points: .* latitude and longitude"),
         )
