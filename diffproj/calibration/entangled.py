@@ -50,6 +50,10 @@ ALIKE = 1.05
 together, the corners could seem not to notice any.)"""
 FAR = 2.0
 """Deviations of an intrinsic parameter beyond which its error bar does not cover another value."""
+TELLING_VIEWS = 3
+"""Views from which on the lens is doubted: fewer do not tell how far corners err together."""
+REAL = 3.5
+"""Deviations of a normal variable from which on a term of the lens is no noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +148,8 @@ def _simpler(found: Fit, numbers: list[int], choices: list[tuple[str, ...]], eve
     for held in choices:
         whole = found.part(left)
         without = _without(whole, held)
-        same = (without.solution.status == Status.CONVERGED) & (_noticed(whole, without, held) < SIGNIFICANT)
+        noticed = _noticed(whole, without, held)
+        same = (without.solution.status == Status.CONVERGED) & (noticed < (REAL if every else SIGNIFICANT))
         if every:
             same &= without.solution.cost <= ALIKE**2 * whole.solution.cost
         step = without.solution.shared - whole.solution.shared
@@ -167,7 +172,8 @@ def _adrift(found: Fit) -> Tensor:
     seen = torch.where(found.task.used.unsqueeze(-1), found.task.pixels, torch.nan).flatten(1, 2)
     spread = (seen - seen.nanmean(1, keepdim=True)).square().nanmean(1).sqrt()
     deviations = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, 2:4].sqrt()
-    return (deviations > ADRIFT * spread).any(-1) | (found.solution.shared[:, :2].abs() > LONG * spread).any(-1)
+    adrift = (deviations > ADRIFT * spread).any(-1) | (found.solution.shared[:, :2].abs() > LONG * spread).any(-1)
+    return adrift & (found.task.used.any(-1).sum(-1) >= TELLING_VIEWS)
 
 
 def _free(found: Fit) -> list[str]:
