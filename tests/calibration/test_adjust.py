@@ -92,11 +92,13 @@ def test_mounted_camera_alone_has_a_covariance() -> None:
         return torch.randn(*shape, dtype=D, generator=random)
 
     many = dp.Camera.mounted(2.18 + 0.02 * noise(20000), 14 + 0.5 * noise(20000), focal=800.0, size=(640, 480))
-    for point in ([0.0, 10, 0], [4.66, 10, 0]):
+    for point in ([0.0, 10, 0], [5.0, 10, 0]):
         pixels = seen(mast, torch.tensor([point], dtype=D))
         measured = dp.measure(pixels, known, GROUND, pixel_sigma=1.0)
         sampled = dp.back_project(pixels + noise(20000, 1, 2), many, GROUND)[0].std(0)
         torch.testing.assert_close(measured.deviations[:, :2], sampled[:, :2], rtol=0.05, atol=0)
+    # 10 m ahead and 5 m aside, as others have sampled it.
+    torch.testing.assert_close(measured.deviations[0, :2], torch.tensor([0.206, 0.442], dtype=D), rtol=0.05, atol=0)
     assert "tilt                 14.0000 ± 0.5000 degrees" in known.summary()
 
 
