@@ -124,10 +124,13 @@ def _batch(camera: Camera, pieces: Sequence[Observation], known: Knowledge) -> t
                 raise ValueError(f"{name}.residuals: want a tensor (*B, M, k) of numbers, got {called(found)}")
             shapes.append(found.shape[:-2])
     try:
-        return tuple(torch.broadcast_shapes(*shapes))
+        batch = tuple(torch.broadcast_shapes(*shapes))
     except RuntimeError:
         listed = ", ".join(str(tuple(shape)) for shape in shapes)
         raise ValueError(f"batch shapes of camera, priors and observations do not broadcast: {listed}") from None
+    if 0 in batch:
+        raise ValueError(f"priors, observations: want them of at least one camera, got batch shape {batch}")
+    return batch
 
 
 def _outcome(

@@ -132,7 +132,7 @@ def _labels(views_by_camera: Mapping[str, Views], moments: Moments | None, who: 
         labels = {}
         for name, views in views_by_camera.items():
             if name not in moments:
-                raise ValueError(f"moments: want those of every camera, got none of {name!r}")
+                raise ValueError(f"moments: want those of every camera in views_by_camera, got none of {name!r}")
             labels[name] = _listed(name, moments[name], len(views))
     for name, own in labels.items():
         double = next((label for label in own if own.count(label) > 1), None)

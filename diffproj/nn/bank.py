@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from diffproj._core.arguments import Array, listing
-from diffproj._core.numerics import broadcast_batches, check_tensor, has_values
+from diffproj._core.numerics import check_tensor, has_values
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.collating import stack
 from diffproj.geometry.plane import Plane
@@ -143,11 +143,11 @@ class ProjectorBank(nn.Module):
             )
         if warp is not None:
             warp = check_tensor("warp", warp, 3, 3, like=pixels)
-            broadcast_batches(pixels=pixels.shape[:1], warp=warp.shape[:-2])
+            _check_of_samples("warp", pixels, warp.shape[:-2])
             warp = warp.expand(*pixels.shape[:1], 3, 3)
         if plane is not None:
             check_one_plane(plane)
-            broadcast_batches(pixels=pixels.shape[:1], plane=plane.batch_shape)
+            _check_of_samples("plane", pixels, plane.batch_shape)
             plane = plane.expand(*pixels.shape[:1])
         found: list[Tensor] = []
         for kind, projector in enumerate(self.projectors):
@@ -177,3 +177,11 @@ class ProjectorBank(nn.Module):
 def _beside(of_samples: Tensor, values: Tensor) -> Tensor:
     """A tensor `(S,)` that broadcasts against one of more axes `(S, ...)`."""
     return of_samples.reshape(-1, *(1,) * (values.ndim - 1))
+
+
+def _check_of_samples(name: str, pixels: Tensor, batch: torch.Size) -> None:
+    """Check that there is one for all samples, or one for each."""
+    if batch not in ((), (1,), pixels.shape[:1]):
+        raise ValueError(
+            f"{name}: want one, or one for each of the {len(pixels)} samples of pixels, got batch shape {tuple(batch)}"
+        )

@@ -131,6 +131,9 @@ def test_a_bank_of_different_lenses(cameras: dp.Camera, pixels: torch.Tensor) ->
     torch.testing.assert_close(again(samples, camera=chosen)[0], points)
     with pytest.raises(ValueError, match="cameras: want at least one, each a single camera"):
         dp.ProjectorBank([cameras], dp.Plane.z(0.0))
+    two_planes = dp.Plane.z(torch.zeros(2, 2, dtype=D))
+    with pytest.raises(ValueError, match=r"plane: want one, or one for each of the 2 samples .* \(2, 2\)"):
+        again(pixels[:4].reshape(2, 2, 2), camera=[0, 1], plane=two_planes)
     with pytest.raises(ValueError, match="camera: want numbers from 0 to 3"):
         bank(samples, camera=[0, 1, 2, 3, 4])
     none = torch.rand(0, 10, 2, dtype=D)
