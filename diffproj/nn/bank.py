@@ -180,8 +180,8 @@ def _beside(of_samples: Tensor, values: Tensor) -> Tensor:
 
 
 def _check_of_samples(name: str, pixels: Tensor, batch: torch.Size) -> None:
-    """Check that there is one for all samples, or one for each."""
-    if batch not in ((), (1,), pixels.shape[:1]):
+    """Check that there is one for all samples, or one for each; in a graph, whose sizes are symbols, PyTorch does."""
+    if has_values(pixels) and batch not in ((), (1,), pixels.shape[:1]):
         raise ValueError(
             f"{name}: want one, or one for each of the {len(pixels)} samples of pixels, got batch shape {tuple(batch)}"
         )

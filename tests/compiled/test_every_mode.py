@@ -73,6 +73,10 @@ MAPS: dict[str, tuple[str, Map]] = {
     ),
     "projector, other plane": ("pixels", lambda x: FROZEN(x, plane=dp.Plane.z(7.0))),
     "bank of lenses": ("pixels", lambda x: LENSES(x, camera=torch.tensor([1, 0]))),
+    "bank of lenses, warped images": (
+        "pixels",
+        lambda x: LENSES(x, camera=torch.tensor([1, 0]), warp=torch.eye(3).expand(len(x), 3, 3), plane=dp.Plane.z(7.0)),
+    ),
     "fisheye": ("pixels", lambda x: dp.back_project(x, FISHEYE, PLANE)),
     "undistort": ("pixels", lambda x: LENS.undistort(x / 1000 - 0.3)),
     "distort": ("pixels", lambda x: LENS.distort(x / 1000 - 0.3)),
