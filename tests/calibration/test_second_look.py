@@ -87,3 +87,18 @@ def test_of_two_fits_as_low_the_one_that_came_to_an_end_is_kept(part: float, tak
     assert lower_fit(ended, lost, torch.arange(1), None).solution.status.tolist() == [
         Status.MAX_ITERATIONS if part > 1 else Status.CONVERGED
     ]
+
+
+def test_a_view_that_fits_far_worse_asks_for_another_look() -> None:
+    """Through a long lens it ended in few steps at an RMS of 0.260 px, with two views off by twice the others'."""
+    draw = torch.Generator().manual_seed(12)
+    focal = 15000 * 4.0 ** float(torch.rand(1, generator=draw))
+    center = torch.tensor([639.5, 479.5], dtype=D) + 20 * torch.randn(2, generator=draw, dtype=D)
+    K = torch.tensor([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1]], dtype=D)
+    lens = dp.BrownConrady(torch.tensor([0.1, -0.5, 0, 0, 0], dtype=D))
+    near = 1.3 * focal / 1280
+    camera = dp.Camera(K, distortion=lens, size=(1280, 960))
+    board = dp.Chessboard(9, 6, 25.0)
+    posed = synthetic.random_cameras(camera, board, 12, distance=(near, 2 * near), seed=12)
+    found = dp.calibrate(synthetic.corner_views(posed, board, noise_px=0.15, seed=12), board)
+    assert float(found.rms) < 0.2068
