@@ -42,8 +42,8 @@ class Status(IntEnum):
 class DampingControl:
     """Damping, acceptance and stopping per problem, in NumPy, which is faster than PyTorch for a few numbers."""
 
-    def __init__(self, cost: np.ndarray) -> None:
-        self.cost = cost
+    def __init__(self, cost: np.ndarray, negligible: np.ndarray) -> None:
+        self.cost, self.negligible = cost, negligible
         self.damping = np.full_like(cost, INITIAL_DAMPING)
         self.increase, self.decrease = np.full_like(cost, FIRST_INCREASE), np.full_like(cost, DAMPING_DECREASE)
         self.active = np.isfinite(cost)
@@ -58,16 +58,16 @@ class DampingControl:
         other.__dict__.update({name: of_each[which] for name, of_each in self.__dict__.items()})
         return other
 
-    def stop(self, expected: np.ndarray, tolerance: float, negligible: float) -> np.ndarray:
+    def stop(self, expected: np.ndarray, tolerance: float) -> np.ndarray:
         """Stop problems that have converged, which are returned, and those whose damping exceeds its maximum."""
         # The current step will still be applied: the criterion is the reduction of the step after it, extrapolated.
         after = expected * np.minimum(np.maximum(expected / self.previous, BEST_CONTRACTION), 1)
         self.previous = np.where(self.active, expected, self.previous)
         converged = (after <= tolerance * self.cost) & (expected <= FINAL_STEP_REDUCTION * self.cost)
         # Where the reduction is below the cost's rounding error, acceptance is random: the first failure ends it.
-        rounding = ROUNDING * self.cost + RESIDUAL_ROUNDING * np.sqrt(negligible * self.cost)
+        rounding = ROUNDING * self.cost + RESIDUAL_ROUNDING * np.sqrt(self.negligible * self.cost)
         exhausted = (self.failed & (expected <= rounding)) | (expected <= 1e-3 * ROUNDING * self.cost)
-        done = self.active & (converged | exhausted | (self.cost <= negligible))
+        done = self.active & (converged | exhausted | (self.cost <= self.negligible))
         stuck = self.active & ~done & (self.damping > MAX_DAMPING)
         self.status[done], self.status[stuck] = Status.CONVERGED, Status.DIVERGED
         self.active &= ~(done | stuck)

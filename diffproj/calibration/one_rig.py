@@ -14,11 +14,12 @@ from diffproj.calibration.rig_fit import rig_fit
 from diffproj.calibration.rig_knowledge import RigKnowledge
 from diffproj.calibration.rig_options import held, held_places, held_points
 from diffproj.calibration.rig_outcome import rig_outcome
+from diffproj.calibration.rig_parameters import RigParameters
 from diffproj.calibration.rig_priors import PLACES, own_priors, rig_knowledge
-from diffproj.calibration.rig_problem import RigParameters
 from diffproj.calibration.rig_result import RigCalibration
 from diffproj.calibration.rig_shape import weighed_anew, with_bow, with_known_points, with_points
 from diffproj.calibration.rig_start import rig_start
+from diffproj.calibration.rig_together import Refinement, by_itself
 from diffproj.calibration.rig_views import Moments, rig_views
 from diffproj.calibration.solver import Status
 from diffproj.lens.models import LensModel
@@ -54,7 +55,7 @@ def rig_calibrated(task: RigTask) -> RigCalibration:
     Raises:
         CalibrationError: as `finished`.
     """
-    return finished(task, alone(task.asked))
+    return by_itself(finished(task, alone(task.asked)))
 
 
 def rig_task(
@@ -89,8 +90,8 @@ def rig_task(
     return RigTask(asked, parameters, positions, points, knowledge, moved)
 
 
-def finished(task: RigTask, own: Mapping[str, Alone]) -> RigCalibration:
-    """The rig, from its cameras on their own.
+def finished(task: RigTask, own: Mapping[str, Alone]) -> Refinement[RigCalibration]:
+    """The rig, from its cameras on their own, by what it wants of the solver.
 
     Raises:
         CalibrationError: there is none, or it did not converge, if that is to be raised.
@@ -98,7 +99,7 @@ def finished(task: RigTask, own: Mapping[str, Alone]) -> RigCalibration:
     views, chosen, who = task.asked.views, task.asked.options, task.asked.who
     seen = {name: one.seen for name, one in own.items()}
     start = rig_start(views, seen, held_places(task.parameters, task.positions, task.asked.known), who)
-    found = rig_fit(
+    found = yield from rig_fit(
         views,
         task.parameters,
         {name: one.shared for name, one in seen.items()},
@@ -109,13 +110,13 @@ def finished(task: RigTask, own: Mapping[str, Alone]) -> RigCalibration:
         task.known,
     )
     if task.moved is not None:
-        found = with_known_points(found, task.moved, chosen)
+        found = yield from with_known_points(found, task.moved, chosen)
     elif chosen.shape == "bow":
-        found = with_bow(found, chosen)
+        found = yield from with_bow(found, chosen)
     elif chosen.shape == "free" or views.spread is not None:
-        found = with_points(found, task.held_points, chosen)
+        found = yield from with_points(found, task.held_points, chosen)
     elif task.known is not None:
-        found = weighed_anew(found, chosen)
+        found = yield from weighed_anew(found, chosen)
     rig = rig_outcome(found, own)
     if chosen.throw and rig.status != Status.CONVERGED:
         raise CalibrationError(f"{who}: {rig.message}", rig)

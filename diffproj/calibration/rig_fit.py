@@ -10,14 +10,15 @@ from diffproj.calibration.entangled import DENOMINATOR
 from diffproj.calibration.fit import MAX_REJECTION_ROUNDS, normal_tensors
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.options import Options
-from diffproj.calibration.parametrisation import POSE
 from diffproj.calibration.rig_knowledge import RigKnowledge
 from diffproj.calibration.rig_options import free_directions
-from diffproj.calibration.rig_problem import RigParameters, RigProblem
+from diffproj.calibration.rig_parameters import RigParameters
+from diffproj.calibration.rig_problem import RigProblem
 from diffproj.calibration.rig_start import RigStart
+from diffproj.calibration.rig_together import Refinement, Wanted
 from diffproj.calibration.rig_views import RigViews
 from diffproj.calibration.shape import Restraint
-from diffproj.calibration.solver import Equations, Prior, solve
+from diffproj.calibration.solver import Equations, Prior
 from diffproj.calibration.task import NEGLIGIBLE_PX
 
 READMITTED = 10.0
@@ -94,8 +95,8 @@ def rig_fit(
     positions: Sequence[int],
     options: Options,
     known: RigKnowledge | None = None,
-) -> RigFit:
-    """The minimum.
+) -> Refinement[RigFit]:
+    """The minimum, by what it wants of the solver.
 
     Args:
         views: of all cameras.
@@ -107,11 +108,11 @@ def rig_fit(
         options: checked.
         known: what is known of the cameras beforehand.
     """
-    found = _fitted(views, parameters, intrinsics, start, inliers, positions, options, known)
+    found = yield from _fitted(views, parameters, intrinsics, start, inliers, positions, options, known)
     below = _folding(found)
     if below:  # two terms of a rational lens that nearly cancel: on its own, the camera's was kept from that
         positions = sorted({*positions, *(position for one in below.values() for position in one)})
-        found = _fitted(views, parameters, intrinsics, start, inliers, positions, options, known)
+        found = yield from _fitted(views, parameters, intrinsics, start, inliers, positions, options, known)
     return replace(found, restrained=tuple(below), positions=tuple(positions))
 
 
@@ -141,8 +142,7 @@ def _fitted(
     positions: Sequence[int],
     options: Options,
     known: RigKnowledge | None,
-) -> RigFit:
-    basis = free_directions(parameters, positions, start.t)
+) -> Refinement[RigFit]:
     shared = start.t.new_zeros(1, parameters.size)
     for c, name in enumerate(views.names):
         shared[0, parameters.intrinsics(c)] = intrinsics[name]
@@ -151,21 +151,20 @@ def _fitted(
     local = tuple(part.unsqueeze(0) for part in start.poses)
     given = {name: views.data[name].used[0] for name in views.names}
     used = {name: _enough(inliers[name] & ~start.apart[name].unsqueeze(-1)) for name in views.names}
-    with torch.inference_mode():
-        fit = Rounds(views, parameters, start.R, basis, options, known=known)
-        fit.solve(used, shared, local)
-        apart = fit.reviewed(given, start.apart)
-        if any(bool((apart[name] != start.apart[name]).any()) for name in views.names):
-            used = {name: _enough(inliers[name] & ~apart[name].unsqueeze(-1)) for name in views.names}
-            fit.solve(used, fit.shared, fit.local)
-        found = fit.at_the_minimum(fit.without_outliers(given, apart), apart)
-    return in_normal_tensors(found)
+    fit = Rounds(views, parameters, start.R, positions, options, known=known)
+    yield from fit.solve(used, shared, local)
+    apart = fit.reviewed(given, start.apart)
+    if any(bool((apart[name] != start.apart[name]).any()) for name in views.names):
+        used = {name: _enough(inliers[name] & ~apart[name].unsqueeze(-1)) for name in views.names}
+        yield from fit.solve(used, fit.shared, fit.local)
+    rejected = yield from fit.without_outliers(given, apart)
+    return fit.at_the_minimum(rejected, apart)
 
 
-def in_normal_tensors(found: RigFit) -> RigFit:
+def _in_normal_tensors(found: RigFit) -> RigFit:
     """The fit outside of inference mode."""
     state = normal_tensors((found.shared, found.local, found.equations, found.problem.base))
-    problem = RigProblem(found.views, found.parameters, state[3], found.used, found.problem.known)
+    problem = RigProblem(found.views, found.parameters, state[3][0], found.used, found.problem.known)
     return replace(found, shared=state[0], local=state[1], equations=state[2], problem=problem)
 
 
@@ -187,16 +186,16 @@ class Rounds:
         views: RigViews,
         parameters: RigParameters,
         base: Tensor,
-        basis: Tensor | None,
+        held: Sequence[int],
         options: Options,
         restraint: Restraint | None = None,
         known: RigKnowledge | None = None,
     ) -> None:
-        self.views, self.parameters, self.base, self.basis, self.options = views, parameters, base, basis, options
+        self.views, self.parameters, self.base, self.held, self.options = views, parameters, base, tuple(held), options
         self.restraint, self.prior, self.known = restraint, prior_of(restraint, parameters), known
         self.iterations, self.round = 0, 0
 
-    def without_outliers(self, given: dict[str, Tensor], apart: dict[str, Tensor]) -> dict[str, Tensor]:
+    def without_outliers(self, given: dict[str, Tensor], apart: dict[str, Tensor]) -> Refinement[dict[str, Tensor]]:
         """Which of the given corners are left out `(V_c, N)`: of views apart, and outliers, if they are to be."""
         names = self.views.names
         rejected = {name: given[name] & apart[name].unsqueeze(-1) for name in names}
@@ -209,10 +208,10 @@ class Rounds:
             enough = {name: _enough(part) for name, part in kept.items()}
             if all(torch.equal(enough[name], self.used[name]) for name in names):
                 break
-            self.solve(enough, self.shared, self.local)
+            yield from self.solve(enough, self.shared, self.local)
         return rejected
 
-    def solve(self, used: dict[str, Tensor], shared: Tensor, local: tuple[Tensor, ...]) -> None:
+    def solve(self, used: dict[str, Tensor], shared: Tensor, local: tuple[Tensor, ...]) -> Refinement[None]:
         """A round on these corners, from unknowns `(1, s)` and poses of the target."""
         options, self.used = self.options, used
         self.problem = RigProblem(self.views, self.parameters, self.base, used, self.known)
@@ -224,21 +223,20 @@ class Rounds:
             if options.progress is not None:
                 options.progress(before + step, rounds * options.max_iterations)
 
-        found = solve(
+        ended = yield Wanted(
             self.problem,
             shared,
             local,
-            local_size=POSE,
-            loss=options.loss,
-            prior=self.prior,
-            basis=self.basis,
-            max_iterations=options.max_iterations,
-            tolerance=options.tolerance,
-            negligible=max(1, self.every) * self._scale() * NEGLIGIBLE_PX**2,
-            progress=tell,
+            self.held,
+            self.prior,
+            options.loss,
+            options.max_iterations,
+            options.tolerance,
+            max(1, self.every) * self._scale() * NEGLIGIBLE_PX**2,
+            tell,
         )
-        self.shared, self.local, self.status = found.shared, found.local, int(found.status[0])
-        self.iterations, self.round = self.iterations + int(found.iterations[0]), self.round + 1
+        self.shared, self.local, self.status, more = ended
+        self.iterations, self.round = self.iterations + more, self.round + 1
 
     def _scale(self) -> float:
         """What a negligible residual costs, over its square: little with small weights, or a small loss."""
@@ -259,6 +257,7 @@ class Rounds:
         problem = RigProblem(self.views, self.parameters, self.base, used)
         return _by_camera(self.views, problem, problem.residuals(self.shared, self.local))
 
+    @torch.inference_mode()
     def reviewed(self, given: dict[str, Tensor], apart: dict[str, Tensor]) -> dict[str, Tensor]:
         """Views that still contradict the others at the minimum, of those that were set apart."""
         if not any(bool(part.any()) for part in apart.values()):
@@ -269,6 +268,7 @@ class Rounds:
         mean = {name: squares[name].sum(-1) / given[name].sum(-1).clamp(min=1) for name in squares}
         return {name: part & ~(mean[name] <= READMITTED**2 * level) for name, part in apart.items()}
 
+    @torch.inference_mode()
     def inliers(self, given: dict[str, Tensor], limit: float) -> dict[str, Tensor]:
         """Which of the given corners are inliers `(V_c, N)`, by their weighted residuals and their camera's noise."""
         kept = {}
@@ -282,15 +282,16 @@ class Rounds:
 
     def at_the_minimum(self, rejected: dict[str, Tensor], apart: dict[str, Tensor]) -> RigFit:
         """Where the last round ended, with the unknowns counted from there."""
-        base, t = self.problem.cameras(self.shared)
-        shared = self.shared.clone()
-        for c in range(1, len(base)):
-            shared[0, self.parameters.pose(c)] = torch.cat([torch.zeros_like(t[c]), t[c]])
-        problem = self.problem.rebased(base)
-        _, equations = problem.equations(shared, self.local, self.options.loss)
-        if self.prior is not None:
-            equations = equations._replace(U=equations.U + self.prior.whole)
-        return RigFit(
+        with torch.inference_mode():
+            base, t = self.problem.places(self.shared)
+            shared = self.shared.clone()
+            for c in range(1, t.shape[1]):
+                shared[0, self.parameters.pose(c)] = torch.cat([torch.zeros_like(t[0, c]), t[0, c]])
+            problem = self.problem.rebased(base)
+            _, equations = problem.equations(shared, self.local, self.options.loss)
+            if self.prior is not None:
+                equations = equations._replace(U=equations.U + self.prior.whole)
+        found = RigFit(
             self.views,
             problem,
             shared,
@@ -301,10 +302,11 @@ class Rounds:
             apart,
             self.status,
             self.iterations,
-            self.basis,
+            free_directions(self.parameters, self.held, self.base),
             self.options.loss,
             restraint=self.restraint,
         )
+        return _in_normal_tensors(found)
 
 
 def _enough(used: Tensor) -> Tensor:

@@ -1,19 +1,19 @@
-"""Many rigs: their cameras on their own are calibrated side by side, then each rig is refined together, one by one.
+"""Many rigs: their cameras on their own are calibrated side by side, and so are the rigs refined."""
 
-Half of a rig's time goes into its cameras on their own, which a batch has cheaper; a rig's own minimum is one problem
-of many unknowns, which another rig's does not make cheaper.
-"""
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from diffproj._core.arguments import called
 from diffproj.calibration.one_rig import RigTask, finished, rig_task
 from diffproj.calibration.options import Options
 from diffproj.calibration.result import CalibrationError
-from diffproj.calibration.rig_alone import alone_together
+from diffproj.calibration.rig_alone import Alone, alone_together
 from diffproj.calibration.rig_result import RigCalibration
+from diffproj.calibration.rig_together import Refinement, side_by_side
 from diffproj.targets.target import Target
+
+MOST_VIEWS = 4000
+"""Views of rigs that are refined at a time, for the sake of memory: more are no faster."""
 
 
 def each_rig(
@@ -60,21 +60,41 @@ def each_rig(
             )
         except ValueError as error:
             refused(number, error)
-    together = alone_together([task.asked for task in tasks.values()])
-    for (number, task), cameras_alone in zip(tasks.items(), together, strict=True):
-        try:
-            if isinstance(cameras_alone, Exception):
-                raise cameras_alone
-            found[number] = finished(task, cameras_alone)
-        except CalibrationError as error:
-            found[number] = error
-        except ValueError as error:
-            refused(number, error)
-        if chosen.progress is not None:
-            chosen.progress(len(found), len(rigs))
+    together = dict(zip(tasks, alone_together([task.asked for task in tasks.values()]), strict=True))
+    for some in _some_at_a_time(tasks):
+        ready = [_from_its_cameras(tasks[number], together[number]) for number in some]
+        for number, rig in zip(some, side_by_side(ready), strict=True):
+            if isinstance(rig, ValueError):
+                refused(number, rig)
+            else:
+                found[number] = rig
+            if chosen.progress is not None:
+                chosen.progress(len(found), len(rigs))
     if rigs and len(mistakes) == len(rigs):
         raise mistakes[0]
     return [found[number] for number in range(len(rigs))]
+
+
+def _from_its_cameras(task: RigTask, own: Mapping[str, Alone] | Exception) -> Refinement[RigCalibration]:
+    """The rig, or the error that its cameras on their own ended with."""
+    if isinstance(own, Exception):
+        raise own
+    return (yield from finished(task, own))
+
+
+def _some_at_a_time(tasks: Mapping[int, RigTask]) -> Iterator[list[int]]:
+    """Rigs by their numbers, as many as are kept in memory at a time."""
+    some: list[int] = []
+    views = 0
+    for number, task in tasks.items():
+        own = sum(map(len, task.asked.views.where.values()))
+        if some and views + own > MOST_VIEWS:
+            yield some
+            some, views = [], 0
+        some.append(number)
+        views += own
+    if some:
+        yield some
 
 
 def _of_each(argument: str, given: Any, count: int) -> list[Any]:

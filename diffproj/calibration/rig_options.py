@@ -11,7 +11,7 @@ from diffproj.calibration.constraints import Priors, of_points
 from diffproj.calibration.losses import Loss
 from diffproj.calibration.options import Options, Progress, calibration_options
 from diffproj.calibration.parametrisation import SKEW, Parametrisation
-from diffproj.calibration.rig_problem import RigParameters
+from diffproj.calibration.rig_parameters import RigParameters
 from diffproj.geometry.camera import Camera
 
 

@@ -12,7 +12,7 @@ from diffproj.calibration.constraints import Priors, make_prior, of_camera
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.rig_knowledge import BASELINE, CENTER, ROTATION, KnownPlace, RigKnowledge
 from diffproj.calibration.rig_options import owner_of, place_in_rig, positions_of
-from diffproj.calibration.rig_problem import RigParameters
+from diffproj.calibration.rig_parameters import RigParameters
 from diffproj.calibration.rig_views import RigViews
 from diffproj.geometry.camera import Camera
 

@@ -14,9 +14,9 @@ from torch import Tensor
 from diffproj.calibration.constraints import printing_precision
 from diffproj.calibration.free_points import MAX_ROUNDS, SAME_NOISE
 from diffproj.calibration.options import Options
-from diffproj.calibration.rig_fit import RigFit, Rounds, in_normal_tensors
-from diffproj.calibration.rig_options import free_directions
-from diffproj.calibration.rig_problem import RigParameters
+from diffproj.calibration.rig_fit import RigFit, Rounds
+from diffproj.calibration.rig_parameters import RigParameters
+from diffproj.calibration.rig_together import Refinement
 from diffproj.calibration.rig_uncertainty import camera_noise, pooled_variance
 from diffproj.calibration.shape import Restraint, restraint_of
 from diffproj.calibration.surveyed import FINEST_PX
@@ -27,26 +27,26 @@ STIFF = 100.0
 """How many times as firmly as without a prior the frame is held beside one, which leaves it no say about the frame."""
 
 
-def weighed_anew(flat: RigFit, options: Options) -> RigFit:
+def weighed_anew(flat: RigFit, options: Options) -> Refinement[RigFit]:
     """The fit to a flat target with what is known beforehand weighed against the noise that the residuals tell."""
 
-    def again(found: RigFit, noise: float) -> RigFit:
+    def again(found: RigFit, noise: float) -> Refinement[RigFit]:
         return _fitted(found, flat.parameters, (), flat.shared.new_zeros(0), options, noise)
 
-    return flat if _is_weighed(flat) else _settled(flat, again, settled=False)
+    return flat if _is_weighed(flat) else (yield from _settled(flat, again, settled=False))
 
 
-def with_bow(flat: RigFit, options: Options) -> RigFit:
+def with_bow(flat: RigFit, options: Options) -> Refinement[RigFit]:
     """The fit with the board's bow."""
     parameters = replace(flat.parameters, bow=True)
 
-    def again(found: RigFit, noise: float) -> RigFit:
+    def again(found: RigFit, noise: float) -> Refinement[RigFit]:
         return _fitted(found, parameters, (), _shape_of(found, 2), options, noise)
 
     return _settled(flat, again, settled=flat.problem.known is None or _is_weighed(flat))
 
 
-def with_points(flat: RigFit, held_points: Sequence[int], options: Options) -> RigFit:
+def with_points(flat: RigFit, held_points: Sequence[int], options: Options) -> Refinement[RigFit]:
     """The fit with free points.
 
     Args:
@@ -60,7 +60,7 @@ def with_points(flat: RigFit, held_points: Sequence[int], options: Options) -> R
     if flat.views.spread is not None:
         printed = _as_surveyed(flat.views.spread)
 
-    def again(found: RigFit, noise: float) -> RigFit:
+    def again(found: RigFit, noise: float) -> Refinement[RigFit]:
         restraint = _restraint(flat, None if printed is None else noise * printed)
         return _fitted(
             found, parameters, held_points, _shape_of(found, 3 * parameters.points), options, noise, restraint
@@ -70,7 +70,9 @@ def with_points(flat: RigFit, held_points: Sequence[int], options: Options) -> R
     return _settled(flat, again, settled=nothing or _is_weighed(flat), least=FINEST_PX**2 if surveyed else 0.0)
 
 
-def _settled(flat: RigFit, again: Callable[[RigFit, float], RigFit], settled: bool, least: float = 0.0) -> RigFit:
+def _settled(
+    flat: RigFit, again: Callable[[RigFit, float], Refinement[RigFit]], settled: bool, least: float = 0.0
+) -> Refinement[RigFit]:
     """The fit that `again` makes of one, with what is known beforehand weighed against that variance of residuals.
 
     Where corners have no weights, it weighs against the noise that the residuals tell, which depends on it in turn: a
@@ -78,7 +80,7 @@ def _settled(flat: RigFit, again: Callable[[RigFit, float], RigFit], settled: bo
     """
     found, noise = flat, 1.0 if settled else max(_noise(flat), least)
     for _ in range(MAX_ROUNDS):
-        found = replace(again(found, noise), prior_variance=noise)
+        found = replace((yield from again(found, noise)), prior_variance=noise)
         before, noise = noise, noise if settled else max(_noise(found), least)
         if abs(noise - before) <= SAME_NOISE * before:
             break
@@ -96,7 +98,7 @@ def _shape_of(found: RigFit, count: int) -> Tensor:
     return shape if len(shape) else found.shared.new_zeros(count)
 
 
-def with_known_points(flat: RigFit, moves: Tensor, options: Options) -> RigFit:
+def with_known_points(flat: RigFit, moves: Tensor, options: Options) -> Refinement[RigFit]:
     """The fit with the points of the target displaced by `moves (N, 3)`, which are known."""
     parameters, moves = replace(flat.parameters, points=len(moves)), flat.views.frame.turned(moves.to(flat.shared))
     return _fitted(flat, parameters, range(moves.numel()), moves.flatten(), options)
@@ -110,23 +112,23 @@ def _fitted(
     options: Options,
     noise: float = 1.0,
     restraint: Restraint | None = None,
-) -> RigFit:
+) -> Refinement[RigFit]:
     """From a fit to one with a shape, which starts at `shape` and of which some unknowns are held, numbers from 0.
 
     What is known of the cameras weighs against residuals of the variance `noise`.
     """
     few, known = parameters.few, begin.problem.known
-    basis = free_directions(parameters, [*begin.positions, *(few + i for i in held)], begin.shared)
+    held = [*begin.positions, *(few + i for i in held)]
     shared = torch.cat([begin.shared[:, :few], shape.unsqueeze(0)], dim=-1)
     given = {name: begin.views.data[name].used[0] for name in begin.views.names}
-    with torch.inference_mode():
-        fit = Rounds(
-            begin.views, parameters, begin.problem.base, basis, options, restraint, known and known.against(noise)
-        )
-        fit.solve(begin.used, shared, begin.local)
-        found = fit.at_the_minimum(fit.without_outliers(given, begin.apart), begin.apart)
+    fit = Rounds(
+        begin.views, parameters, begin.problem.base[0], held, options, restraint, known and known.against(noise)
+    )
+    yield from fit.solve(begin.used, shared, begin.local)
+    rejected = yield from fit.without_outliers(given, begin.apart)
+    found = fit.at_the_minimum(rejected, begin.apart)
     found = replace(found, iterations=begin.iterations + found.iterations)
-    return replace(in_normal_tensors(found), restrained=begin.restrained, positions=begin.positions)
+    return replace(found, restrained=begin.restrained, positions=begin.positions)
 
 
 def _as_surveyed(spread: Tensor) -> Tensor:

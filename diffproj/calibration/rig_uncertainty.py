@@ -216,9 +216,9 @@ def _dispersion(found: RigFit, H: Equations, M: Equations) -> Tensor:
         u, S, K = u[..., kept], S[..., kept, kept], K[..., kept, kept]
         total, pull = S.sum(1), u.sum(1)
         if found.problem.known is not None:  # pulls along, and what it determines costs no degree of freedom
-            off, rows = found.problem.known.rows(found.shared[0], *found.problem.cameras(found.shared))
-            rows = rows[:, kept]
-            total, pull = total + rows.mT @ rows, pull + off @ rows
+            off, rows = found.problem.known.rows(found.shared, *found.problem.places(found.shared))
+            rows = rows[..., kept]
+            total, pull = total + rows.mT @ rows, pull + (rows.mT @ off.unsqueeze(-1)).squeeze(-1)
         if basis is not None:
             T = basis.mT.unsqueeze(1)
             u, S, K = (T @ u.unsqueeze(-1)).squeeze(-1), T @ S @ T.mT, T @ K @ T.mT

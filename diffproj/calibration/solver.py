@@ -67,11 +67,11 @@ class Problem(Protocol):
 
 
 @runtime_checkable
-class Parted(Problem, Protocol):
+class Parted(Protocol):
     """A batch that can go on with some of its problems, where most have come to their end."""
 
-    def part(self, which: Tensor) -> Problem:
-        """Some of the problems `(n,)`."""
+    def part(self, which: Tensor) -> Any:
+        """Some of the problems `(n,)`, as a problem of the same kind."""
         ...
 
 
@@ -200,7 +200,7 @@ def solve(
     basis: Float[Tensor, "p s q"] | None = None,
     max_iterations: int = 50,
     tolerance: float = 3e-14,
-    negligible: float = 0.0,
+    negligible: float | Float[Tensor, " p"] = 0.0,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Solution:
     """Minimise the cost of every problem.
@@ -217,7 +217,7 @@ def solve(
         max_iterations: maximum number of steps.
         tolerance: of convergence: the relative reduction of the cost that the step after the current one would bring,
             extrapolated from the ratio of the last two predicted reductions.
-        negligible: a cost, in the cost's unit, that counts as zero.
+        negligible: a cost, in the cost's unit, that counts as zero; one for all problems, or for each.
         progress: called after each step with its number, from 1, and the costs `(P,)`.
 
     Returns:
@@ -227,7 +227,7 @@ def solve(
     terms = _Terms(problem, local_size, weights, loss, prior, every)
     cost, equations = terms.at(shared, local)
     state = _State(shared, local, cost, equations)
-    control = DampingControl(_array(cost))
+    control = DampingControl(_array(cost), _array(torch.as_tensor(negligible).to(cost).expand_as(cost)))
     everyone = Everyone(state, control)
     for iteration in range(1, max_iterations + 1):
         along = state.equations.along(basis)
@@ -238,7 +238,7 @@ def solve(
         # Heavy damping makes every predicted reduction small: convergence is then judged by the gradient.
         heavy = control.damping > HEAVY_DAMPING
         expected = np.where(heavy, _array(_decoupled_reduction(along)), predicted) if heavy.any() else predicted
-        done = control.stop(expected, tolerance, negligible)
+        done = control.stop(expected, tolerance)
         if done.any():
             # The final step still improves the unknowns, but its reduction is negligible: apply without evaluating it.
             last = done & (predicted <= FINAL_STEP_REDUCTION * control.cost)

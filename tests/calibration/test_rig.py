@@ -10,7 +10,8 @@ import torch
 
 import diffproj as dp
 from diffproj.calibration.parametrisation import Parametrisation
-from diffproj.calibration.rig_problem import RigParameters, RigProblem
+from diffproj.calibration.rig_parameters import RigParameters
+from diffproj.calibration.rig_problem import RigProblem
 from diffproj.calibration.rig_views import rig_views
 from tests.calibration.rig_scenes import Scene, off_truth, scene
 
