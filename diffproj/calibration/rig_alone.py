@@ -237,6 +237,7 @@ def _calibrated(
             raise
         return [_unknown(asked[number], name) for number, name in members]
     found = outcome(first.who, together, fit, whole.size, throw=False)
+    shared, rms = found.shared.detach(), found.rms.tolist()  # of all cameras, each time that they are asked for
     results: list[Alone | CalibrationError | ValueError] = []
     for row, (number, name) in enumerate(members):
         if bool(found.status[row] != Status.CONVERGED):
@@ -244,14 +245,14 @@ def _calibrated(
             continue
         data, count = own[row], len(own[row].views)
         R, t = found.cameras.R[row, :count].detach(), found.cameras.t[row, :count].detach()
-        seen = Seen(found.shared[row].detach(), *data.frame.pose(R, t), found.used[row, :count])
+        seen = Seen(shared[row], *data.frame.pose(R, t), found.used[row, :count])
         late: tuple[Callable[[], str], Callable[[], OtherPoses]]
         if len(asked) == 1:
             late = partial(_remark, found, row), partial(_others, found, (row, slice(count)))
         else:  # a rig carries along what is of its own cameras alone
             part = _Part(first.who, data, fit.alone(row, count))
             late = part.remark, part.others
-        results.append(Alone(found.parameters, seen, float(found.rms[row]), *late))
+        results.append(Alone(found.parameters, seen, rms[row], *late))
     return results
 
 
