@@ -20,14 +20,14 @@ ROTATION, CENTER, BASELINE = "rotation", "center", "baseline"
 
 @dataclass(frozen=True, eq=False)
 class KnownPlace:
-    """What is known of where a camera stands in the rig, or in each of P rigs, with their axis in front.
+    """What is known of where a camera stands in each of P rigs.
 
     Attributes:
         camera: its number.
         what: its rotation, its center in the first camera's frame, or its baseline, the distance from that.
         start: where its pose stands among the shared unknowns.
-        mean: `(3, 3)`, `(3,)` in world units, or `(1,)`.
-        deviation: in radians about the camera's axes `(3,)`, or in world units `(3,)`, `(1,)`.
+        mean: `(P, 3, 3)`, `(P, 3)` in world units, or `(P, 1)`.
+        deviation: in radians about the camera's axes `(P, 3)`, or in world units `(P, 3)`, `(P, 1)`.
     """
 
     camera: int
@@ -43,7 +43,7 @@ class KnownPlace:
         """
         turn = turn_rate(omega)
         if self.what == ROTATION:
-            off = turn_between(self.mean.expand_as(R), R)
+            off = turn_between(self.mean, R)
             slope = torch.cat([torch.linalg.solve(turn_rate(off), turn), torch.zeros_like(turn)], dim=-1)
         elif self.what == CENTER:
             off = -(R.mT @ t.unsqueeze(-1)).squeeze(-1) - self.mean
@@ -57,13 +57,13 @@ class KnownPlace:
 
 @dataclass(frozen=True, eq=False)
 class RigKnowledge:
-    """Priors on the shared unknowns of a rig, or of each of P rigs, with their axis in front.
+    """Priors on the shared unknowns of each of P rigs.
 
     Attributes:
         positions: of intrinsics and coefficients that are known `(k,)`, the same in all rigs.
-        mean, deviation: of these `(k,)`.
+        mean, deviation: of these `(P, k)`.
         places: of cameras.
-        variance: of a residual of weight 1, against which all of it weighs.
+        variance: of a residual of weight 1, against which all of it weighs, `(P,)` or one for all.
     """
 
     positions: Tensor
@@ -94,7 +94,7 @@ class RigKnowledge:
         places = tuple(
             replace(own, **of([one.places[number] for one in ones])) for number, own in enumerate(self.places)
         )
-        variance = take([torch.as_tensor(one.variance).to(self.mean) for one in ones])
+        variance = take([torch.as_tensor(one.variance).to(one.mean).expand(len(one.mean)) for one in ones])
         return replace(self, **of(ones), places=places, variance=variance)
 
     def rows(self, shared: Tensor, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
@@ -104,7 +104,7 @@ class RigKnowledge:
         """
         size = shared.shape[-1]
         own = torch.nn.functional.one_hot(self.positions, size).to(shared) / self.deviation.unsqueeze(-1)
-        offs, slopes = [(shared[:, self.positions] - self.mean) / self.deviation], [own.expand(len(shared), -1, -1)]
+        offs, slopes = [(shared[:, self.positions] - self.mean) / self.deviation], [own]
         for place in self.places:
             start = place.start
             off, slope = place.rows(R[:, place.camera], t[:, place.camera], shared[:, start : start + 3])
@@ -114,6 +114,6 @@ class RigKnowledge:
         return root * torch.cat(offs, dim=-1), root.unsqueeze(-1) * torch.cat(slopes, dim=-2)
 
 
-def joined_knowledge(of_each: Sequence[RigKnowledge]) -> RigKnowledge:
-    """What is known of many rigs, of whose unknowns the same are."""
-    return of_each[0]._each(of_each, torch.stack)
+def joined_knowledge(of_each: Sequence[RigKnowledge]) -> RigKnowledge | None:
+    """What is known of many rigs, of whose unknowns the same are; `None` where nothing is."""
+    return of_each[0]._each(of_each, torch.cat) if of_each else None

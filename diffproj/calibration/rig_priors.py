@@ -91,7 +91,7 @@ def rig_knowledge(
     if not numbers and not places:
         return None
     where, mean, deviation = torch.stack(numbers).T if numbers else like.new_zeros(3, 0)
-    return RigKnowledge(where.long(), mean, deviation, tuple(places))
+    return RigKnowledge(where.long(), mean.unsqueeze(0), deviation.unsqueeze(0), tuple(places))
 
 
 def _reference(kind: Parametrisation, known: Camera | None, size: tuple[int, int] | None, like: Tensor) -> Tensor:
@@ -133,7 +133,8 @@ def _place(
         R, t = (part.to(like) for part in there)
         center = -(R.mT @ t)
         mean = {ROTATION: R, CENTER: center, BASELINE: center.norm().unsqueeze(0)}[what]
-    return KnownPlace(camera, what, at, mean, deviation.deg2rad() if what == ROTATION else deviation)
+    deviation = deviation.deg2rad() if what == ROTATION else deviation
+    return KnownPlace(camera, what, at, mean.unsqueeze(0), deviation.unsqueeze(0))
 
 
 def _numbers(entry: str, value: Any, count: int, like: Tensor) -> Tensor:

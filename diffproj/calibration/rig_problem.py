@@ -119,8 +119,8 @@ class Group:
             )
         rig = torch.cat([group.rig + number for number, group in groups.items()])
         names = "camera", "moment", "number", "pixels", "used"
-        parts = [torch.cat([getattr(group, name) for group in groups.values()]) for name in names]
-        return cls(one.parameters, one.members, moments, one.points, rig, *parts, weights)
+        parts = {name: torch.cat([getattr(group, name) for group in groups.values()]) for name in names}
+        return replace(one, moments=moments, rig=rig, weights=weights, **parts)
 
     def part(self, which: Tensor) -> "Group":
         """Those of some of the rigs `(n,)`, which are numbered anew."""
@@ -189,7 +189,7 @@ class RigProblem:
             base=torch.cat([problem.base for problem in problems]),
             moments=moments,
             groups=[Group.joined(groups, moments) for groups in by_lens.values()],
-            known=None if one.known is None else joined_knowledge([problem.known for problem in problems]),
+            known=joined_knowledge([problem.known for problem in problems if problem.known is not None]),
         )
 
     def part(self, which: Tensor) -> "RigProblem":

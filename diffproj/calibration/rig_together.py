@@ -19,7 +19,7 @@ from diffproj.calibration.rig_options import free_directions
 from diffproj.calibration.rig_problem import RigProblem
 from diffproj.calibration.solver import Prior, solve
 
-MOST_VIEWS = 400
+MOST_VIEWS = 800
 """Views in a batch: enough to hide call overhead; of more, what a view costs is all that counts."""
 FILLED = 1.5
 """Most moments of a rig in a batch, over the fewest: what is more than the hidden moments cost is not."""
@@ -134,10 +134,7 @@ def _batches(wanted: dict[int, Wanted]) -> list[list[int]]:
 def _solved(batch: Sequence[Wanted]) -> list[Ended]:
     """Where each of some rigs that are alike ends."""
     first, moments = batch[0], [one.problem.moments for one in batch]
-    shared, prior = torch.cat([one.shared for one in batch]), None
-    if first.prior is not None:
-        parts = zip(*(one.prior for one in batch if one.prior is not None), strict=True)
-        prior = Prior(*(None if part[0] is None else torch.cat(part) for part in parts))
+    shared = torch.cat([one.shared for one in batch])
     basis = free_directions(first.problem.parameters, first.held, shared)
     found = solve(
         RigProblem.joined([one.problem for one in batch]),
@@ -145,7 +142,7 @@ def _solved(batch: Sequence[Wanted]) -> list[Ended]:
         tuple(map(_filled, zip(*(one.local for one in batch), strict=True))),
         local_size=POSE,
         loss=first.loss,
-        prior=prior,
+        prior=_joined([one.prior for one in batch if one.prior is not None]),
         basis=None if basis is None else basis.expand(len(batch), -1, -1),
         max_iterations=first.max_iterations,
         tolerance=first.tolerance,
@@ -157,6 +154,15 @@ def _solved(batch: Sequence[Wanted]) -> list[Ended]:
         Ended(found.shared[p : p + 1], tuple(z[p : p + 1, :count] for z in found.local), status, iterations)
         for p, (status, iterations, count) in enumerate(ends)
     ]
+
+
+def _joined(priors: Sequence[Prior]) -> Prior | None:
+    """The priors of all rigs, if there are some."""
+    if not priors:
+        return None
+    roots = [prior.root for prior in priors if prior.root is not None]
+    mean, precision = torch.cat([prior.mean for prior in priors]), torch.cat([prior.precision for prior in priors])
+    return Prior(mean, precision, root=torch.cat(roots) if roots else None)
 
 
 def _filled(parts: Sequence[Tensor]) -> Tensor:
