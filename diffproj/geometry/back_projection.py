@@ -224,7 +224,7 @@ class PlaneMap(MapViews, Copied, Shown):
         lens = self.camera.distortion
         if lens is None:
             return pixels - self.camera.K.select(-1, 2).narrow(-1, 0, 2).unsqueeze(-2), None
-        if not isinstance(lens, BrownConrady):
+        if type(lens) is not BrownConrady:  # of a class derived from it, whose way back may be another, too
             return self.camera.directions(pixels)
         xy, finite = normalised(pixels, self.camera.K)
         xy, seen = lens.undistort_apart(xy)

@@ -79,9 +79,9 @@ def search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, Te
     """
     readable = has_values(points, coefficients, plan.domain) and not in_forward_mode()
     if readable and is_short(points) and coefficients.shape[-1] <= UNTILTED:
-        arrays = arrays_of(coefficients, points, *plan)[1]
+        _, (numbers, places, *parts) = arrays_of(coefficients, points, *plan)
         with np.errstate(all="ignore"):
-            tried = _tried(*arrays[:2], Plan(*arrays[2:]), points.dtype)
+            tried = _tried(numbers, places, Plan(*parts), points.dtype)
         x, y, start_x, start_y, possible, solved = map(torch.from_numpy, tried)
     else:
         x, y, start_x, start_y, possible, solved = _tried(coefficients, points, plan, points.dtype)
