@@ -27,6 +27,8 @@ BLOCK_POINTS = 2**16
 that the intermediate results stay in the processor's cache."""
 BLOCK_POINTS_ELSEWHERE = 2**23
 """The same on a GPU: large enough that its kernels take longer than their launch, small enough for its memory."""
+SHORT = 2**12
+"""Points on a CPU up to which NumPy's steps, which cost half of what PyTorch's do, make up for slower arithmetic."""
 
 
 # ----------------------------------------------------------------------------------------------- argument checks
@@ -147,6 +149,11 @@ def all_within(tensor: Tensor, limit: float) -> bool:
         return False
     low, high = tensor.detach().aminmax()  # NaN if one is
     return float(low) > -limit and float(high) < limit
+
+
+def is_short(vectors: Tensor) -> bool:
+    """Whether these are few vectors `(*B, N, 2)` or `(*B, N, 3)` on a CPU."""
+    return vectors.device.type == "cpu" and vectors.numel() <= 2 * SHORT
 
 
 def version_of(tensor: Tensor) -> int:

@@ -45,7 +45,7 @@ from diffproj._core.warn import warn_caller
 from diffproj.geometry import description
 from diffproj.geometry.camera import Camera, as_camera, meeting_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
-from diffproj.geometry.intrinsics import pixel_to_normalized
+from diffproj.geometry.intrinsics import normalised, pixel_to_normalized
 from diffproj.geometry.map_views import MapViews
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.geometry.plane_kernel import components, denominator_and_threshold, direct, intersection, recorded
@@ -224,9 +224,9 @@ class PlaneMap(MapViews, Copied, Shown):
         lens = self.camera.distortion
         if lens is None:
             return pixels - self.camera.K.select(-1, 2).narrow(-1, 0, 2).unsqueeze(-2), None
-        if not isinstance(lens, BrownConrady):
+        if type(lens) is not BrownConrady:  # of a class derived from it, whose way back may be another, too
             return self.camera.directions(pixels)
-        xy, finite = self.camera._normalised(pixels)
+        xy, finite = normalised(pixels, self.camera.K)
         xy, seen = lens.undistort_apart(xy)
         return xy, seen & finite
 

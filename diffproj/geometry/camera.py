@@ -22,7 +22,6 @@ from torch.utils._pytree import tree_leaves
 from diffproj._core.arguments import Array, instance, meeting
 from diffproj._core.batched import Batched
 from diffproj._core.numerics import (
-    all_within,
     broadcast_batches,
     check_same_kind,
     check_tensor,
@@ -32,7 +31,6 @@ from diffproj._core.numerics import (
     in_blocks,
     interleaved,
     linear,
-    side_by_side,
     transform,
     wants_derivative,
 )
@@ -41,14 +39,10 @@ from diffproj.geometry.changed_images import ChangedImages
 from diffproj.geometry.exchange import Exchange
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounded_pixels
 from diffproj.geometry.grid import checked_size, inside
-from diffproj.geometry.intrinsics import check_intrinsics, pixel_to_normalized, through_pinhole
+from diffproj.geometry.intrinsics import check_intrinsics, normalised, through_pinhole
 from diffproj.geometry.placement import Placed
 from diffproj.geometry.rotations import check_pose
-from diffproj.lens.compiling import coordinates
 from diffproj.lens.protocol import Lens
-
-SQUARED = 0.45
-"""The power of the largest number up to which a pixel counts as finite: its square, and what is left of it, are."""
 
 
 class Camera(
@@ -296,26 +290,11 @@ class Camera(
             ValueError: wrong shape or device, or batch shapes that do not broadcast.
         """
         pixels = meeting_camera(self, "pixels", pixels, 2)
-        xy, finite = self._normalised(pixels)
+        xy, finite = normalised(pixels, self.K)
         if self.distortion is None:
             return torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1), finite
         direction, valid = self.distortion.unproject(xy)
         return direction, valid & finite
-
-    def _normalised(
-        self, pixels: Float[Tensor, "*batch n 2"]
-    ) -> tuple[Float[Tensor, "*batch n 2"], Bool[Tensor, "*batch n"]]:
-        """Pixels that were checked, on the normalised plane, still distorted `(*B, N, 2)`, and which are finite."""
-        center = self.K[..., :2, 2].unsqueeze(-1).unbind(-2)
-        u, v = pixels.unbind(-1) if wants_derivative(pixels, self.K) else coordinates(pixels)
-        limit = torch.finfo(pixels.dtype).max ** SQUARED
-        offset = [u - center[0], v - center[1]]
-        if all_within(pixels, limit):  # the usual case
-            finite = torch.ones_like(u, dtype=torch.bool)
-        else:
-            finite = torch.maximum(u.abs(), v.abs()) < limit
-            offset = [torch.where(finite, part, 0.0) for part in offset]
-        return side_by_side(linear(entries(pixel_to_normalized(self.K)), offset)), finite
 
     def rays(
         self, pixels: Float[Tensor, "*#batch n 2"] | Array

@@ -118,9 +118,9 @@ class ChangedImages(CameraParts):
         broadcast_batches(**{"camera": self.batch_shape, name: matrix.shape[:-2]})
         if has_values(matrix):
             check_warp(name, matrix, self.K, behind_lens=self.distortion is not None)
-        ahead = self.K[..., :2, 2]
-        if self.size is not None:
-            ahead = self.K.new_tensor([(side - 1) / 2 for side in self.size])
+        ahead = None if self.size is None else [(side - 1) / 2 for side in self.size]
         K, turn = warped(self.K, matrix, ahead)
+        if turn is None:
+            return self._with(K=K, size=checked_size(size) or self.size)
         R, t = (turn.unsqueeze(-1) * self.R.unsqueeze(-3)).sum(-2), dot(turn, self.t.unsqueeze(-2))
         return self._with(K=K, R=R, t=t, size=checked_size(size) or self.size)

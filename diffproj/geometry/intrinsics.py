@@ -9,10 +9,26 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from diffproj._core.numerics import arrays_of, has_values, in_float64, least_depth, rounding, wants_derivative
+from diffproj._core.numerics import (
+    all_within,
+    arrays_of,
+    entries,
+    has_values,
+    in_float64,
+    is_short,
+    least_depth,
+    linear,
+    rounding,
+    side_by_side,
+    wants_derivative,
+)
+from diffproj.lens.compiling import coordinates
+
+SQUARED = 0.45
+"""The power of the largest number up to which a pixel counts as finite: its square, and what is left of it, are."""
 
 
 def intrinsic_matrix(
@@ -35,6 +51,43 @@ def pixel_to_normalized(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch
     a, b, c, d = K[..., :2, :2].flatten(-2).unbind(-1)
     determinant = torch.addcmul(a * d, b, c, value=-1)
     return (torch.stack([d, -b, -c, a], dim=-1) / determinant.unsqueeze(-1)).unflatten(-1, (2, 2))
+
+
+def normalised(
+    pixels: Float[Tensor, "*#batch n 2"], K: Float[Tensor, "*#batch 3 3"]
+) -> tuple[Float[Tensor, "*out n 2"], Bool[Tensor, "*out n"]]:
+    """Pixels on the normalised plane, still distorted `(*B, N, 2)`, and which are finite; of others that of `(0, 0)`.
+
+    Without derivatives each component is in one piece of memory.
+    """
+    limit = torch.finfo(pixels.dtype).max ** SQUARED
+    derivative = wants_derivative(pixels, K)
+    if is_short(pixels) and not derivative and has_values(pixels, K):
+        return _normalised_short(pixels.numpy(force=True), K.numpy(force=True), limit)
+    center = K[..., :2, 2].unsqueeze(-1).unbind(-2)
+    u, v = pixels.unbind(-1) if derivative else coordinates(pixels)
+    offset = [u - center[0], v - center[1]]
+    if all_within(pixels, limit):  # the usual case
+        finite = torch.ones_like(u, dtype=torch.bool)
+    else:
+        finite = torch.maximum(u.abs(), v.abs()) < limit
+        offset = [torch.where(finite, part, 0.0) for part in offset]
+    return side_by_side(linear(entries(pixel_to_normalized(K)), offset)), finite
+
+
+def _normalised_short(pixels: np.ndarray, K: np.ndarray, limit: float) -> tuple[Tensor, Tensor]:
+    """The same of few pixels, in NumPy."""
+    a, b, c, d = (K[..., row, column, None] for row in (0, 1) for column in (0, 1))
+    xy = np.empty((2, *np.broadcast_shapes(pixels.shape[:-1], a.shape)), pixels.dtype)
+    with np.errstate(all="ignore"):
+        finite = np.abs(pixels).max(-1) < limit
+        u, v = (pixels[..., axis] - K[..., axis, 2, None] for axis in (0, 1))
+        if not finite.all():
+            u, v = (np.where(finite, part, np.zeros((), part.dtype)) for part in (u, v))
+        determinant = a * d - b * c
+        np.subtract(u * (d / determinant), v * (b / determinant), out=xy[0])
+        np.subtract(v * (a / determinant), u * (c / determinant), out=xy[1])
+    return torch.from_numpy(xy).movedim(0, -1), torch.from_numpy(finite)
 
 
 def through_pinhole(direction: Sequence[Tensor], derivative: bool) -> tuple[list[Tensor], Tensor]:
@@ -73,8 +126,8 @@ def upright(
 
 
 def warped(
-    K: Float[Tensor, "*#batch 3 3"], matrix: Float[Tensor, "*#batch 3 3"], ahead: Float[Tensor, "*#batch 2"]
-) -> tuple[Float[Tensor, "*out 3 3"], Float[Tensor, "*out 3 3"]]:
+    K: Float[Tensor, "*#batch 3 3"], matrix: Float[Tensor, "*#batch 3 3"], ahead: Sequence[float] | None
+) -> tuple[Float[Tensor, "*out 3 3"], Float[Tensor, "*out 3 3"] | None]:
     """The intrinsics of a warped image, and the rotation of the camera that the warp implies.
 
     A warp maps homogeneous pixels `p = K X_cam` to `H p`. `H K` factors into new intrinsics and a rotation,
@@ -88,23 +141,27 @@ def warped(
     Args:
         K: `(*B, 3, 3)`.
         matrix: H `(*B, 3, 3)`, from pixels of the image to pixels of the warped image.
-        ahead: a pixel `(*B, 2)` of the image that the warped image shows.
+        ahead: a pixel of the image that the warped image shows; the principal point if left out.
 
     Returns:
-        `K'` and `Q`, both `(*B, 3, 3)` in the dtype of K.
+        `K'` and `Q`, both `(*B, 3, 3)` in the dtype of K; `None` in the place of Q where all warps are seen to be
+        affine.
     """
-    given = K, matrix, ahead
-    if wants_derivative(*given) or not has_values(*given):
-        return tuple(part.to(K.dtype) for part in _warped(torch, *map(in_float64, given)))  # type: ignore[return-value]
-    library, arrays = arrays_of(*given, double=True)
-    upper, Q = (torch.as_tensor(part, dtype=K.dtype, device=K.device) for part in _warped(library, *arrays))
+    if wants_derivative(K, matrix) or not has_values(K, matrix):
+        return tuple(part.to(K.dtype) for part in _warped(torch, in_float64(K), in_float64(matrix), ahead))  # type: ignore[return-value]
+    library, (K_given, H) = arrays_of(K, matrix, double=True)
+    if library is np and not H[..., 2, :2].any():  # the usual case
+        upper = (H[..., None] * K_given[..., None, :, :]).sum(-2) / H[..., 2:, 2:]
+        return torch.as_tensor(upper, dtype=K.dtype), None
+    upper, Q = (torch.as_tensor(part, dtype=K.dtype, device=K.device) for part in _warped(library, K_given, H, ahead))
     return upper, Q
 
 
-def _warped(library: Any, K: Any, matrix: Any, ahead: Any) -> tuple[Any, Any]:
+def _warped(library: Any, K: Any, matrix: Any, ahead: Sequence[float] | None) -> tuple[Any, Any]:
     """The same of arrays, or of tensors."""
+    u, v = (K[..., 0, 2], K[..., 1, 2]) if ahead is None else ahead
     G = (matrix[..., None] * K[..., None, :, :]).sum(-2)
-    w = (matrix[..., 2, :2] * ahead).sum(-1) + matrix[..., 2, 2]
+    w = matrix[..., 2, 0] * u + matrix[..., 2, 1] * v + matrix[..., 2, 2]
     G = library.where((w < 0)[..., None, None], -G, G)
     length = (G[..., 2, :] * G[..., 2, :]).sum(-1)[..., None] ** 0.5
     last = G[..., 2, :] / length

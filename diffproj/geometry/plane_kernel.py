@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._core.numerics import all_true, entries, interleaved, linear
+from diffproj._core.numerics import all_true, entries, interleaved, is_short, linear
 from diffproj._core.torch_private import has_storage
-from diffproj.geometry.plane_kernel_short import divided, gradient, is_short
+from diffproj.geometry.plane_kernel_short import divided, gradient
 
 
 def components(p: Tensor) -> list[Tensor | None]:

@@ -7,14 +7,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-SHORT = 2**12
-"""Points up to which it pays."""
-
-
-def is_short(p: Tensor) -> bool:
-    """Whether these are few vectors `(*B, N, 2)` or `(*B, N, 3)` on a CPU."""
-    return p.device.type == "cpu" and p.numel() <= 2 * SHORT
-
 
 def divided(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """The points, which are valid, `b . p`, and which are not valid (`None`: all are)."""

@@ -61,7 +61,8 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
         The largest disc around the axis on which the symmetric part of the Jacobian is positive definite; its radius
         is rounded down. Infinite for a lens without a fold.
         """
-        return self._domain()
+        domain = self._domain()
+        return torch.where(domain < torch.finfo(domain.dtype).max, domain, torch.inf)  # that of a buffer is finite
 
     def distort(
         self, xy: Float[Tensor, "*batch n 2"] | Array

@@ -26,12 +26,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffproj.lens.polynomial import minus_product, polynomial
+from diffproj.lens.polynomial import minus_product, plus_product, polynomial
 
 COUNTS = (4, 5, 8, 12, 14)
 """Numbers of coefficients that the model can have."""
+UNTILTED = 12
+"""Up to how many of them there is no tilt."""
 Values = Any
-"""A tensor; or, of a lens without tilt, an array of NumPy, for what is radial."""
+"""A tensor; or, of a lens without tilt, an array of NumPy."""
 Columns = tuple[Values, ...]
 
 
@@ -130,10 +132,10 @@ def _slope(over_s: Columns) -> Columns:
 class Jacobian(NamedTuple):
     """Derivatives of `(x', y')` by `(x, y)`: `xy` is that of `x'` by `y`."""
 
-    xx: Tensor
-    xy: Tensor
-    yx: Tensor
-    yy: Tensor
+    xx: Values
+    xy: Values
+    yx: Values
+    yy: Values
 
 
 def denominator(terms: Terms, s: Values) -> Values:
@@ -171,34 +173,34 @@ def term_growth(terms: Terms, s: Values) -> Values:
 
 def bend(terms: Terms, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """`(x', y')`: all distortion but the tilt."""
-    s = torch.addcmul(x * x, y, y)
-    factor = torch.addcmul(_tangential_factor(terms, x, y), s, _growth(terms, s))
+    s = plus_product(x * x, y, y)
+    factor = plus_product(_tangential_factor(terms, x, y), s, _growth(terms, s))
     sideways_x, sideways_y = polynomial(s, terms.sideways_x), polynomial(s, terms.sideways_y)
-    return torch.addcmul(x * factor, s, sideways_x), torch.addcmul(y * factor, s, sideways_y)
+    return plus_product(x * factor, s, sideways_x), plus_product(y * factor, s, sideways_y)
 
 
-def residual(terms: Terms, target: tuple[Tensor, Tensor], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def residual(terms: Terms, target: tuple[Values, Values], x: Values, y: Values) -> tuple[Values, Values, Values]:
     """`target - (x', y')`, and `s`."""
-    s = torch.addcmul(x * x, y, y)
-    factor = torch.addcmul(_tangential_factor(terms, x, y), s, _growth(terms, s))
+    s = plus_product(x * x, y, y)
+    factor = plus_product(_tangential_factor(terms, x, y), s, _growth(terms, s))
     off_x = minus_product(minus_product(target[0], x, factor), s, polynomial(s, terms.sideways_x))
     return off_x, minus_product(minus_product(target[1], y, factor), s, polynomial(s, terms.sideways_y)), s
 
 
-def bend_off(terms: Terms, target: tuple[Tensor, Tensor], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Jacobian]:
+def bend_off(terms: Terms, target: tuple[Values, Values], x: Values, y: Values) -> tuple[Values, Values, Jacobian]:
     """Residual `target - (x', y')` and Jacobian of `(x', y')`, in as few operations as possible."""
-    s = torch.addcmul(x * x, y, y)
+    s = plus_product(x * x, y, y)
     growth = _growth(terms, s)
-    factor = torch.addcmul(_tangential_factor(terms, x, y), s, growth)
-    slope = radial_slope(terms, s, torch.addcmul(terms.one, s, growth) if terms.below else factor)
+    factor = plus_product(_tangential_factor(terms, x, y), s, growth)
+    slope = radial_slope(terms, s, plus_product(terms.one, s, growth) if terms.below else factor)
     sideways_x, sideways_y = polynomial(s, terms.sideways_x), polynomial(s, terms.sideways_y)
     steep_x, steep_y = polynomial(s, terms.sideways_slope_x), polynomial(s, terms.sideways_slope_y)
-    slope_x, slope_y = torch.addcmul(terms.two_p2, x, slope), torch.addcmul(terms.two_p1, y, slope)
+    slope_x, slope_y = plus_product(terms.two_p2, x, slope), plus_product(terms.two_p1, y, slope)
     jacobian = Jacobian(
-        torch.addcmul(factor, x, slope_x + steep_x),
-        torch.addcmul(x * slope_y, y, steep_x),
-        torch.addcmul(y * slope_x, x, steep_y),
-        torch.addcmul(factor, y, slope_y + steep_y),
+        plus_product(factor, x, slope_x + steep_x),
+        plus_product(x * slope_y, y, steep_x),
+        plus_product(y * slope_x, x, steep_y),
+        plus_product(factor, y, slope_y + steep_y),
     )
     off_x = minus_product(minus_product(target[0], x, factor), s, sideways_x)
     off_y = minus_product(minus_product(target[1], y, factor), s, sideways_y)
@@ -206,8 +208,8 @@ def bend_off(terms: Terms, target: tuple[Tensor, Tensor], x: Tensor, y: Tensor) 
 
 
 def newton_direction(
-    terms: Terms, target: tuple[Tensor, Tensor], x: Tensor, y: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    terms: Terms, target: tuple[Values, Values], x: Values, y: Values
+) -> tuple[Values, Values, Values, Values, Values]:
     """Residual at `(x, y)`, and the Newton step there as its two numerators and their common denominator."""
     off_x, off_y, slope = bend_off(terms, target, x, y)
     determinant = minus_product(slope.xx * slope.yy, slope.xy, slope.yx)
@@ -216,9 +218,9 @@ def newton_direction(
     return off_x, off_y, step_x, step_y, determinant
 
 
-def _tangential_factor(terms: Terms, x: Tensor, y: Tensor) -> Tensor:
+def _tangential_factor(terms: Terms, x: Values, y: Values) -> Values:
     """`1 + 2 (p1 y + p2 x)`."""
-    return torch.addcmul(x * terms.two_p2, y, terms.two_p1) + terms.one
+    return plus_product(x * terms.two_p2, y, terms.two_p1) + terms.one
 
 
 class Tilted(NamedTuple):
@@ -267,7 +269,7 @@ def by_coefficients(terms: Terms, x: Tensor, y: Tensor, count: int) -> Tensor:
 
 def columns_by_coefficients(terms: Terms, x: Tensor, y: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
     """Derivatives of `(x', y')`, before the tilt, by one of its coefficients after the other."""
-    s = torch.addcmul(x * x, y, y)
+    s = plus_product(x * x, y, y)
     below = denominator(terms, s)
 
     def by_power(power: int) -> tuple[Tensor, Tensor]:

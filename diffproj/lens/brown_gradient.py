@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffproj._core.numerics import has_values
 from diffproj._core.torch_private import in_forward_mode
-from diffproj.lens.brown_equations import Terms, bend_off, columns_by_coefficients
+from diffproj.lens.brown_equations import UNTILTED, Terms, bend_off, columns_by_coefficients
 from diffproj.lens.brown_inverse import newton, untilted
 
 
@@ -34,7 +34,7 @@ def recorded(coefficients: Tensor, points: Tensor, x: Tensor, y: Tensor, valid: 
 
 def follows_gradient(points: Tensor, coefficients: Tensor) -> bool:
     """Whether `with_gradient` is enough here: for reverse mode, and lenses without tilt."""
-    return coefficients.shape[-1] <= 12 and has_values(points, coefficients) and not in_forward_mode()
+    return coefficients.shape[-1] <= UNTILTED and has_values(points, coefficients) and not in_forward_mode()
 
 
 def with_gradient(coefficients: Tensor, points: Tensor, x: Tensor, y: Tensor, valid: Tensor) -> Tensor:

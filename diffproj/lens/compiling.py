@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,12 +28,14 @@ def _transforming() -> bool:
     return in_functional_transform() or in_forward_mode()
 
 
-def coordinates(points: Tensor) -> tuple[Tensor, Tensor]:
-    """`x` and `y` of points `(*B, N, 2)`, outside of autograd.
+def coordinates(points: Any) -> tuple[Any, Any]:
+    """`x` and `y` of points `(*B, N, 2)`, a tensor outside of autograd, or an array of NumPy.
 
     On a CPU, but not in an exported graph, they are made contiguous first, in a compiled graph by an opaque operation:
     a loop with stride 2 is not vectorised and runs at a quarter of the speed.
     """
+    if not isinstance(points, Tensor):
+        return np.ascontiguousarray(points[..., 0]), np.ascontiguousarray(points[..., 1])
     compiling = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
     if compiling and points.device.type == "cpu" and not _transforming():
         points = _deinterleaved(points).movedim(0, -1)

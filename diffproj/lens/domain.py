@@ -74,6 +74,8 @@ def _first_bad_cell(library: Any, good: Any, radii: Any, start: Any) -> tuple[An
     failed = bad.any(-1)
     index = library.where(failed, (bad * 1).argmax(-1), radii.shape[-1] - 1)[..., None]
     edges = library.concatenate((start[..., None], radii), -1)
+    if library is np and index.ndim == 1:  # of one lens, in a third of the time
+        return edges[index[0]], edges[index[0] + 1], failed
     take = np.take_along_axis if library is np else torch.take_along_dim
     low, high = take(edges, index, -1), take(edges, index + 1, -1)
     return low[..., 0], high[..., 0], failed

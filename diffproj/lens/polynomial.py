@@ -1,4 +1,4 @@
-"""Polynomials by Horner's rule, and `total - a b` in one operation."""
+"""Polynomials by Horner's rule, and sums with a product in one operation: of tensors, or of NumPy's arrays."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,10 +8,7 @@ from torch import Tensor
 
 
 def polynomial(x: Any, coefficients: Sequence[Any]) -> Any:
-    """`c0 + c1 x + c2 x^2 + ...` for coefficients that broadcast against `x`; `c0` itself if it is the only one.
-
-    Of tensors, or of NumPy's arrays.
-    """
+    """`c0 + c1 x + c2 x^2 + ...` for coefficients that broadcast against `x`; `c0` itself if it is the only one."""
     total = coefficients[-1]
     if not isinstance(x, Tensor):
         for coefficient in reversed(coefficients[:-1]):
@@ -31,10 +28,22 @@ def series(x: Tensor, coefficients: Sequence[float]) -> Tensor:
     return total
 
 
-def minus_product(total: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """`total - a b`, in one operation.
+def plus_product(total: Any, a: Any, b: Any) -> Any:
+    """`total + a b`."""
+    return torch.addcmul(total, a, b) if isinstance(a, Tensor) else total + a * b
+
+
+def plus_quotient(total: Any, a: Any, b: Any) -> Any:
+    """`total + a / b`."""
+    return torch.addcdiv(total, a, b) if isinstance(a, Tensor) else total + a / b
+
+
+def minus_product(total: Any, a: Any, b: Any) -> Any:
+    """`total - a b`.
 
     In a compiled graph, where operations are fused anyway, it is written as two: PyTorch 2.13 crashes there on the
     forward derivative of `addcmul` with `value`.
     """
-    return total - a * b if torch.compiler.is_compiling() else torch.addcmul(total, a, b, value=-1)
+    if isinstance(a, Tensor) and not torch.compiler.is_compiling():
+        return torch.addcmul(total, a, b, value=-1)
+    return total - a * b

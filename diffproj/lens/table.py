@@ -10,8 +10,9 @@ denominator keeps most nodes within 45 degrees of the axis however far the table
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,28 +23,43 @@ SAMPLES = 384
 
 
 class InverseTable(NamedTuple):
-    """A tabulated inverse.
+    """A tabulated inverse, of tensors or of NumPy's arrays.
 
     Attributes:
         rho_max: `(*B,)`, the distorted radius at which the table ends.
         ratio: `(*B, 2, NODES)`, `r / rho` at uniform nodes in `u`, and how much it rises from each to the next.
     """
 
-    rho_max: Tensor
-    ratio: Tensor
+    rho_max: Any
+    ratio: Any
 
-    def ratio_at(self, rho_squared: Tensor) -> Tensor:
+    def ratio_at(self, rho_squared: Any) -> Any:
         """`r / rho` for distorted points of squared radius `rho_squared (*B, N)`; beyond the table, that at its end."""
-        farthest = (self.rho_max * self.rho_max).unsqueeze(-1)
-        near = farthest.clamp_max(1)
+        rho_max = self.rho_max[..., None]
+        farthest = rho_max * rho_max
+        near = farthest.clip(None, 1)
         end = (NODES - 1) ** 2 * near / farthest  # position^2 is A / (c^2 + rho^2) - this
-        squared = (near + rho_squared).reciprocal() * (near * ((NODES - 1) ** 2 + end)) - end
+        squared = near * ((NODES - 1) ** 2 + end) / (near + rho_squared) - end
+        if not isinstance(squared, Tensor):
+            position = squared.clip(0, None) ** 0.5
+            index = position.astype(np.int64).clip(0, NODES - 1)  # a NaN has an index too
+            return _taken(self.ratio, index, position - index.astype(position.dtype))
         if torch.compiler.is_exporting():  # of operations that ONNX has
             position = torch.where(squared > 0, squared, 0.0).sqrt()
             index = position.long().clamp(0, NODES - 1)
             return _interpolated(self.ratio, index, position - index)
         position = squared.clamp_min(0).sqrt()
         return _interpolated(self.ratio, position.int().clamp(0, NODES - 1), position.frac())  # a NaN has an index too
+
+
+def _taken(nodes: np.ndarray, index: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """`_interpolated` of arrays."""
+    if nodes.ndim == 2:
+        low, rise = nodes[0][index], nodes[1][index]
+    else:
+        shape = *index.shape[:-1], NODES
+        low, rise = (np.take_along_axis(np.broadcast_to(nodes[..., i, :], shape), index, -1) for i in (0, 1))
+    return low + fraction * rise
 
 
 def _interpolated(nodes: Tensor, index: Tensor, fraction: Tensor) -> Tensor:

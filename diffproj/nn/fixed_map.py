@@ -150,7 +150,9 @@ class FixedMap(GeometryModule):
             if lens is None:
                 return
             for name, part in lens.plan()._asdict().items():
-                setattr(self, name, part.detach().clone(memory_format=torch.contiguous_format))
+                # No infinity: what averages the buffers of a network, such as `AveragedModel`, would make NaN of it.
+                part = part.detach().clamp(max=torch.finfo(part.dtype).max)
+                setattr(self, name, part.clone(memory_format=torch.contiguous_format))
 
     def __getstate__(self) -> dict[str, Any]:
         self._is_outdated(OF_MATRIX, "matrix")  # built again here, for the marks are not those of a copy

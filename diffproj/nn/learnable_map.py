@@ -79,6 +79,8 @@ class LearnableMap(nn.Module):
             for tensor in tensors.values()
             if tensor is not None
         ]
+        if any(module._modules for module in (self.camera, self.plane)):  # parametrised: what stands there is no tensor
+            return None
         if torch.compiler.is_compiling() or in_forward_mode() or any(tensor.requires_grad for tensor in state):
             return None
         if self.device.type != "cpu" or not has_values(*state):

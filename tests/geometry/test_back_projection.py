@@ -386,3 +386,21 @@ def test_a_camera_without_a_pose_is_warned_of(camera: dp.Camera, pixels: Tensor)
         assert not valid.any()
     dp.back_project(pixels, camera.without_pose(), dp.Plane.z(900.0))  # a wall in front of it
     dp.back_project(pixels, camera, dp.Plane.z(0.0))
+
+
+@pytest.mark.parametrize("name", ["undistort", "unproject"])
+def test_a_lens_derived_from_the_packages_own_has_the_last_word(name: str, camera: dp.Camera, pixels: Tensor) -> None:
+    """In the map too, which has a short way through the lenses that it knows."""
+
+    class Doubled(dp.BrownConrady):
+        pass
+
+    def doubled(lens: dp.BrownConrady, xy: Tensor) -> tuple[Tensor, Tensor]:
+        found, valid = getattr(dp.BrownConrady, name)(lens, xy)
+        return torch.cat([2 * found[..., :2], found[..., 2:]], dim=-1), valid
+
+    setattr(Doubled, name, doubled)
+    t = torch.tensor([0.0, 0, 500], dtype=camera.dtype)
+    derived = dp.Camera(camera.K, t=t, distortion=Doubled(torch.zeros(5, dtype=camera.dtype)))
+    points, _ = dp.back_project(pixels, derived, dp.Plane.z(0.0))
+    torch.testing.assert_close(points, 2 * dp.back_project(pixels, dp.Camera(camera.K, t=t), dp.Plane.z(0.0))[0])

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffproj.geometry import plane_kernel_short
+from diffproj._core import numerics
 from diffproj.geometry.plane_kernel import direct, recorded
 
 BATCHES = [((), ()), ((3,), (3,)), ((3,), ()), ((2, 3), (3,))]
@@ -31,7 +31,7 @@ def test_the_short_way_gives_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     if not short:  # as of many points
-        monkeypatch.setattr(plane_kernel_short, "SHORT", 0)
+        monkeypatch.setattr(numerics, "SHORT", 0)
     p, matrix, seen = example(components, points, maps)
     seen = seen if lens else None
     (slow, valid), (fast, too) = recorded(p, matrix, seen), direct(p, matrix, seen)
@@ -85,7 +85,7 @@ def test_a_point_is_the_same_to_rounding_however_many_there_are(
     p, matrix, seen = (part.detach() for part in example(components, (3,), (3,)))
     p, matrix = p.to(kind), matrix.to(kind)
     few = direct(p, matrix, seen)
-    monkeypatch.setattr(plane_kernel_short, "SHORT", 0)
+    monkeypatch.setattr(numerics, "SHORT", 0)
     many = direct(p, matrix, seen)
     torch.testing.assert_close(few[0], many[0])
     assert torch.equal(few[1], many[1])
