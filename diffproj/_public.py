@@ -16,6 +16,7 @@ from diffproj.calibration.losses import Cauchy as Cauchy
 from diffproj.calibration.losses import Huber as Huber
 from diffproj.calibration.losses import Loss as Loss
 from diffproj.calibration.losses import SoftL1 as SoftL1
+from diffproj.calibration.mismatch import CameraDisagreementWarning as CameraDisagreementWarning
 from diffproj.calibration.mismatch import CameraMismatchWarning as CameraMismatchWarning
 from diffproj.calibration.observation import Observation as Observation
 from diffproj.calibration.observations import Heights as Heights
@@ -69,7 +70,6 @@ from diffproj.lens.protocol import Lens as Lens
 from diffproj.measurement.accuracy_map import AccuracyMap as AccuracyMap
 from diffproj.measurement.choices import PixelNoiseWarning as PixelNoiseWarning
 from diffproj.measurement.ellipses import Ellipses as Ellipses
-from diffproj.measurement.fuse import CameraDisagreementWarning as CameraDisagreementWarning
 from diffproj.measurement.fuse import FusedMeasurement as FusedMeasurement
 from diffproj.measurement.fuse import fuse as fuse
 from diffproj.measurement.measure import measure as measure

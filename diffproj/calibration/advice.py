@@ -145,6 +145,8 @@ def judged(seen: Evidence) -> Judgement:
         )
     if Kind.UNEVEN_PRINT in seen.kinds:
         remedies.insert(0, "no other photograph yet, but shape='free', or a board whose sides were measured both ways")
+    if Kind.WRONG_PRIOR in seen.kinds:
+        remedies.insert(0, "first another look at the prior that the remark names")
     if Kind.BENT in seen.kinds:
         remedies.insert(0, "no other photograph yet, but shape='bow', or a board glued to something flat")
     word, reasons = ("Weak", faults) if faults else ("Good", _praise(seen, tilt, covered))
@@ -170,7 +172,7 @@ def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | 
         faults.append(f"pixel coordinates outnumber unknowns by {spare:.0f} only, so they hardly test each other")
         remedies.append("more landmarks, near and far, in all parts of the image")
     faults += _reasons(remarks, *OF_THE_CAMERA)
-    if contradicted := _reasons(remarks, Kind.CONTRADICTION):
+    if contradicted := _reasons(remarks, Kind.CONTRADICTION, Kind.WRONG_PRIOR):
         faults += contradicted
         remedies.append("a look at wrong landmarks and wrong priors, or larger deviations for them")
     if not faults:
@@ -186,7 +188,7 @@ def _percent(part: float) -> str:
 
 def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
     """What makes it weak."""
-    faults = _reasons(seen.remarks, Kind.CONTRADICTION)
+    faults = _reasons(seen.remarks, Kind.CONTRADICTION, Kind.WRONG_PRIOR)
     count = int(seen.used.sum())
     if seen.different < FEW_VIEWS:
         alike = f" of {count}" if round(seen.different) < count else ""

@@ -18,6 +18,10 @@ class CameraMismatchWarning(UserWarning):
     """The corners of a photograph do not lie where the calibrated camera sees them: is it that camera's?"""
 
 
+class CameraDisagreementWarning(UserWarning):
+    """Cameras that measured the same points disagree by more than their deviations explain."""
+
+
 class Mismatch(NamedTuple):
     """Located views against the calibration that they were located with.
 

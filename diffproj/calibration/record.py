@@ -100,6 +100,8 @@ class Recorded:
         views = Views(
             tensor(fields, "pixels", (*batch, V, N, 2)), visible, _names(fields["names"], V), _size(fields["size"])
         )
+        if None not in (views.size, camera.size) and views.size != camera.size:
+            raise ValueError(f"size: want that of the camera, {camera.size}, got {views.size}")
         used, rejected = (mask(fields, name, (*batch, V, N)) for name in ("used", "rejected"))
         if bool((used & ~visible).any()) or bool((used & rejected).any()):
             raise ValueError("used: want corners that are visible and not rejected, got others")

@@ -21,6 +21,8 @@ class Kind(StrEnum):
     """The board is bent."""
     CONTRADICTION = "contradiction"
     """The residuals contradict the deviations that were given."""
+    WRONG_PRIOR = "wrong prior"
+    """The views contradict what was said beforehand of a parameter."""
 
 
 class Remark(NamedTuple):

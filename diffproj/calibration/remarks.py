@@ -24,6 +24,7 @@ from diffproj.calibration.adequacy import (
 from diffproj.calibration.entangled import Entangled, Simpler
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.leftover import Leftover, leftover
+from diffproj.calibration.prior_contradiction import PriorContradiction, prior_contradictions
 from diffproj.calibration.remark import OF_THE_CAMERA, Kind, Remark, Remarks
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
@@ -90,8 +91,13 @@ def remarks(
     which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
     if len(which):
         left, groups = leftover(found, which, SIGNIFICANT), two_groups(found, which)
+        wrong = prior_contradictions(found, which)
         for i, p in enumerate(map(int, which.tolist())):
             saved = groups[p].saved if p in groups else 0.0
+            if p in wrong:
+                said[p].append(_of_the_prior(wrong[p]))
+                if wrong[p].saved > BETTER * max(saved, float(left.smooth.share[i])):
+                    continue
             if not of_landmarks and _uneven_print(task, left, i, p, saved):
                 said[p].append(_of_the_print(left, i))
                 continue
@@ -101,6 +107,17 @@ def remarks(
                 remark = None if remark is not None and remark.kind in OF_THE_CAMERA else remark
             said[p] += [] if remark is None else [remark]
     return tuple(map(tuple, said))
+
+
+def _of_the_prior(wrong: PriorContradiction) -> Remark:
+    reason = f"the views contradict the prior on {wrong.name}"
+    return Remark(
+        f"{reason}: they tell {wrong.told:.6g} ± {wrong.deviation:.2g}, and it says {wrong.said:.6g} ± "
+        f"{wrong.sure:.2g}, {wrong.far:.0f} deviations off: is it of this camera, its zoom, this lens model, and "
+        "photographs of this size?",
+        Kind.WRONG_PRIOR,
+        reason,
+    )
 
 
 def _unsure_focal(found: Fit) -> Tensor:

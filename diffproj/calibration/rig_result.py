@@ -198,7 +198,9 @@ class RigCalibration(RigAccount, Copied, RigRecorded):
                 own corners if left out.
 
         Returns:
-            The points, with the joint covariance of the noise of their pixels and of the rig.
+            The points, with the joint covariance of the noise of their pixels and of the rig. Where pixels cannot be
+            those of one point it `disagrees`, its covariance is as much larger as it takes to explain them, and a
+            `CameraDisagreementWarning` says so.
 
         Raises:
             TypeError: no mapping from names to pixels.

@@ -6,6 +6,11 @@ A point's position minimises `sum_c |project_c(X) - uv_c|^2 / sigma_c^2`. With `
     dX = -A^-1 sum J_c^T (G_c dtheta - d uv_c) / sigma_c^2          A = sum J_c^T J_c / sigma_c^2
 
 so that points share the rig's errors, and each has those of its own pixels besides.
+
+What the residuals of a point tell besides is whether its pixels are of one point. They are the part of the errors that
+the point does not take up, `P e` with P the projection off the columns of J, and their chi-square has two degrees of
+freedom a camera, less three: with two cameras that of the distance from each other's epipolar lines. Where chance does
+not explain it nothing tells which pixel is wrong, and the covariance grows by chi-square over its degrees of freedom.
 """
 
 from collections.abc import Mapping
@@ -21,13 +26,19 @@ from diffproj._core.copying import Copied
 from diffproj._core.numerics import check_tensor
 from diffproj._core.shown import Shown
 from diffproj._core.shown import number as shown
+from diffproj._core.warn import warn_caller
 from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.mismatch import CameraDisagreementWarning
 from diffproj.calibration.result import Calibration
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.cayley import cross_matrix
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.slopes import by_direction
 
+CHANCE = 1e-4
+"""How likely the residuals of any of the points may be by chance before their cameras disagree."""
+MOST_NAMED = 5
+"""Points that a warning names."""
 STEPS = 12
 """Gauss-Newton steps from the point nearest to all rays; noise of pixels takes three or four."""
 
@@ -50,12 +61,15 @@ class Triangulation(Shown, Copied):
         valid: where at least two cameras see the point, in front of them, from different directions `(N,)`.
         covariance: of each point `(N, 3, 3)`, in squared world units: of its pixels and of the rig.
         residuals: projected minus seen pixels, by camera, `(N, 2)`; 0 where a camera does not see the point.
+        disagrees: where the residuals are larger than noise and rig explain, as where a camera's pixel is that of
+            another point `(N,)`. The covariance there is as much larger as it takes to explain them.
     """
 
     points: Float[Tensor, "n 3"]
     valid: Bool[Tensor, " n"]
     covariance: Float[Tensor, "n 3 3"]
     residuals: dict[str, Float[Tensor, "n 2"]]
+    disagrees: Bool[Tensor, " n"]
     _by_rig: Tensor  # derivative of the points by a root of the rig's covariance (N, 3, s)
     _of_pixels: Tensor  # covariance of the pixels' noise alone (N, 3, 3)
 
@@ -95,11 +109,16 @@ class Triangulation(Shown, Copied):
         """Points and deviations as columns of Python's own numbers: `pandas.DataFrame` takes it."""
         columns = {name: self.points[:, i].tolist() for i, name in enumerate("xyz")}
         columns |= {f"{name}_deviation": self.deviations[:, i].tolist() for i, name in enumerate("xyz")}
-        return columns | {"valid": self.valid.tolist()}
+        return columns | {"valid": self.valid.tolist(), "disagrees": self.disagrees.tolist()}
 
     def _facts(self) -> list[str]:
         size = self.deviations[self.valid].square().sum(-1).sqrt()
-        return [f"{len(self.points)} points", f"{int(self.valid.sum())} valid", f"deviation {shown(size, '.3g')}"]
+        return [
+            f"{len(self.points)} points",
+            f"{int(self.valid.sum())} valid",
+            f"deviation {shown(size, '.3g')}",
+            f"{int(self.disagrees.sum())} doubtful" if bool(self.disagrees.any()) else "",
+        ]
 
     def _columns(self) -> dict[str, list[Any]]:
         return self.to_dict()
@@ -125,18 +144,55 @@ def triangulated(rig: Rig, pixels_by_camera: Any, pixel_sigma: Any) -> Triangula
     eye = torch.eye(3, dtype=X.dtype, device=X.device)
     inverse = torch.linalg.inv(torch.where(valid[:, None, None], A, eye))
     root = _root(rig)
-    by_rig = X.new_zeros(len(X), 3, root.shape[-1])
-    for name in pixels:
-        own = rig.columns[name]
-        G = _by_parameters(rig, name, X)
-        weighted = J[name].mT @ G / sigma[name] ** 2
-        by_rig = by_rig - inverse @ torch.where(seen[name][:, None, None], weighted, 0.0) @ root[own]
-    by_rig = torch.where(valid[:, None, None], by_rig, 0.0)
-    inverse = torch.where(valid[:, None, None], inverse, 0.0)
+    whole = {name: (seen[name][:, None, None] / sigma[name]).to(X) for name in pixels}
+    slopes = torch.cat([J[name] * whole[name] for name in pixels], dim=-2)  # (N, 2 c, 3), in deviations
+    shifts = torch.cat([_by_parameters(rig, name, X) * whole[name] @ root[rig.columns[name]] for name in pixels], -2)
+    off = torch.cat([residuals[name].unsqueeze(-1) * whole[name] for name in pixels], dim=-2)
+    by_rig = -inverse @ slopes.mT @ shifts
+    disagrees, scale = _disagreement(slopes, shifts, off, inverse, count, valid)
+    if bool(disagrees.any()):
+        warn_caller(_doubt(disagrees), CameraDisagreementWarning)
+    by_rig = torch.where(valid[:, None, None], scale.sqrt()[:, None, None] * by_rig, 0.0)
+    inverse = torch.where(valid[:, None, None], scale[:, None, None] * inverse, 0.0)
     covariance = inverse + by_rig @ by_rig.mT
     points = torch.where(valid.unsqueeze(-1), X, 0.0)
     left = {name: torch.where(valid.unsqueeze(-1), residuals[name], 0.0) for name in pixels}
-    return Triangulation(points, valid, covariance, left, by_rig, inverse)
+    return Triangulation(points, valid, covariance, left, disagrees, by_rig, inverse)
+
+
+def _disagreement(
+    J: Tensor, G: Tensor, off: Tensor, inverse: Tensor, count: Tensor, valid: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Where residuals are none of chance `(N,)`, and the factor on variances that explains them; 1 elsewhere.
+
+    Args:
+        J: derivatives of all pixels by the point, in deviations `(N, 2 c, 3)`.
+        G: by a root of the rig's covariance `(N, 2 c, s)`.
+        off: the residuals `(N, 2 c, 1)`.
+        inverse: of `J^T J` `(N, 3, 3)`.
+        count: how many cameras see the point `(N,)`.
+        valid: where there is a point `(N,)`.
+    """
+    apart = torch.eye(J.shape[-2], dtype=J.dtype, device=J.device) - J @ inverse @ J.mT
+    left = apart @ G
+    spread = torch.eye(J.shape[-2], dtype=J.dtype, device=J.device) + left @ left.mT  # 1 in what the point takes up
+    squares = (off * torch.linalg.solve_ex(spread, off)[0]).sum((-2, -1))
+    spare = (2.0 * count.to(J) - 3).clamp(min=1)
+    chance = torch.special.gammaincc(spare / 2, squares.nan_to_num(0.0, 0.0) / 2)
+    disagrees = valid & (chance < CHANCE / max(1, int(valid.sum())))
+    return disagrees, torch.where(disagrees, squares / spare, 1.0)
+
+
+def _doubt(disagrees: Tensor) -> str:
+    which = disagrees.nonzero().flatten().tolist()
+    listed = ", ".join(map(str, which[:MOST_NAMED])) + f" and {len(which) - MOST_NAMED} more" * (
+        len(which) > MOST_NAMED
+    )
+    what = f"point {listed} is" if len(which) == 1 else f"points {listed} are"
+    return (
+        f"triangulate: {what} further from the cameras' rays than the deviations explain: are these pixels of one "
+        "point, of one moment, and as exact as pixel_sigma says, and did the cameras stand still?"
+    )
 
 
 def _checked(rig: Rig, pixels_by_camera: Any, pixel_sigma: Any) -> tuple[dict[str, Tensor], dict[str, float]]:

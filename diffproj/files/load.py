@@ -7,12 +7,14 @@ from typing import TypeVar
 import numpy as np
 
 from diffproj._core.arguments import called, file_path
+from diffproj._core.warn import warn_caller
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.rig_result import RigCalibration
 from diffproj.files import own_json
 from diffproj.files.document import Document
 from diffproj.files.formats import FormatName, PathLike, format_of
 from diffproj.files.found import Found
+from diffproj.files.image_sizes import exchanged_sides, other_image
 from diffproj.geometry.camera import Camera
 
 T = TypeVar("T")
@@ -25,7 +27,8 @@ def load_camera(path: PathLike, format: FormatName | None = None, camera: str | 
     """Load a camera; of a calibration, the camera without a pose.
 
     The formats are told apart by what is in the file; `diffproj.files` lists them with their conventions, which are
-    turned into those of `Camera`. What is not understood to the last coefficient of the lens is refused.
+    turned into those of `Camera`. What is not understood to the last coefficient of the lens is refused, and so is a
+    size that looks like height and width; a K that looks like that of another resolution is warned of.
 
     Args:
         path: the file to read.
@@ -69,9 +72,26 @@ def found_in(document: Document, format: FormatName | None = None) -> Found:  # 
     """
     try:
         with np.errstate(all="ignore"):  # a camera that is not finite is refused where it is built
-            return format_of(document, format).read(document)
+            found = format_of(document, format).read(document)
+        for one in found.cameras.values():
+            _check_size(one, own=own_json.recognises(document))
     except DAMAGE as error:
         raise ValueError(_message(document, error)) from error
+    return found
+
+
+def _check_size(camera: Camera, own: bool) -> None:
+    """Refuse sides in the wrong order, and warn of a K of another image; of the own file, which keeps all, warn.
+
+    Raises:
+        ValueError: the size looks like height and width.
+    """
+    exchanged = exchanged_sides(camera)
+    if exchanged and not own:
+        raise ValueError(f"size: want width and height, got {camera.size}, {exchanged}")
+    doubt = f"size: {camera.size}, {exchanged}" if exchanged else other_image(camera)
+    if doubt:
+        warn_caller(doubt)
 
 
 def load_calibration(path: PathLike, camera: str | None = None) -> Calibration:
@@ -136,9 +156,12 @@ def content_of(document: Document, camera: str | None = None) -> Camera | Calibr
 
 def _own(document: Document, read: Callable[[Document], T | None]) -> T | None:
     try:
-        return read(document) if own_json.recognises(document) else None
+        found = read(document) if own_json.recognises(document) else None
     except DAMAGE as error:
         raise ValueError(_message(document, error)) from error
+    if isinstance(found, Calibration):
+        _check_size(found.camera, own=True)
+    return found
 
 
 def _message(document: Document, error: Exception) -> str:

@@ -238,7 +238,7 @@ def _sides(mapping: dict[str, Any]) -> tuple[int, int] | None:
 
 
 def _plausible(size: tuple[int, int] | None, K: np.ndarray) -> tuple[int, int] | None:
-    """The size, unless it is (height, width), or that of something else, as the principal point tells."""
+    """The size, unless the principal point is beyond (height, width), or far off: see `image_sizes` for the rest."""
     x, y = float(K[0, 2]), float(K[1, 2])
     if size is not None and not (-size[0] < x < 2 * size[0] and -size[1] < y < 2 * size[1]):
         raise ValueError(

@@ -32,6 +32,7 @@ from torch.utils._pytree import tree_leaves
 
 from diffproj._core.arguments import called
 from diffproj._core.numerics import broadcast_batches
+from diffproj.calibration.mismatch import CameraDisagreementWarning
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.agreement import chances, chi_square, disagreeing, inverse, joined, without
 from diffproj.measurement.measurement import Measurement
@@ -40,10 +41,6 @@ from diffproj.measurement.sight import Sight, Straight
 
 MOST_POINTS = 3000
 """Whose joint covariance is inverted for each camera."""
-
-
-class CameraDisagreementWarning(UserWarning):
-    """Cameras that measured the same points disagree by more than their deviations explain."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

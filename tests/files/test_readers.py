@@ -475,10 +475,10 @@ def test_cameras_in_mappings_of_their_own(tmp_path: Path) -> None:
 
 
 def test_one_camera_of_several_is_asked_for(tmp_path: Path) -> None:
-    differing = SAMPLES["cameras.txt"].decode().replace("2 OPENCV 640 480", "2 OPENCV 320 240")
+    differing = SAMPLES["cameras.txt"].decode().replace("2 OPENCV 640 480", "2 OPENCV 660 480")
     with pytest.raises(ValueError, match=r"want the name of one camera, for the 2 of the file differ.*they are 1, 2"):
         load(tmp_path, "cameras.txt", differing)
-    assert load(tmp_path, "cameras.txt", differing, camera=1).size == (320, 240)
+    assert load(tmp_path, "cameras.txt", differing, camera=1).size == (660, 480)
     for asked in ("3", 2, -3):
         with pytest.raises(ValueError, match="camera: want"):
             load(tmp_path, "cameras.txt", camera=asked)

@@ -1,0 +1,75 @@
+"""Sizes that are (height, width), and those of other images than K is of: refused, or warned of."""
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import diffproj as dp
+from diffproj.files.image_sizes import exchanged_sides, other_image
+
+
+def _file(path: Path, size, c=(648.0, 487.0), f=900.0) -> Path:
+    K = [[f, 0, c[0]], [0, f, c[1]], [0, 0, 1]]
+    path.write_text(json.dumps({"camera_matrix": K, "dist_coeffs": [-0.2, 0.1, 0, 0, 0], "image_size": size}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("size", "c"), [((960, 1280), (648, 487)), ((1080, 1920), (960, 540)), ((480, 640), (326, 174))]
+)
+def test_height_and_width_are_refused(tmp_path: Path, size, c):
+    """The last are the numbers of a public Kalibr file, whose resolution is in the wrong order."""
+    with pytest.raises(ValueError, match=r"want width and height, got .*, which looks like height and width"):
+        dp.load_camera(_file(tmp_path / "a.json", size, c))
+    assert dp.load_camera(_file(tmp_path / "b.json", size[::-1], c)).size == size[::-1]
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_k_of_another_resolution_is_warned_of(tmp_path: Path, factor):
+    size = [int(1280 * factor), int(960 * factor)]
+    with pytest.warns(UserWarning, match="is K that of photographs of another resolution"):
+        assert dp.load_camera(_file(tmp_path / "a.json", size)).size == tuple(size)
+
+
+def test_right_cameras_are_left_alone():
+    """2000 of all shapes, their principal points off by 4 % of a side; and but few of 300 halves of images."""
+    generator = np.random.default_rng(4)
+    refused = 0
+    for i in range(2300):
+        w, h = map(int, generator.integers(200, 4000, 2))
+        c = np.array([w, h]) * (0.5 + 0.04 * generator.standard_normal(2))
+        if i >= 2000:
+            w, h, c = (w // 2, h, c - [generator.integers(0, w // 2), 0]) if i % 2 else (w, h // 2, c)
+        camera = dp.Camera(torch.tensor([[w, 0, c[0]], [0, w, c[1]], [0, 0, 1]]), size=(w, h))
+        assert i >= 2000 or not exchanged_sides(camera)
+        assert not other_image(camera)
+        refused += bool(exchanged_sides(camera))
+    assert refused <= 2
+
+
+def test_turned_cameras_keep_their_sides(tmp_path: Path):
+    """A photograph turned by a right angle, with the K that belongs to it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert dp.load_camera(_file(tmp_path / "a.json", [960, 1280], (472.0, 648.0))).size == (960, 1280)
+
+
+def test_the_own_file_is_loaded_and_warned_of(tmp_path: Path):
+    """It keeps whatever camera there is."""
+    K = torch.tensor([[900.0, 0, 648], [0, 900, 487], [0, 0, 1]])
+    dp.save_camera(tmp_path / "a.json", dp.Camera(K, size=(960, 1280)))
+    with pytest.warns(UserWarning, match="looks like height and width"):
+        assert dp.load_camera(tmp_path / "a.json").size == (960, 1280)
+
+
+def test_a_calibration_of_another_size_than_its_photographs_is_refused(tmp_path: Path):
+    dp.save_camera(tmp_path / "a.json", dp.calibrate(dp.example_views("left"), dp.Chessboard()))
+    fields = json.loads((tmp_path / "a.json").read_text())
+    fields["camera"]["size"] = [480, 640]
+    (tmp_path / "a.json").write_text(json.dumps(fields))
+    with pytest.raises(ValueError, match=r"size: want that of the camera, \(480, 640\), got \(640, 480\)"):
+        dp.load(tmp_path / "a.json")
