@@ -78,9 +78,11 @@ class CalibrationOptions(LocateOptions, TypedDict, total=False):
         priors: what is known beforehand, by name or group: a standard deviation about the values that `fixed` would
             keep, or a tuple `(mean, standard deviation)`, of each member of a group; with `tied_focal`, `"focal"` is
             one number, that of `f_x`, and is known once. It weighs against corners whose standard deviation is
-            `pixel_sigma`, or `1 / sqrt(weight)` px: give one along with it. Under `"points"`, the standard deviation of
-            the coordinates of free points about their nominal places: a number, or one for each axis, `(3,)`, or
-            coordinate, `(N, 3)`; where neither is given, it weighs against the noise that the residuals tell.
+            `pixel_sigma`, or `1 / sqrt(weight)` px, and 1 px where neither is given: give one along with it. (A remark
+            says so where the noise that the residuals tell would move a parameter by half its deviation.) Under
+            `"points"`, the standard deviation of the coordinates of free points about their nominal places: a number,
+            or one for each axis, `(3,)`, or coordinate, `(N, 3)`; where neither is given, it weighs against the noise
+            that the residuals tell.
     """
 
     objective: Objective

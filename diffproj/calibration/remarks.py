@@ -25,6 +25,7 @@ from diffproj.calibration.entangled import Entangled, Simpler
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.leftover import Leftover, leftover
 from diffproj.calibration.prior_contradiction import PriorContradiction, prior_contradictions
+from diffproj.calibration.prior_weight import Elsewhere, weighed_anew
 from diffproj.calibration.remark import OF_THE_CAMERA, Kind, Remark, Remarks
 from diffproj.calibration.solver import Status
 from diffproj.calibration.task import Task
@@ -78,6 +79,9 @@ def remarks(
             )
     for p, other in doubt.simpler.items():
         said[p].append(Remark(_not_told(other)))
+    for p, elsewhere in weighed_anew(found).items():
+        if bool(converged[p]):
+            said[p].append(Remark(_weighed_anew(elsewhere)))
     for p in (converged & _unsure_focal(found)).nonzero().flatten().tolist():
         said[p].append(Remark(_unsure(found, p)))
     for p in (converged & _contradicts_noise(found)).nonzero().flatten().tolist():
@@ -162,6 +166,13 @@ def _not_told(other: Simpler) -> str:
     return (
         f"these views hardly tell {', '.join(other.held)} from {other.name}: without {it} it is {other.there:.1f} px, "
         f"not {other.here:.1f}, at residuals {grown}; the error bars hold both; fix {it}, or take a simpler lens"
+    )
+
+
+def _weighed_anew(other: Elsewhere) -> str:
+    return (
+        f"the priors weigh against corners that are known to 1 px, and these scatter by {other.sigma:.2g} px: with "
+        f"pixel_sigma={other.sigma:.2g} {other.name} would be about {other.there:.5g}, not {other.here:.5g}"
     )
 
 

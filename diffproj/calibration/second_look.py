@@ -8,10 +8,10 @@ lens that stands for what the poses should explain. A camera is looked at again 
 * a view fits far worse than the others, as one does that is turned over where a long lens bends to the rest.
 
 Then starts compete. The best focal lengths of a grid (`focal_grid`), with and without the lens's first estimate, are
-solved side by side, and what ends lowest is kept, or what is reached from it with the principal point on another side
-of the image's middle, or with views turned over (`turned_views`). Who is still lost then, with the principal point far
-outside the image, climbs a ladder of focal lengths (`focal_ladder`), or as a fisheye starts from a grid of principal
-points. A minimum is only ever replaced by a lower one, or by one as low where the solver came to an end.
+solved side by side, and what ends lowest is kept, or what is reached from it with the principal point at the image's
+middle or on another side of it, or with views turned over (`turned_views`). Who is still lost then, with the principal
+point far outside the image, climbs a ladder of focal lengths (`focal_ladder`), or as a fisheye starts from a grid of
+principal points. A minimum is only ever replaced by a lower one, or by one as low where the solver came to an end.
 """
 
 from collections.abc import Sequence
@@ -126,7 +126,7 @@ def second_look(
         found = _from_other_middles(found, straight, which, reject, steps)
     short: dict[str, Any] = steps | {"max_iterations": SHORT_FIT}
     if moves_principal_point(task):
-        found = _with_other_sides(found, straight.middle[which], which, short, steps, reject)
+        found = _with_other_principal_points(found, straight.middle[which], which, short, steps, reject)
     if straight.lens == "none" and MODELS[straight.model].count:
         found = _along_focal_lengths(found, straight, which, reject, steps)
     return found if reject is not None else _with_views_turned_over(found, which, short, steps)
@@ -229,39 +229,41 @@ def _with_views_turned_over(found: Fit, which: Tensor, short: dict[str, Any], st
     return found
 
 
-def _with_other_sides(
+def _with_other_principal_points(
     found: Fit, middle: Tensor, which: Tensor, short: dict[str, Any], steps: dict[str, Any], reject: float | None
 ) -> Fit:
-    """The fit of some cameras `(n,)`, or what is lower from the principal point on the image's other sides.
+    """The fit of some cameras `(n,)`, or what is lower from the principal point elsewhere in the image.
 
     Of a long lens the principal point is hardly known, and with it decides which way the coefficients bend the image:
-    there are valleys on both sides of the middle `(n, 2)`, and where it is far off in both directions, on four.
+    there are valleys on both sides of the middle `(n, 2)`, where it is far off in both directions, on four; and another
+    may be reached from the middle itself.
     """
     part = found.part(which)
     solution = part.solution
     both = ~((solution.shared[:, 2:4] - middle).abs().amin(-1) <= ASIDE * 2 * middle.amax(-1))
     every = torch.arange(len(which), device=which.device)
-    rows = torch.cat([every, every[both], every[both]])
-    sides = middle.new_tensor([(1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])
-    sides = sides.repeat_interleave(torch.tensor([len(every), *[int(both.sum())] * 2], device=rows.device), dim=0)
-    start = _other_side(
-        part.task.parameters, solution.shared[rows], part.part(rows).solution.local, middle[rows], sides
-    )
-    if not bool(both.any()):
-        return lower_fit(found, fit(part.task, *start, reject=reject, **steps), which, reject)
+    starts = [every, every, every[both], every[both]]
+    sides = middle.new_tensor([(1.0, 1.0), (0.5, 0.5), (1.0, 0.0), (0.0, 1.0)])
+    counts = torch.tensor([len(some) for some in starts], device=which.device)
+    rows, sides = torch.cat(starts), sides.repeat_interleave(counts, dim=0)
+    start = _elsewhere(part.task.parameters, solution.shared[rows], part.part(rows).solution.local, middle[rows], sides)
     tried = fit(part.task.part(rows), *start, reject=reject, **short)
     best = tried.part(every)
-    for first in (len(every), len(every) + int(both.sum())):
-        some = torch.arange(first, first + int(both.sum()), device=rows.device)
-        best = lower_fit(best, tried.part(some), every[both], reject)
+    for some, numbers in zip(
+        starts[1:], torch.arange(len(rows), device=rows.device).split(counts.tolist())[1:], strict=True
+    ):
+        best = lower_fit(best, tried.part(numbers), some, reject)
     last = fit(part.task, best.solution.shared, best.solution.local, reject=reject, **steps)
     return lower_fit(found, last, which, reject)
 
 
-def _other_side(
+def _elsewhere(
     parameters: Parametrisation, shared: Tensor, poses: Pose, middle: Tensor, sides: Tensor
 ) -> tuple[Tensor, Pose]:
-    """The same with the principal point mirrored at the middle where `sides (n, 2)` are 1, views shifted, no lens."""
+    """The same with the principal point elsewhere, views shifted and no lens.
+
+    It is mirrored at the middle where `sides (n, 2)` are 1, and at it where they are a half.
+    """
     shared, (R, t) = shared.clone(), poses
     moved = 2 * (middle - shared[:, 2:4]) * sides
     lens = slice(len(INTRINSICS), parameters.lens_end)
