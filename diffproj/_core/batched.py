@@ -290,6 +290,9 @@ def index_batch(tensor: Tensor, index: Any, behind: int) -> Tensor:
     index = tuple(_for_tensors(part) for part in (index if isinstance(index, tuple) else (index,)))
     if not any(part is Ellipsis for part in index):
         index = (*index, Ellipsis)
+    if not tensor.is_meta and any(isinstance(part, Tensor) and part.is_meta for part in index):
+        # PyTorch would give memory as it lies.
+        raise IndexError("index: want numbers that are known, got a tensor on the meta device")
     try:
         return tensor[(*index, *(slice(None),) * behind)]
     except (IndexError, TypeError, ValueError, RuntimeError, OverflowError) as error:

@@ -18,6 +18,7 @@ from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
 from diffproj.calibration.bow import bow_deviation, bowed
 from diffproj.calibration.comparison import LensComparison
 from diffproj.calibration.covariance import Covariance
+from diffproj.calibration.indexed import Indexed
 from diffproj.calibration.mismatch import Mismatch
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.positions import Positions, positions
@@ -47,10 +48,10 @@ class CalibrationError(RuntimeError):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibration(Account, Copied, Recorded):
+class Calibration(Account, Copied, Recorded, Indexed):
     """A camera with the poses of the views that it was found from, and those views.
 
-    Many cameras side by side have a batch shape `*B`; for one camera it is empty.
+    Many cameras side by side have a batch shape `*B`; for one camera it is empty. `calibration[i]` is one of many.
 
     Attributes:
         camera: intrinsics and lens with the world frame in the camera, batch shape `*B`: what one saves.

@@ -446,6 +446,7 @@ def _calibration(t: Things) -> dict[str, Call]:
                 "pixel_sigma": {"one": 0.1, "two": 0.2},
             },
         ),
+        "Calibration[]": Call(t.many.__getitem__, {"index": 1}),
         "RigCalibration[]": Call(t.rig.__getitem__, {"name": "one"}),
         "Triangulation.between": Call(t.triangulated.between, {"i": 0, "j": 1}),
         "Triangulation.length": Call(t.triangulated.length, {"i": 0, "j": 1}),
