@@ -13,8 +13,8 @@ from diffproj.calibration.validation import CrossValidation, cross_validate
 from diffproj.cli.calibrate_document import document
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
 from diffproj.cli.inputs import check_writable, writing
-from diffproj.cli.photographs import find_corners, photographs
-from diffproj.cli.reporting import check_report, report_text, write_page
+from diffproj.cli.photographs import photographs, search
+from diffproj.cli.reporting import check_report, kept_for, report_text, write_page
 from diffproj.cli.terminal import (
     RESULTS,
     aligned,
@@ -43,7 +43,9 @@ def run(options: argparse.Namespace) -> int:
     lens = {"shape": options.shape, "skew": options.skew, "reject_outliers": options.reject_outliers}
     with progress_bars() as bars:
         folders = [path for path in options.photographs if path.is_dir()]
-        views = find_corners(sources, board, bars, orientation=options.orientation, in_folders=folders)
+        kept = kept_for(options.report, len(sources), board)
+        found = search(sources, board, bars, orientation=options.orientation, in_folders=folders, beside=kept)
+        views = found.views
         if options.folds is not None and options.folds > len(views):
             raise ValueError(f"--folds: want at most the number of views, {len(views)}, got {options.folds}")
         task = bars.add_task("Solving", total=None)
@@ -64,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
     page = ""
     if options.report is not None:
         with working("Writing the report"):
-            page = report_text(calibration, options, sources, board, folds)
+            page = report_text(calibration, options, found, board, folds)
     try:
         _write(options, calibration, page)
     except OSError:

@@ -9,7 +9,7 @@ from rich.table import Table
 from diffproj._core.atomic import write_whole
 from diffproj.calibration.result import CalibrationError
 from diffproj.cli.inputs import check_folder, writing
-from diffproj.cli.photographs import find_corners, photographs
+from diffproj.cli.photographs import photographs, search
 from diffproj.cli.terminal import RESULTS, as_json, in_options, progress_bars, result, working
 from diffproj.cli.units import heading
 from diffproj.files.save import save_camera
@@ -92,7 +92,7 @@ def _corners(options: argparse.Namespace) -> tuple[Views, Chessboard, tuple[list
     if options.images is not None:
         with progress_bars() as bars:
             folders = [path for path in options.images if path.is_dir()]
-            views = find_corners(photographs(options.images), board, bars, in_folders=folders)
+            views = search(photographs(options.images), board, bars, in_folders=folders).views
         return views, board, default_split(len(views))
     if options.data == "synthetic":
         setup = paper_setup()
@@ -102,7 +102,7 @@ def _corners(options: argparse.Namespace) -> tuple[Views, Chessboard, tuple[list
                 synthetic.photograph(camera, setup.board, seed=i).numpy()
                 for i, camera in enumerate(bars.track(cameras, description="Rendering"))
             ]
-            views = find_corners(images, setup.board, bars)
+            views = search(images, setup.board, bars).views
         named = Views(views.pixels, views.visible, setup.names, views.size)
         count = len(setup.fit.R)
         return named, board, (list(range(count)), list(range(count, len(named))))

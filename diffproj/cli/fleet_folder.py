@@ -6,10 +6,9 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from diffproj.cli.photographs import photographs
+from diffproj.cli.photographs import photographs, search_in_folders
 from diffproj.cli.terminal import NOTES, failure
 from diffproj.targets.boards import Board
-from diffproj.targets.detection import detect
 from diffproj.targets.views import Views
 
 
@@ -55,7 +54,7 @@ def searched(folder: Folder) -> Searched:
         try:
             sources = photographs([folder.path])
             count = len(sources)
-            views = detect(sources, folder.board, orientation=folder.orientation)
+            views = search_in_folders(sources, folder.board, [folder.path], orientation=folder.orientation).views
         except (ValueError, OSError, RuntimeError) as problem:
             error = failure(problem)
     lines = [line.removeprefix("diffproj: ") for line in said.get().splitlines()]

@@ -2,22 +2,20 @@
 
 import hashlib
 import os
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 from rich.progress import Progress
 
 from diffproj.cli.terminal import counted, detail, note, working
 from diffproj.targets import videos
 from diffproj.targets.boards import Board
-from diffproj.targets.detection import detect
+from diffproj.targets.detection import Searched, searched
 from diffproj.targets.images import SUFFIXES, NotAnImageError, Orientation, Photograph, decoded, listed
-from diffproj.targets.views import Views
 
 HEIC = frozenset({".heic", ".heif", ".hif"})
 RAW = frozenset({".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2"})
@@ -73,14 +71,15 @@ def one_photograph(path: Path, orientation: Orientation, colour: bool = False) -
         return Photograph(files[0].name, str(files[0]), decoded(files[0], orientation, colour))
 
 
-def find_corners(
+def search(
     sources: list[Any],
     board: Board,
     bars: Progress,
     title: str = "Finding corners",
     orientation: str = "sensor",
     in_folders: Collection[Path] = (),
-) -> Views:
+    beside: Callable[..., object] | None = None,
+) -> Searched:
     """The board's corners in photographs, on all cores, under a progress bar.
 
     Args:
@@ -90,43 +89,41 @@ def find_corners(
         title: of the progress bar.
         orientation: how pixels are counted.
         in_folders: folders that were named; what cannot be read of these is left out, and told.
+        beside: makes something small of each photograph with the board while it is decoded, see `searched`.
     """
     task = bars.add_task(title, total=None)
     with ThreadPoolExecutor(max(1, min(len(sources), os.cpu_count() or 1))) as cores, _silent_opencv():
-
-        def found(among: list[Any]) -> Views:
-            return detect(
-                among,
-                board,
-                lambda done, total: bars.update(task, completed=done, total=total),
-                orientation=orientation,
-                executor=cores,
-            )
-
-        try:
-            views = found(sources)
-        except NotAnImageError as error:
-            if error.path.parent not in in_folders:
-                raise
-            views = found(_readable(sources, in_folders))
-    detail(f"{title}: {counted(len(views), 'view')} of {counted(len(sources), 'photograph')}")
-    return views
-
-
-def _readable(sources: list[Photograph], in_folders: Collection[Path]) -> list[Photograph]:
-    """Without what cannot be read of the folders."""
-    left = [one for one in sources if isinstance(one.source, Path) and one.source.parent in in_folders]
-    broken = [one for one in left if isinstance(one.source, Path) and not _is_image(one.source)]
-    kept = [one for one in sources if not any(one is other for other in broken)]
-    if not kept:
-        folder = Path(broken[0].label).parent
-        raise ValueError(
-            f"{folder}: want a folder with photographs ({', '.join(sorted(SUFFIXES))}), its "
-            f"{counted(len(broken), 'image file')} cannot be read; copy them once more"
+        found = search_in_folders(
+            sources,
+            board,
+            in_folders,
+            progress=lambda done, total: bars.update(task, completed=done, total=total),
+            orientation=orientation,
+            executor=cores,
+            beside=beside,
         )
-    for one in broken:
+    detail(f"{title}: {counted(len(found.views), 'view')} of {counted(len(sources), 'photograph')}")
+    return found
+
+
+def search_in_folders(sources: list[Any], board: Board, folders: Collection[Path], **how: Any) -> Searched:
+    """What `searched` finds, without what cannot be read of some folders, which is told.
+
+    Raises:
+        ValueError: nothing in them can be read; or as `searched`.
+    """
+    try:
+        found = searched(sources, board, may_be_broken=folders, **how)
+    except NotAnImageError as error:
+        if error.path.parent not in folders:
+            raise
+        raise ValueError(
+            f"{error.path.parent}: want a folder with photographs ({', '.join(sorted(SUFFIXES))}), its "
+            f"{counted(len(sources), 'image file')} cannot be read; copy them once more"
+        ) from error
+    for one in found.broken:
         note(f"{one.label}: cannot be read as an image; skipped")
-    return kept
+    return found
 
 
 def _is_video(path: Path) -> bool:
@@ -181,12 +178,6 @@ def _in_folder(folder: Path) -> list[Path]:
     if left:
         note(f"{folder}: skipped {' and '.join(left)}")
     return [Path(one.label) for one in listed(str(folder))]
-
-
-def _is_image(path: Path) -> bool:
-    """Whether OpenCV reads it; at an eighth of its size, which for JPEG takes a fraction of the time."""
-    data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    return bool(data.size) and cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_8) is not None
 
 
 @contextmanager

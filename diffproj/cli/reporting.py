@@ -1,7 +1,7 @@
 """The report that `--report` asks for: checked before the work, written whole after it."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ from diffproj.cli.inputs import check_writable, writing
 if TYPE_CHECKING:  # the help needs neither
     from diffproj.calibration.result import Calibration
     from diffproj.calibration.validation import CrossValidation
+    from diffproj.targets.detection import Searched
 
 SUFFIXES = (".html", ".htm")
 
@@ -36,19 +37,29 @@ def check_report(path: Path | None) -> None:
         import_module("jinja2")
 
 
+def kept_for(path: Path | None, photographs: int, board: Any) -> Callable[..., object] | None:
+    """What keeps of a photograph, while it is decoded, what a report shows of it; nothing where none is asked for."""
+    if path is None:
+        return None
+    from diffproj.report.pictures import keeper  # here, for it takes a while to load
+
+    return keeper(photographs, len(board.points))
+
+
 def report_text(
     calibration: "Calibration",
     options: argparse.Namespace,
-    photographs: Sequence[Any],
+    found: "Searched",
     board: Any,
     folds: "CrossValidation | None",
 ) -> str:
-    """The report on a calibration, with the views held out as they were, or in five folds."""
+    """The report on a calibration of views that were found, with them held out as they were, or in five folds."""
+    from diffproj.report.pictures import of_search
     from diffproj.report.write import FOLDS, report  # here, for it takes a while to load
 
     return report(
         calibration,
-        photographs,
+        of_search(found),
         FOLDS if folds is None else folds,
         target=board,
         orientation=options.orientation,

@@ -10,7 +10,7 @@ import torch
 from diffproj.calibration.locate import locate
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.rig_result import RigCalibration
-from diffproj.cli.photographs import find_corners, one_photograph
+from diffproj.cli.photographs import one_photograph, search
 from diffproj.cli.terminal import detail, progress_bars
 from diffproj.cli.units import Length, agreed, heading
 from diffproj.cli.which_board import given_board
@@ -120,7 +120,7 @@ def new_photograph(options: argparse.Namespace, photograph: Photograph) -> Scene
         if doubt is not None:
             warnings.warn(doubt, stacklevel=2)
     with progress_bars() as bars:
-        views = find_corners([photograph], board, bars, orientation=options.orientation)
+        views = search([photograph], board, bars, orientation=options.orientation).views
     check_size(camera, views.size, options.camera, options.photograph)
     try:
         found = locate(views, board, camera if calibration is None else calibration)

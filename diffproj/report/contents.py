@@ -3,6 +3,8 @@
 import warnings
 from collections.abc import Iterable
 
+import torch
+
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.validation import CrossValidation
 from diffproj.geometry.plane import Plane
@@ -22,11 +24,12 @@ from diffproj.report.usage import usage_part
 from diffproj.report.verdict import verdict_part
 from diffproj.targets.images import Orientation, Source
 from diffproj.targets.target import Target
+from diffproj.targets.videos import Frame
 
 
 def contents(
     calibration: Calibration,
-    photographs: Source | Iterable[Source] | None,
+    photographs: Source | Iterable[Source] | Pictures | None,
     folds: CrossValidation | int | None,
     target: Target | None,
     orientation: Orientation,
@@ -38,9 +41,12 @@ def contents(
     Raises:
         ValueError: the photographs are not those of the views, or no size is known.
     """
-    found = pictures(
-        photographs, calibration.views.names, calibration.views.size or calibration.camera.size, orientation
-    )
+    views, size = calibration.views, calibration.views.size or calibration.camera.size
+    if isinstance(photographs, Pictures):
+        found = photographs
+    else:
+        corners = views.pixels.detach().to("cpu", torch.float64).numpy()
+        found = pictures(photographs, views.names, corners, size, orientation)
     if found.size is None:
         raise ValueError(
             "calibration: want one whose image size is known, got none; give views a size, dp.Views(pixels, "
@@ -72,6 +78,7 @@ def _measuring(facts: Facts, found: Pictures, orientation: Orientation) -> list[
         return []
     plane = Plane.z(float(facts.calibration.nominal[:, 2].mean()))
     source, name = found.sources[view], facts.names[view]
+    source = source.image if isinstance(source, Frame) else source
     return [measuring_part(source, facts.calibration, plane, view, orientation=orientation, name=name)]
 
 

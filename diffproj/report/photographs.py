@@ -8,9 +8,8 @@ from markupsafe import Markup
 from diffproj.report import svg
 from diffproj.report.document import Part, render, shortened
 from diffproj.report.facts import NAME, Facts
-from diffproj.report.pictures import LOUPE, Pictures
+from diffproj.report.pictures import MOST_VIEWS, SIDE, Pictures
 
-MOST_VIEWS = 60
 MOST_CORNERS = 40_000
 """Corners of all views together above which only some views are shown, those that fit worst first."""
 ODD = 2.0
@@ -26,7 +25,7 @@ def photographs_part(facts: Facts, pictures: Pictures) -> Part:
     if count > min(MOST_VIEWS, fitting):
         worst = sorted(views, key=lambda view: -np.nan_to_num(facts.view_rms[view]))
         views = sorted(worst[: min(MOST_VIEWS, fitting)])
-    addresses = pictures.small(views)
+    addresses = pictures.addresses(views)
     magnification = times(facts, ARROW)
     usual = float(np.nanmedian(facts.view_rms)) if facts.seen_views else 0.0
     cards = []
@@ -51,6 +50,7 @@ def photographs_part(facts: Facts, pictures: Pictures) -> Part:
         left_out=count - len(views),
         count=count,
         others=others,
+        searched=pictures.searched,
         magnification=f"{magnification:g}",
         shown=bool(addresses),
         rejected=bool(facts.rejected.any()),
@@ -99,15 +99,14 @@ def _loupe(facts: Facts, view: int, pictures: Pictures) -> Markup:
     if found is None:
         return Markup()
     address, left, top = found
-    side = 2 * LOUPE + 1
     du, dv = facts.residuals[view, corner]
     parts = [
-        svg.image(left - 0.5, top - 0.5, side, side, address, "pixels"),
+        svg.image(left - 0.5, top - 0.5, SIDE, SIDE, address, "pixels"),
         svg.rings([(u, v)], 2.0, "seen"),
         svg.crosses([(u + du, v + dv)], 1.6, "off", 2),
     ]
     label = f"The corner of {facts.names[view]} that fits worst, enlarged: {svg.plain(float(lengths[corner]))} px off"
-    box = f"{left - 0.5} {top - 0.5} {side} {side}"
+    box = f"{left - 0.5} {top - 0.5} {SIDE} {SIDE}"
     return Markup('<svg class="picture loupe" viewBox="{}" role="img" aria-label="{}">{}</svg>').format(
         box, label, Markup("").join(parts)
     )

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable
-from typing import Any, cast, get_args
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 from diffproj._core.arguments import called, choice, file_path, whole_number
 from diffproj._core.atomic import write_whole
@@ -12,6 +12,9 @@ from diffproj.calibration.rig_result import RigCalibration
 from diffproj.calibration.validation import CrossValidation
 from diffproj.targets.images import Orientation, Source
 from diffproj.targets.target import Target, points_of
+
+if TYPE_CHECKING:  # it loads Jinja2
+    from diffproj.report.pictures import Pictures
 
 TITLE = "Calibration of a camera"
 FOLDS = 5
@@ -75,7 +78,7 @@ def write_report(
 
 def report(
     calibration: Calibration,
-    photographs: Source | Iterable[Source] | None = None,
+    photographs: "Source | Iterable[Source] | Pictures | None" = None,
     folds: CrossValidation | int | None = FOLDS,
     target: Target | None = None,
     orientation: Orientation | str = "sensor",

@@ -2,12 +2,15 @@
 
 import functools
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import Executor
-from typing import get_args
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 import torch
+from jaxtyping import Float, Shaped
 
 from diffproj._core.arguments import function, whole_number
 from diffproj.targets.april_grid import AprilGrid
@@ -16,7 +19,7 @@ from diffproj.targets.charuco import CharucoBoard
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.finders import Found, find
-from diffproj.targets.images import Orientation, Photograph, Source, grey, listed
+from diffproj.targets.images import NotAnImageError, Orientation, Photograph, Source, grey, listed
 from diffproj.targets.numbering import follow
 from diffproj.targets.tasks import results_of
 from diffproj.targets.videos import Frame, distinct
@@ -119,6 +122,60 @@ def detect(
         >>> views.pixels[0, :2].round(decimals=1).tolist()  # each edge is half a pixel before its first pixel
         [[69.5, 69.5], [109.5, 69.5]]
     """
+    return searched(
+        photographs, target, progress, orientation=orientation, frames=frames, executor=executor, stacklevel=3
+    ).views
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What a search of photographs found.
+
+    Attributes:
+        views: those in which the board was found.
+        photographs: the photograph of each view.
+        beside: what was made of each of these, while it was decoded; empty where nothing was asked for.
+        without: photographs without the board.
+        broken: files that are no images, of those that may be.
+    """
+
+    views: Views
+    photographs: tuple[Photograph, ...]
+    beside: tuple[Any, ...]
+    without: tuple[Photograph, ...]
+    broken: tuple[Photograph, ...]
+
+
+def searched(
+    photographs: Source | Iterable[Source],
+    target: Board,
+    progress: Callable[[int, int], object] | None = None,
+    *,
+    orientation: Orientation | str = "sensor",
+    frames: int | None = None,
+    executor: Executor | None = None,
+    beside: Callable[[Shaped[np.ndarray, "h w"], Float[np.ndarray, "n 2"]], object] | None = None,
+    may_be_broken: Collection[Path] = (),
+    stacklevel: int = 2,
+) -> Searched:
+    """What `detect` does, with all that it learns of the photographs.
+
+    Args:
+        photographs: as `detect` takes them, and so are those that follow.
+        target: see there.
+        progress: see there.
+        orientation: see there.
+        frames: see there.
+        executor: see there.
+        beside: makes something small of a grey photograph from 0 to 255 that shows the board, and of the corners' px,
+            NaN where hidden. It runs where the photograph is decoded, so that nobody decodes it again.
+        may_be_broken: folders, of which files that are no images are left out.
+        stacklevel: of the warnings.
+
+    Raises:
+        NotAnImageError: a file is no image, or none of those that may be broken is one.
+        Exception: as `detect`.
+    """
     as_target(target)
     if progress is not None:
         function("progress", progress, "a function of (done, total)")
@@ -131,35 +188,61 @@ def detect(
         frames = whole_number("frames", frames, "a whole number from 1 on", least=1)
     listing = listed(photographs, frames)
     # One reading for size and corners: to decode a photograph takes as long as to find a board in it.
-    search = functools.partial(_find, target=target, orientation=raster)
-    found = results_of(search, listing, executor, progress)
+    search = functools.partial(
+        _find, target=target, orientation=raster, beside=beside, may_be_broken=frozenset(may_be_broken)
+    )
+    results = results_of(search, listing, executor, progress)
+    broken = [photograph for photograph, one in zip(listing, results, strict=True) if one is None]
+    if len(broken) == len(listing):
+        path = Path(broken[0].label)
+        raise NotAnImageError(path, path.stat().st_size)
+    pairs = [(photograph, one) for photograph, one in zip(listing, results, strict=True) if one is not None]
+    listing, found = [photograph for photograph, _ in pairs], [one for _, one in pairs]
     size = _common_size(listing, [one.size for one in found])
-    pairs = [(photograph, one.grid) for photograph, one in zip(listing, found, strict=True) if one.grid is not None]
+    pairs = [(photograph, one) for photograph, one in pairs if one.grid is not None]
     if not pairs:
         raise BoardNotFoundError(_advice([photograph.label for photograph in listing], found, target))
+    without = [photograph for photograph, one in zip(listing, found, strict=True) if one.grid is None]
     for photograph, one in zip(listing, found, strict=True):
         if one.grid is None and _sharpness(photograph) is None:
             text = f"{_miss(photograph, one, target)}; photograph skipped"
-            warnings.warn(text, BoardNotFoundWarning, stacklevel=2)
-    seen, grids = zip(*pairs, strict=True)
-    grids = follow(list(grids), target) if isinstance(target, Chessboard | CircleGrid) else list(grids)
+            warnings.warn(text, BoardNotFoundWarning, stacklevel=stacklevel)
+    seen = [photograph for photograph, _ in pairs]
+    grids = [one.grid for _, one in pairs if one.grid is not None]
+    grids = follow(grids, target) if isinstance(target, Chessboard | CircleGrid) else grids
     # Of a video, one view of each place: copies of a view make error bars too small.
     chosen = [k for k, photograph in enumerate(seen) if _sharpness(photograph) is not None]
     new = distinct([grids[k] for k in chosen], [_sharpness(seen[k]) or 0.0 for k in chosen], size)
     kept = sorted({*range(len(seen))} - {k for k, differs in zip(chosen, new, strict=True) if not differs})
     pixels = torch.from_numpy(np.stack([grids[k] for k in kept])).reshape(len(kept), len(target), 2)
     names = [seen[k].name for k in kept]
-    return Views(pixels, pixels.isfinite().all(dim=-1), names=names, size=size)
+    views = Views(pixels, pixels.isfinite().all(dim=-1), names=names, size=size)
+    made = () if beside is None else tuple(pairs[k][1].beside for k in kept)
+    return Searched(views, tuple(seen[k] for k in kept), made, tuple(without), tuple(broken))
 
 
-def _find(photograph: Photograph, target: Board, orientation: Orientation) -> Found:
-    """Read one photograph and find the target in it: the work of one task."""
-    image = grey(photograph, orientation)
+def _find(
+    photograph: Photograph,
+    target: Board,
+    orientation: Orientation,
+    beside: Callable[..., object] | None,
+    may_be_broken: frozenset[Path],
+) -> Found | None:
+    """Read one photograph and find the target in it, the work of one task; `None` for a broken one that may be so."""
+    try:
+        image = grey(photograph, orientation)
+    except NotAnImageError as error:
+        if error.path.parent in may_be_broken:
+            return None
+        raise
     size = image.shape[1], image.shape[0]
     try:
-        return find(image, target)._replace(size=size)
+        found = find(image, target)._replace(size=size)
+        if beside is not None and found.grid is not None:
+            found = found._replace(beside=beside(image, found.grid.reshape(-1, 2)))
     except Exception as error:
         raise RuntimeError(f"{photograph.label}: {type(error).__name__} while searching it: {error}") from error
+    return found
 
 
 def _sharpness(photograph: Photograph) -> float | None:

@@ -29,12 +29,14 @@ class Found(NamedTuple):
         seen: `(columns, rows)` of the largest pattern where there is no such chessboard; (0, 0) for none.
         hint: what is there instead of another board, and what to give then; empty for nothing.
         size: `(width, height)` of the photograph, which who reads it fills in.
+        beside: what else was made of the photograph.
     """
 
     grid: Float[np.ndarray, "rows columns 2"] | None
     seen: tuple[int, int] = (0, 0)
     hint: str = ""
     size: tuple[int, int] = (0, 0)
+    beside: object = None
 
 
 def find(image: Shaped[np.ndarray, "h w"], target: Board) -> Found:

@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import torch
 
 import diffproj as dp
 from diffproj.cli import calibrating
+from diffproj.targets.detection import Searched
 from tests.cli.commands import runner
 
 PHOTOGRAPHS = Path(os.environ.get("DIFFPROJ_PHOTOS", "/usr/share/doc/opencv-doc/examples/data"))
@@ -100,13 +102,14 @@ def test_calibrate_names_rejected_corners(
     corner = 11
     shift = torch.zeros(5, 40, 2, dtype=torch.float64)
     shift[2, corner, 0] = 1.0
-    found = calibrating.find_corners
+    found = calibrating.search
 
-    def spoilt(*arguments: Any, **options: Any) -> dp.Views:
-        views = found(*arguments, **options)
-        return dp.Views(views.pixels + shift, names=views.names, size=views.size)
+    def spoilt(*arguments: Any, **options: Any) -> Searched:
+        searched = found(*arguments, **options)
+        views = searched.views
+        return replace(searched, views=dp.Views(views.pixels + shift, names=views.names, size=views.size))
 
-    monkeypatch.setattr(calibrating, "find_corners", spoilt)
+    monkeypatch.setattr(calibrating, "search", spoilt)
     code, out, _ = calibrate(capsys, folder, *options)
     assert code == 0
     assert "1 corner rejected as outlier\n" in out
@@ -228,7 +231,7 @@ def test_interrupting_is_no_traceback(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(calibrating, "find_corners", interrupt)
+    monkeypatch.setattr(calibrating, "search", interrupt)
     code, _, err = calibrate(capsys, photographs / "1.png", "-o", tmp_path / "camera.json")
     assert (code, one_line(err)) == (130, "diffproj: interrupted")
     assert not list(tmp_path.iterdir())
@@ -258,12 +261,11 @@ def test_what_is_no_photograph_in_a_folder_is_left_out_and_told(
     assert told[2] == "folder: skipped 1 video: name a video by itself, for its frames are of another size"
     assert told[3] == "folder: skipped 2 hidden files and 1 file that is no photograph"
     assert told[4] == "copy of 2.png: the same photograph as 2.png; counted once"
-    assert told[5:7] == [
+    assert "5.png: found no board" in told[5]
+    assert told[6:] == [
         "empty.jpg: cannot be read as an image; skipped",
         "half.png: cannot be read as an image; skipped",
     ]
-    assert "5.png: found no board" in told[7]
-    assert len(told) == 8
 
 
 def test_the_unit_is_kept(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -311,8 +313,15 @@ def test_calibrate_writes_a_report(photographs: Path, tmp_path: Path, capsys: py
     assert page.count("data:image/jpeg") == 5 + 1  # and the one to measure in
     assert "No board was found in 5.png." in page
     assert f"dp.load_calibration(&#39;{camera}&#39;)" in page
-    rms = float(dp.load_calibration(camera).rms)
-    assert f"{rms:.3g} px" in page
+    found = dp.load_calibration(camera)
+    assert f"{float(found.rms):.3g} px" in page
+    # What was kept while the board was searched is what the library reads of the same files.
+    dp.write_report(tmp_path / "by_library.html", found, photographs, folds=None)
+    library = (tmp_path / "by_library.html").read_text(encoding="utf-8")
+    assert "No view belongs to 5.png." in library
+    shown = re.findall(r"data:image/[^\"]+", page)
+    assert len(shown) > 5 + 5 + 1  # the photographs, their corners that fit worst, that to measure in, and accuracy
+    assert shown == re.findall(r"data:image/[^\"]+", library)
 
 
 def test_a_report_that_cannot_be_written_is_told_before_the_work(

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -18,7 +19,7 @@ import diffproj as dp
 from diffproj import cli, synthetic
 from diffproj.cli.terminal import RESULTS
 from diffproj.files.document import Document
-from tests.cli.commands import parser, runner
+from tests.cli.commands import runner
 
 run = runner()
 pytestmark = pytest.mark.usefixtures("there")
@@ -212,29 +213,66 @@ def test_the_shell_completes(line: str, words: set[str], tmp_path: Path) -> None
     assert not re.search(r"\| +(torch|rich|matplotlib)$", done.stderr, re.MULTILINE)
 
 
-def test_files_are_read_once(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    read: Counter[str] = Counter()
+@pytest.fixture
+def read(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How often photographs were decoded, grey and in colour, and each camera file read."""
+    counts: Counter[str] = Counter()
     decode, document = cv2.imdecode, Document.read
 
     def counted_decode(data: np.ndarray, flags: int) -> np.ndarray:
-        read["decoded"] += 1
+        counts["colour" if flags & cv2.IMREAD_COLOR else "grey"] += 1
         return decode(data, flags)
 
     def counted_document(path: Path) -> Document:
-        read[str(path)] += 1
+        counts[str(path)] += 1
         return document(path)
 
     monkeypatch.setattr(cv2, "imdecode", counted_decode)
     monkeypatch.setattr(Document, "read", counted_document)
-    parser("measure")(capsys, *PHOTO, *POINTS, "--draw", "measured.png", "--page", "page.html")
-    assert read == {"decoded": 1, "camera.json": 1}
-    read.clear()
-    parser("rectify")(capsys, *PHOTO, "--resolution", "2")
-    assert read == {"decoded": 1, "camera.json": 1}
-    read.clear()
-    assert run(capsys, *COMMANDS["calibrate"])[0] == 0
-    assert read == {"decoded": 5}
-    read.clear()
-    assert run(capsys, "info", "camera.json")[0] == 0
-    assert run(capsys, "convert", "camera.json", "again.yaml")[0] == 0
-    assert read == {"camera.json": 2}
+    return counts
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (COMMANDS["measure"], {"grey": 1, "camera.json": 1}),
+        ((*COMMANDS["measure"], "--draw", "measured.png"), {"grey": 1, "camera.json": 1}),
+        ((*COMMANDS["measure"], "--page", "page.html"), {"colour": 1, "camera.json": 1}),
+        ((*COMMANDS["measure"], "--draw", "a.png", "--page", "page.html"), {"colour": 1, "camera.json": 1}),
+        (COMMANDS["rectify"], {"colour": 1, "camera.json": 1}),
+        (COMMANDS["locate"], {"camera.json": 1}),
+        (("locate", "photo.png", *COMMANDS["locate"][1:]), {"grey": 1, "camera.json": 1}),
+        (("locate", "photo.png", *COMMANDS["locate"][1:], "--draw", "a.png"), {"grey": 1, "camera.json": 1}),
+        (COMMANDS["calibrate"], {"grey": 5}),
+        ((*COMMANDS["calibrate"], "--folds", "3", "--draw", "a.png"), {"grey": 5}),
+        # That in which the report measures is shown in its colours, which the detector never saw.
+        ((*COMMANDS["calibrate"], "--draw", "a.png", "--report", "a.html"), {"grey": 5, "colour": 1}),
+        (("calibrate", "damaged", *COMMANDS["calibrate"][2:]), {"grey": 6}),
+        (("calibrate", "--fleet", "fleet", *BOARD, "--workers", "1", "-o", "fleet.jsonl"), {"grey": 6}),
+        (("experiment", "--images", "photos", *BOARD, "--output", "results"), {"grey": 5}),
+        (COMMANDS["info"], {"camera.json": 1}),
+        (COMMANDS["convert"], {"camera.json": 1}),
+    ],
+)
+def test_files_are_read_once(
+    arguments: tuple[str, ...],
+    expected: dict[str, int],
+    folder: Path,
+    read: Counter[str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    Path("fleet.jsonl").unlink(missing_ok=True)
+    for name in ("damaged", "fleet/one"):
+        shutil.copytree("photos", name, dirs_exist_ok=True)
+        Path(name, "broken.png").write_bytes(b"something")
+    code, _, err = run(capsys, *arguments)
+    assert code == 0, err
+    assert read == expected
+
+
+def test_frames_of_videos_are_decoded_once(read: Counter[str], capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ("film.avi", *BOARD, "--frames", "1", "--distortion", "none", "-o", "new.json")
+    assert run(capsys, "calibrate", *arguments)[0] == 0
+    assert read == {"grey": 5}
+    assert run(capsys, "calibrate", *arguments, "--report", "a.html")[0] == 0
+    assert read == {"grey": 5 + 5 + 1}  # grey as they are kept, that to measure in, too

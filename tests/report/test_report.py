@@ -356,16 +356,18 @@ def photographs(folder: Path, count: int, size: tuple[int, int]) -> list[Path]:
 
 def test_photographs_go_to_the_views_of_their_names(calibration: dp.Calibration, tmp_path: Path) -> None:
     paths = photographs(tmp_path, 3, (640, 480))
-    found = pictures(paths, ("2.png", "0.png", "other"), (640, 480))
-    assert set(found.images) == {0, 1}
+    corners = np.full((3, 2, 2), 100.0)
+    found = pictures(paths, ("2.png", "0.png", "other"), corners, (640, 480))
+    assert set(found.of_views) == set(found.sources) == {0, 1}
     assert found.others == ("1.png",)
-    assert np.array_equal(found.images[0], cv2.imread(str(paths[2]), cv2.IMREAD_GRAYSCALE))
+    whole = cv2.imread(str(paths[2]), cv2.IMREAD_GRAYSCALE)
+    assert np.array_equal(found.of_views[0].loupes[0], whole[88:113, 88:113])
     arrays = [np.full((480, 640), n, np.uint8) for n in range(2)]
-    assert set(pictures(arrays, ("left", "right"), None).images) == {0, 1}
+    assert set(pictures(arrays, ("left", "right"), corners, None).of_views) == {0, 1}
     with pytest.raises(ValueError, match="photographs: want those of the views, left, right, got 3 others"):
-        pictures(paths, ("left", "right"), (640, 480))
+        pictures(paths, ("left", "right"), corners, (640, 480))
     with pytest.raises(ValueError, match="photographs: want 320 x 240 px as the views have, got 640 x 480 px in"):
-        pictures(paths, ("0.png",), (320, 240))
+        pictures(paths, ("0.png",), corners, (320, 240))
     with pytest.raises(FileNotFoundError):
         report(calibration, ["missing.png"])
 
@@ -384,15 +386,19 @@ def test_26_large_photographs_stay_below_5_megabytes(calibration: dp.Calibration
 def test_a_corner_is_enlarged_where_it_is(tmp_path: Path) -> None:
     image = np.zeros((60, 80), np.uint8)
     image[30, 50] = 255
-    found = pictures(image, ("view",), (80, 60)).enlarged(0, 50.3, 29.8)
+    corners = np.array([[[np.nan, np.nan], [0.2, 59.4], [50.3, 29.8]]])
+    kept = pictures(image, ("view",), corners, (80, 60))
+    found = kept.enlarged(0, 50.3, 29.8)
     assert found is not None
     address, left, top = found
     content = cv2.imdecode(np.frombuffer(base64.b64decode(address.partition(",")[2]), np.uint8), 0)
     row, column = np.argwhere(content == 255)[0]
     assert (left + column, top + row) == (50, 30)
-    assert pictures(image, ("view",), (80, 60)).enlarged(0, 500.0, 29.8) is None
-    edge = pictures(image, ("view",), (80, 60)).enlarged(0, 0.2, 59.4)
+    assert kept.enlarged(0, 40.0, 29.8) is None
+    assert kept.enlarged(1, 50.3, 29.8) is None
+    edge = kept.enlarged(0, 0.2, 59.4)
     assert edge is not None
+    assert edge[1:] == (-12, 59 - 12)
 
 
 def test_what_has_no_report_is_refused_with_a_remedy(calibration: dp.Calibration, tmp_path: Path) -> None:
@@ -456,11 +462,21 @@ def test_a_report_is_written_whole_or_not_at_all(calibration: dp.Calibration, tm
     assert Outline(file.read_text(encoding="utf-8")).texts["h1"] == ["Calibration of a camera"]
 
 
-def test_with_photographs_the_report_measures_in_one(calibration: dp.Calibration, tmp_path: Path) -> None:
+def test_with_photographs_the_report_measures_in_one(
+    calibration: dp.Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     names = calibration.views.names
     for path, name in zip(photographs(tmp_path, 13, (640, 480)), names, strict=True):
         path.rename(tmp_path / name)
+    decode, colours = cv2.imdecode, []
+
+    def counted(data: np.ndarray, flags: int) -> np.ndarray:
+        colours.append(bool(flags & cv2.IMREAD_COLOR))
+        return decode(data, flags)
+
+    monkeypatch.setattr(cv2, "imdecode", counted)
     outline = Outline(report(calibration, tmp_path, folds=None))
+    assert colours == [False] * 13 + [True]
     usual = names[Facts(calibration, (640, 480)).usual_view]
     assert [a["id"] for tag, a in outline.elements if tag == "section"] == [*ANCHORS, "measuring-page"]
     assert outline.texts["h2"][-1] == f"Measure in {usual}"
