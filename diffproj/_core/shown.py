@@ -88,10 +88,8 @@ def in_pixels(size: tuple[int, int] | None) -> str:
 
 
 def rounded(value: float, deviation: float) -> tuple[str, str]:
-    """A value and its standard deviation, both to the second digit of the latter; a deviation of 0 is not told."""
+    """A value and its standard deviation, both to the second digit of the latter or its whole ones; 0 is not told."""
     if not (0 < deviation < math.inf):
         return _cell(value), "" if deviation == 0 else _cell(deviation)
-    decimals = 1 - math.floor(math.log10(deviation))
-    if decimals < 0:
-        return f"{round(value, decimals):.0f}", f"{round(deviation, decimals):.0f}"
+    decimals = max(0, 1 - math.floor(math.log10(deviation)))
     return f"{value:.{decimals}f}", f"{deviation:.{decimals}f}"

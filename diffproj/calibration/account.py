@@ -31,6 +31,13 @@ SENTENCES = {
 }
 
 
+def told_of(calibration: "Account") -> list[str]:
+    """The remarks on the one camera of a calibration, and what makes it doubtful, a sentence each."""
+    doubts = "" if calibration.status else calibration.doubts
+    remarks = [remark.sentence for remark in calibration.findings[0] if remark.sentence not in doubts]
+    return [*remarks, *([doubts] if doubts else [])]
+
+
 class Account(Shown):
     """The part of `Calibration` that is in words."""
 
@@ -232,9 +239,7 @@ class Account(Shown):
             lines.append(
                 f"{'image':<16}{100 * (1 - share):.0f} % of its border lies beyond the fold of the lens: no rays"
             )
-        doubts = "" if self.status else self.doubts
-        remarks = [remark.sentence for remark in self.findings[0] if remark.sentence not in doubts] + [doubts]
-        return "\n".join([*lines, self._ends()[0], *filter(None, remarks), self.verdict])
+        return "\n".join([*lines, self._ends()[0], *told_of(self), self.verdict])
 
     def _shape(self) -> str:
         """How far a target of free points is off its nominal places."""

@@ -22,7 +22,7 @@ from diffproj.calibration.options import Options
 from diffproj.calibration.parametrisation import BOW, INTRINSICS
 from diffproj.calibration.remark import OF_THE_CAMERA
 from diffproj.calibration.result import Calibration, CalibrationError
-from diffproj.calibration.verdict import ONE_VIEW
+from diffproj.calibration.verdict import LacksViews
 from diffproj.lens.models import MODELS, LensModel
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
@@ -111,7 +111,8 @@ def _candidate(
 ) -> _Candidate:
     nothing = torch.full(fit.used.shape[:1], torch.inf, dtype=fit.points.dtype, device=fit.used.device)
     if not bool(fit.converged):
-        return _Candidate(model, fit, fit.message, nothing)
+        cause = LacksViews(fit.message) if isinstance(fit.causes[0], LacksViews) else fit.message
+        return _Candidate(model, fit, cause, nothing)
     own = _options(chosen, model).but(progress=None)
     measure = chosen.loss if chosen.objective == "image" else None
     try:
@@ -119,11 +120,11 @@ def _candidate(
             refits, errors = without_views(views, target, model, folds_of(views, FOLDS), own, measure)
         else:
             refits, errors = without_corners(views, target, model, own, measure)
-    except CalibrationError as error:
-        return _Candidate(model, fit, str(error), nothing)
+    except CalibrationError as error:  # a view that was held out has no pose
+        return _Candidate(model, fit, LacksViews(error), nothing)
     if not bool(refits.converged.all()):
         part = "some of the views" if by_views else "every second corner"
-        return _Candidate(model, fit, f"not determined without {part}", nothing)
+        return _Candidate(model, fit, LacksViews(f"not determined without {part}"), nothing)
     return _Candidate(model, fit, "", _mean_squares(errors))
 
 
@@ -155,7 +156,7 @@ def _simplest(candidates: list[_Candidate]) -> _Candidate | None:
 
 def _lacks_views(candidate: _Candidate) -> bool:
     """Whether the views do not determine its camera."""
-    return "determine" in candidate.cause or ONE_VIEW in candidate.cause
+    return isinstance(candidate.cause, LacksViews)
 
 
 def _inadequate(candidate: _Candidate) -> bool:

@@ -13,7 +13,7 @@ from diffproj._core.arguments import instance
 from diffproj._core.copying import Copied
 from diffproj.calibration import ambiguity as ambiguities
 from diffproj.calibration import mismatch as mismatches
-from diffproj.calibration.account import Account
+from diffproj.calibration.account import Account, told_of
 from diffproj.calibration.ambiguity import SURE, OtherPoses, widened
 from diffproj.calibration.bow import bow_deviation, bowed
 from diffproj.calibration.comparison import LensComparison
@@ -190,14 +190,7 @@ class Calibration(Account, Copied, Recorded, Indexed):
         """How it ended, in a sentence, and the remarks; for many cameras, how many converged and why others did not."""
         ends = self._ends()
         if not self.views.batch_shape:
-            doubts = "" if self.status else self.doubts
-            return "; ".join(
-                [
-                    ends[0],
-                    *(text for text in self.remarks if text and text not in doubts),
-                    *([doubts] if doubts else []),
-                ]
-            )
+            return "; ".join([ends[0], *told_of(self)])
         failed = [f"camera {i}: {ends[i]}" for i in self.status.flatten().nonzero().flatten().tolist()]
         count = f"{len(ends) - len(failed)} of {len(ends)} cameras converged"
         return "; ".join([count, *failed, *filter(None, [self.doubts])])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 from torch import Tensor
 
-from diffproj._core.shown import Shown, number
+from diffproj._core.shown import Shown, number, rounded
 from diffproj.calibration.parametrisation import BOW
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.solver import Status
@@ -189,7 +189,4 @@ def _spread(value: float, deviation: Tensor | None, digits: int) -> str:
 
 def _rounded(value: float, deviation: float) -> str:
     """Both to the second digit of the deviation."""
-    if not 0 < deviation < math.inf:
-        return f"{value:.6g}"
-    decimals = max(0, 1 - math.floor(math.log10(deviation)))
-    return f"{value:.{decimals}f} ± {deviation:.{decimals}f}"
+    return " ± ".join(filter(None, rounded(value, deviation)))

@@ -55,7 +55,14 @@ LEFT_HANDED = (
     "and v exchanged?"
 )
 
-ONE_VIEW = (
+
+class LacksViews(str):
+    """A cause that other views would mend: these do not determine the camera, or a pose of theirs."""
+
+    __slots__ = ()
+
+
+ONE_VIEW = LacksViews(
     "one view does not tell the focal length from the principal point, the lens and the unevenness of the board: add "
     "views with the board tilted by 20 to 50 degrees about both axes, or let fixed or priors hold the principal point "
     "and the lens (a known camera needs but one view to be located)"
@@ -128,7 +135,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
         elif status[p] == Status.DIVERGED:
             continue
         elif bool(no_pose[p].any()):
-            causes[p] = (
+            causes[p] = LacksViews(
                 f"the corners of {_joined_names(names, no_pose[p])} do not determine a pose: do they lie on a line?"
             )
         elif bool(handed[p]):
@@ -146,19 +153,20 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
                 "number the corners of each row from the other end"
             )
         elif bool(alone[p]) and not (int(used[p].sum()) == 1 and bool(unknown[p].any())):
-            causes[p] = ONE_VIEW if int(used[p].sum()) == 1 else f"the views show the board alike, and {ONE_VIEW}"
+            several = int(used[p].sum()) > 1
+            causes[p] = LacksViews(f"the views show the board alike, and {ONE_VIEW}") if several else ONE_VIEW
         elif not bool(redundant[p]) or bool(unknown[p].any()):
             few = task.parameters.few_names
             lacking = [name for name, lost in zip(few, unknown[p].tolist(), strict=False) if lost]
             if task.free and not task.surveyed:
-                causes[p] = _shapeless(lacking, bool(unknown[p, len(few) :].any()), int(used[p].sum()))
+                causes[p] = LacksViews(_shapeless(lacking, bool(unknown[p, len(few) :].any()), int(used[p].sum())))
                 continue
             seen = task.part(slice(p, p + 1))
             free = task.basis is None or bool(task.basis[p, 2:4].any())
             if task.solid or isinstance(board, Landmarks):
-                causes[p] = _undetermined_by_landmarks(lacking, free, task.solid)
+                causes[p] = LacksViews(_undetermined_by_landmarks(lacking, free, task.solid))
                 continue
-            causes[p] = _undetermined(lacking, R[p, used[p]], _foreshortening(seen)[0, used[p]], free)
+            causes[p] = LacksViews(_undetermined(lacking, R[p, used[p]], _foreshortening(seen)[0, used[p]], free))
     return status, tuple(causes)
 
 

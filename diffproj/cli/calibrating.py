@@ -7,8 +7,10 @@ from dataclasses import replace
 from rich.markup import escape
 from rich.table import Table
 
+from diffproj.calibration.account import SENTENCES, told_of
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.result import Calibration
+from diffproj.calibration.solver import Status
 from diffproj.calibration.validation import CrossValidation, cross_validate
 from diffproj.cli.calibrate_document import document
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
@@ -173,10 +175,9 @@ def _say_how_it_ended(calibration: Calibration, reject_outliers: bool) -> None:
     if reject_outliers:
         count = int(calibration.rejected.sum())
         result(f"{count or 'no'} corner{'s' * (count > 1)} rejected as outlier{'s' * (count > 1)}".capitalize())
-    how, *remarks = in_options(calibration.message).split("; ")
-    result(f"Solver {how}")
-    for remark in remarks:
-        result(textwrap.fill(_with_unit(sentence(remark), calibration.unit), 79))
+    result(f"Solver {SENTENCES[Status.CONVERGED]}")  # else there is a failure in its place
+    for remark in told_of(calibration):
+        result(textwrap.fill(_with_unit(sentence(in_options(remark)), calibration.unit), 79))
     result("\n" + textwrap.fill(_with_unit(in_options(calibration.verdict), calibration.unit), 79))
 
 

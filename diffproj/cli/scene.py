@@ -14,6 +14,7 @@ from diffproj.cli.photographs import one_photograph, search
 from diffproj.cli.terminal import detail, progress_bars
 from diffproj.cli.units import Length, agreed, heading
 from diffproj.cli.which_board import given_board
+from diffproj.files.found import NotOneCameraError
 from diffproj.files.load import load
 from diffproj.geometry.camera import Camera
 from diffproj.targets.images import Photograph
@@ -146,9 +147,7 @@ def loaded(path: Path) -> tuple[Camera, Calibration | None]:
     """
     try:
         found = load(path)
-    except ValueError as error:
-        if "camera: want the name of one of" not in str(error):
-            raise
+    except NotOneCameraError as error:
         raise ValueError(
             f"--camera: want one camera, got a fleet in {path}; 'diffproj convert {path} one.json --camera NAME' "
             "takes one of them out, error bars and all"

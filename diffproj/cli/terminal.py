@@ -12,6 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from diffproj._core import shown
 from diffproj.calibration.result import CalibrationError
 from diffproj.calibration.solver import Status
 from diffproj.cli.command_line import leave_output
@@ -183,8 +184,7 @@ def rounded(value: float, deviation: float) -> tuple[str, str]:
         return f"{value:.6g}", "unknown"
     if deviation >= HUGE:
         return f"{value:.2e}", f"{deviation:.1e}"
-    decimals = max(0, 1 - math.floor(math.log10(deviation)))
-    return f"{value:.{decimals}f}", f"{deviation:.{decimals}f}"
+    return shown.rounded(value, deviation)
 
 
 def aligned(numbers: Sequence[str]) -> list[str]:

@@ -8,6 +8,10 @@ MOST_NAMES = 8
 """Names of cameras in a message."""
 
 
+class NotOneCameraError(ValueError):
+    """A file holds the cameras of a fleet, and none of them is named."""
+
+
 @dataclass(frozen=True)
 class Found:
     """What a reader found in a file.

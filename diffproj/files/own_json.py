@@ -31,7 +31,7 @@ from torch import Tensor
 from diffproj.calibration.result import Calibration
 from diffproj.calibration.rig_result import RigCalibration
 from diffproj.files.document import Document
-from diffproj.files.found import Found
+from diffproj.files.found import Found, NotOneCameraError
 from diffproj.files.numbers import image_size
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import KINDS, coefficients_of
@@ -201,7 +201,9 @@ def _chosen(document: Document, camera: str | None) -> dict[str, Any]:
             raise ValueError(f"camera: want it left out, for the file holds one, got {camera!r}")
         return _checked(document)
     if camera is None and len(fleet) > 1:
-        raise ValueError(f"camera: want the name of one of {len(fleet)}, such as {next(iter(fleet))!r}, got None")
+        raise NotOneCameraError(
+            f"camera: want the name of one of {len(fleet)}, such as {next(iter(fleet))!r}, got None"
+        )
     name = next(iter(fleet)) if camera is None else camera
     if name not in fleet:
         raise ValueError(f"camera: want the name of one of {len(fleet)}, such as {next(iter(fleet))!r}, got {name!r}")

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 
 from diffproj._core.shown import rounded
+from diffproj.calibration.account import told_of
 from diffproj.calibration.border import border_with_rays
 from diffproj.calibration.distinct import alike, described
 from diffproj.geometry.plane import Plane
@@ -70,9 +71,7 @@ def doubts(facts: Facts) -> list[str]:
     calibration = facts.calibration
     found = []
     if facts.converged:
-        told = calibration.doubts
-        found += [remark.sentence for remark in calibration.findings[0] if remark.sentence not in told]
-        found += [told] if told else []
+        found += told_of(calibration)
         border = float(border_with_rays(calibration.camera.detach(), facts.size))
         if border < 1:
             found.append(

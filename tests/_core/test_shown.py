@@ -109,7 +109,7 @@ def test_plain_numbers_of_a_calibration_hold_its_noise_and_its_deviations() -> N
 
 def test_numbers_for_people() -> None:
     assert rounded(123.456, 0.0234) == ("123.456", "0.023")
-    assert rounded(123.456, 234.0) == ("120", "230")
+    assert rounded(123.456, 234.0) == ("123", "234")
     assert rounded(123.456, 0.0) == ("123.456", "")
     assert rounded(123.456, float("inf")) == ("123.456", "inf")
     assert number(torch.tensor([1.0, 1.0])) == "1.0"

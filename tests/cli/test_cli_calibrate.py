@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import diffproj as dp
+from diffproj.calibration.remark import Remark
 from diffproj.cli import calibrating
 from diffproj.targets.detection import Searched
 from tests.cli.commands import runner
@@ -322,6 +323,13 @@ def test_calibrate_writes_a_report(photographs: Path, tmp_path: Path, capsys: py
     shown = re.findall(r"data:image/[^\"]+", page)
     assert len(shown) > 5 + 5 + 1  # the photographs, their corners that fit worst, that to measure in, and accuracy
     assert shown == re.findall(r"data:image/[^\"]+", library)
+
+
+def test_a_remark_is_one_paragraph(capsys: pytest.CaptureFixture[str]) -> None:
+    found = dp.calibrate(dp.example_views("left")[:5], dp.Chessboard(), "none", throw=False)
+    remark = Remark("one thing; fix it, or take a simpler lens")
+    calibrating._say_how_it_ended(replace(found, _remarks=lambda: ((remark,),)), False)
+    assert "\nOne thing; take a simpler lens\n" in capsys.readouterr().out
 
 
 def test_a_report_that_cannot_be_written_is_told_before_the_work(
