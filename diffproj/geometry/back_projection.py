@@ -224,11 +224,11 @@ class PlaneMap(MapViews, Copied, Shown):
         lens = self.camera.distortion
         if lens is None:
             return pixels - self.camera.K.select(-1, 2).narrow(-1, 0, 2).unsqueeze(-2), None
-        if type(lens) is not BrownConrady:  # of a class derived from it, whose way back may be another, too
-            return self.camera.directions(pixels)
-        xy, finite = normalised(pixels, self.camera.K)
-        xy, seen = lens.undistort_apart(xy)
-        return xy, seen & finite
+        if isinstance(lens, BrownConrady) and type(lens) is BrownConrady:  # one derived from it may go back otherwise
+            xy, finite = normalised(pixels, self.camera.K)
+            xy, seen = lens.undistort_apart(xy)
+            return xy, seen & finite
+        return self.camera.directions(pixels)
 
     def _checked(self, pixels: Tensor | Array) -> Tensor:
         if self.is_per_point:

@@ -66,7 +66,8 @@ class ProjectorBank(nn.Module):
         for number, camera in enumerate(given):
             kinds.setdefault((model_of(camera.distortion).name, camera.size), []).append(number)
         first = given[0].K
-        kind_of, place_of = (torch.zeros(len(given), dtype=torch.long, device=first.device) for _ in range(2))
+        with torch.inference_mode(False):  # so that a state can be loaded wherever the bank was built
+            kind_of, place_of = (torch.zeros(len(given), dtype=torch.long, device=first.device) for _ in range(2))
         projectors = []
         for kind, numbers in enumerate(kinds.values()):
             for place, number in enumerate(numbers):

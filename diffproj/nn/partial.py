@@ -48,6 +48,20 @@ class GeometryModule(nn.Module):
         super().__init__()
         self.masked: set[str] = set()
 
+    def register_buffer(self, name: str, tensor: Tensor | None, persistent: bool = True) -> None:
+        """As any module does; what inference mode made is copied, so that the module can be trained afterwards."""
+        if tensor is not None and tensor.is_inference():
+            with torch.inference_mode(False):
+                tensor = tensor.clone()
+        super().register_buffer(name, tensor, persistent)
+
+    def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
+        """Likewise."""
+        if param is not None and param.is_inference():
+            with torch.inference_mode(False):
+                param = nn.Parameter(param.detach().clone(), param.requires_grad)
+        super().register_parameter(name, param)
+
     def _apply(self, fn, recurse: bool = True):  # type: ignore[override]
         least = torch.finfo(self.lowest_precision).bits
 

@@ -91,3 +91,16 @@ def test_an_ensemble_by_vmap(learn: tuple[str, ...], lens_camera: dp.Camera, pix
         want, seen = member(pixels)
         torch.testing.assert_close(points[k], want, rtol=1e-9, atol=1e-9)
         assert torch.equal(valid[k], seen)
+
+
+def test_what_is_built_in_inference_mode_learns(lens_camera: dp.Camera, pixels: Tensor) -> None:
+    with torch.inference_mode():
+        projector = dp.PlaneProjector(lens_camera, dp.Plane.z(0.0), EVERY)
+        bank = dp.ProjectorBank([lens_camera], dp.Plane.z(0.0), EVERY)
+        rig = dp.LearnableRig({"left": lens_camera, "right": lens_camera.shifted([5.0, 0, 0])})
+    bank(pixels[None], camera=[0])[0].sum().backward()
+    rig()["right"].project(torch.ones(1, 3, dtype=pixels.dtype))[0].sum().backward()
+    assert len(gradients(projector, pixels)) == 7
+    for module in (projector, bank, rig):
+        assert not any(tensor.is_inference() for tensor in (*module.parameters(), *module.buffers()))
+        assert any(parameter.grad is not None for parameter in module.parameters())
