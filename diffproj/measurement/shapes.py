@@ -8,6 +8,11 @@ and so a covariance, where its length has none.
 import torch
 from torch import Tensor
 
+from diffproj._core.warn import warn_caller
+
+MOST_CORNERS = 1000
+"""Whose sides are compared with each other."""
+
 
 def difference(points: Tensor) -> tuple[Tensor, Tensor]:
     """From the first of two points `(2, 3)` to the second; and false."""
@@ -18,6 +23,32 @@ def area_vector(points: Tensor) -> tuple[Tensor, Tensor]:
     """At right angles to the outline of points `(k, 3)`, as long as its area; and false."""
     around = torch.linalg.cross(points - points[:1], points.roll(-1, 0) - points[:1]).sum(0)
     return around / 2, torch.zeros_like(points[0, 0], dtype=torch.bool)
+
+
+def crosses_itself(points: Tensor) -> Tensor:
+    """Whether the outline of points `(..., k, 3)` on a plane crosses itself `(...)`, its corners being no crossings."""
+    points = points.detach()
+    normal = torch.linalg.cross(points - points[..., :1, :], points.roll(-1, -2) - points[..., :1, :])
+    largest = normal.square().sum(-1).argmax(-1)  # any two arms that are not on a line tell the plane
+    normal = normal.gather(-2, largest[..., None, None].expand(*largest.shape, 1, 3)).unsqueeze(-3)
+    a, b = points.unsqueeze(-2), points.roll(-1, -2).unsqueeze(-2)  # (..., k, 1, 3): the sides' ends
+
+    def side(of: Tensor) -> Tensor:
+        """On which side of each side's line points `(..., 1, k, 3)` lie, `(..., k, k)`."""
+        return (torch.linalg.cross(b - a, of - a) * normal).sum(-1).sign()
+
+    ends = a.transpose(-3, -2), b.transpose(-3, -2)
+    parted = side(ends[0]) * side(ends[1]) < 0
+    return (parted & parted.mT).flatten(-2).any(-1)
+
+
+def warn_of_crossings(points: Tensor, valid: Tensor) -> None:
+    """Warn of outlines `(..., k, 3)` that cross themselves, where all of their corners `(..., k)` are valid."""
+    if 3 < points.shape[-2] <= MOST_CORNERS and bool((valid.all(-1) & crosses_itself(points)).any()):
+        warn_caller(
+            "area: the outline crosses itself, and what lies on its two sides cancels: give its corners in their order "
+            "around, or the areas one by one"
+        )
 
 
 def turn(points: Tensor) -> tuple[Tensor, Tensor]:
