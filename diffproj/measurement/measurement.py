@@ -226,7 +226,8 @@ class Measurement(Copied, Shown):
             every = self._numbers("corners", index.unsqueeze(0))
         if every.shape[-1] < 3:
             raise ValueError(f"corners: want at least 3, got {every.shape[-1]}")
-        warn_of_crossings(self.points[..., every[0], :], self.valid[..., every[0]])
+        places, spread = (part.detach()[..., every[0], :] for part in (self.points, self.deviations))
+        warn_of_crossings(places, spread, self.valid[..., every[0]])
         return self._norms(area_vector, every)
 
     def summary(self) -> str:

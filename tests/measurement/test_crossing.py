@@ -63,3 +63,14 @@ def test_the_area_of_corners_in_a_wrong_order_is_warned_of() -> None:
     with pytest.warns(UserWarning, match="area: the outline crosses itself"):
         found = measured.area([0, 2, 1, 3])
     assert float(found.value[0]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_corners_on_a_line_are_left_alone() -> None:
+    """A column of a real board's corners, which lie on both sides of their line by chance."""
+    calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+    corners = calibration.views.pixels[0, ::9]
+    measured = dp.measure(corners, calibration, dp.Plane.z(0.0), view=0, pixel_sigma=0.5)
+    assert crosses_itself(measured.points)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert float(measured.area().value[0]) < 30  # of 125 mm squared: 12 with a deviation of 9
