@@ -1,4 +1,9 @@
-"""Whether points in space were given in a left-handed frame: then their mirror image fits, and they do not."""
+"""Whether points were given in a left-handed frame.
+
+Of points in space the mirror image fits then, and they do not. Points on a plane and their mirror image are seen alike:
+the camera only comes to stand on the other side. Whether that is wrong nobody can tell who does not know where up is;
+what can be told is that the camera would stand below level ground, and upside down.
+"""
 
 from dataclasses import replace
 
@@ -14,6 +19,9 @@ DOUBTFUL = 0.003
 """RMS residual of a view, relative to its corners' spread, from which on the mirror image is tried."""
 BETTER = 0.04
 """Part of the cost that the mirror image must come below."""
+LEVEL, UPRIGHT = 0.95, 0.2
+"""Cosine between z and the normal of a plane from which on it is level; and that between z and up in the photograph
+from which on a camera below the plane stands upright, as one does that looks at a ceiling."""
 FOCAL_LENGTHS = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)
 """Focal lengths that it is tried with where they are free, relative to the corners' extent in px: that of the fit
 may be anything, for from infinitely far away points and their mirror image look alike."""
@@ -43,6 +51,21 @@ def left_handed(task: Task, solution: Solution, error: Tensor) -> Tensor:
         shared[:, :2] = factor * extent if free else shared[:, :2]
         lowest = lowest.minimum(_cost(mirrored, shared))
     return found.index_put((which,), lowest < BETTER * solution.cost[which])
+
+
+def upside_down(points: Tensor, R: Tensor, t: Tensor) -> Tensor:
+    """Which poses `(...)` see points `(N, 3)` of a level plane from below, and do not stand upright there.
+
+    Args:
+        points: in the world.
+        R: of the poses, world to camera `(..., 3, 3)`.
+        t: too `(..., 3)`.
+    """
+    middle = points.mean(0)
+    normal = torch.linalg.svd(points - middle).Vh[2]
+    normal = normal * torch.where(normal[2] < 0, -1.0, 1.0).to(normal)
+    depth = (R @ normal * (t + R @ middle)).sum(-1)  # of the plane, along its normal, seen from the camera
+    return (normal[2] > LEVEL) & (depth > 0) & (-(R @ normal)[..., 1] < UPRIGHT)
 
 
 def _cost(task: Task, shared: Tensor) -> Tensor:

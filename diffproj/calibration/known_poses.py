@@ -340,11 +340,11 @@ def _remarks(data: Data, task: Task, found: Found, plain: Calibration) -> tuple[
     cost, left = (torch.where(seen, z.reshape(seen.shape), 0).sum(-1) for z in (found.cost, spare(task, found)))
     chance = torch.special.gammaincc(left.clamp(min=1).to(cost) / 2, cost)
     for p in ((chance < CONTRADICTION) & (left > 0)).nonzero().flatten().tolist():
-        if not told[p] and plain.converged.flatten()[p]:
+        if all(one.kind == Kind.BELOW for one in told[p]) and plain.converged.flatten()[p]:
             times = float((2 * cost[p] / left[p]).sqrt())
             reason = f"residuals and priors are {times:.2g} times what their deviations say"
             sentence = (
                 f"{reason}, more than chance allows: look for a wrong prior or landmark, or give larger deviations"
             )
-            told[p] = (Remark(sentence, Kind.CONTRADICTION, reason),)
+            told[p] = (Remark(sentence, Kind.CONTRADICTION, reason), *told[p])
     return tuple(told)

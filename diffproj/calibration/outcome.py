@@ -16,12 +16,14 @@ from diffproj.calibration.data import Data
 from diffproj.calibration.eliminated import local_inverse
 from diffproj.calibration.entangled import Entangled
 from diffproj.calibration.fit import Fit, fit
+from diffproj.calibration.handedness import upside_down
 from diffproj.calibration.mismatch import Mismatch
 from diffproj.calibration.noise import Noise, level, noise_of
 from diffproj.calibration.options import Options
 from diffproj.calibration.other_intrinsics import mismatch_of_a_camera
 from diffproj.calibration.other_poses import other_poses
 from diffproj.calibration.parametrisation import SKEW, Parametrisation
+from diffproj.calibration.remark import Kind, Remark, Remarks
 from diffproj.calibration.remarks import remarks
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.calibration.solver import Prior, Status
@@ -30,6 +32,13 @@ from diffproj.calibration.uncertainty import covariance_of
 from diffproj.calibration.verdict import verdicts
 from diffproj.geometry.camera import Camera
 from diffproj.targets.landmarks import Landmarks
+
+BELOW = (
+    "in {} the camera is below the landmarks' plane, where z is smaller, and not upright if z is up: heights over the "
+    "plane run along -z then, which is right where z points down; if z is to be up, as with x east and y north, x and "
+    "y are exchanged, or one has the wrong sign"
+)
+"""What is said of views that see landmarks of a level plane from below."""
 
 
 def minimised(
@@ -127,7 +136,7 @@ def outcome(
         rig=None if known is None else known.rig,
         _covariance=partial(_covariance, found, data, before, known, doubt),
         _others=partial(_others, found, data, before),
-        _remarks=partial(remarks, found, status, doubt, [data.views.names] * len(status), landmarks is not None),
+        _remarks=partial(_remarks, found, status, doubt, data),
         landmarks=landmarks,
         uncertain=data.uncertain,
         _mismatch=_mismatch(found, status, known, tuple(batch)),
@@ -135,6 +144,21 @@ def outcome(
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)
     return calibration
+
+
+def _remarks(found: Fit, status: Tensor, doubt: Entangled, data: Data) -> tuple[Remarks, ...]:
+    """The remarks on each camera, and on how it stands to the landmarks, where the target is that."""
+    names, of_landmarks = data.views.names, isinstance(data.target, Landmarks)
+    said = remarks(found, status, doubt, [names] * len(status), of_landmarks)
+    if not of_landmarks or found.task.solid:
+        return said
+    R, t = data.frame.world_pose(*_state(found)[1])
+    below = upside_down(data.given_points.detach(), R, t) & found.task.used.any(-1)
+    below &= (status == Status.CONVERGED).unsqueeze(-1)
+    return tuple(
+        (*one, Remark(BELOW.format(", ".join(names[v] for v in where)), Kind.BELOW)) if where else one
+        for one, where in zip(said, (row.nonzero().flatten().tolist() for row in below), strict=True)
+    )
 
 
 def _mismatch(

@@ -21,6 +21,8 @@ class Kind(StrEnum):
     """The board is bent."""
     CONTRADICTION = "contradiction"
     """The residuals contradict the deviations that were given."""
+    BELOW = "below"
+    """Landmarks on a level plane are seen from below, by a camera that is upside down if z is up."""
     WRONG_PRIOR = "wrong prior"
     """The views contradict what was said beforehand of a parameter."""
 

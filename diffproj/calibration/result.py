@@ -24,7 +24,7 @@ from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.positions import Positions, positions
 from diffproj.calibration.record import Recorded
 from diffproj.calibration.region import covered_region
-from diffproj.calibration.remark import Remarks, text_of
+from diffproj.calibration.remark import Kind, Remarks, text_of
 from diffproj.calibration.shape_names import Shape
 from diffproj.calibration.solver import Status
 from diffproj.geometry.camera import Camera
@@ -211,9 +211,10 @@ class Calibration(Account, Copied, Recorded, Indexed):
         """Where poses alone were found, what residuals say against the `pixel_sigma`, in words; empty where nothing."""
         if not (self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics)):
             return ""
+        said = [text_of(one for one in remarks if one.kind != Kind.BELOW) for remarks in self.findings]
         if not self.views.batch_shape:
-            return self.remarks[0]
-        many = [camera for camera, text in enumerate(self.remarks) if text]
+            return said[0]
+        many = [camera for camera, text in enumerate(said) if text]
         which = ", ".join(map(str, many))
         return f"the residuals of cameras {which} are larger than pixel_sigma says: see remarks" if many else ""
 

@@ -39,6 +39,8 @@ its grid by 0.08 mm gives 0.58 at an RMS of 0.16 px.)"""
 UNEVEN, TELLING = 4.0, 8
 """Times the median over views that the mean square of the residuals of one must be to fit far worse, and from how many
 corners on that tells."""
+SAMPLE_POINTS, MOST_PAIRS = 4096, 2**22
+"""Corners whose neighbours are looked at, and distances that are held at once."""
 MANY_STEPS = 12
 """Steps of the solver from which on a minimum is looked at again."""
 SHORT_FIT = 40
@@ -78,11 +80,23 @@ def correlation(found: Fit) -> Tensor:
     task = replace(found.task, **cut, whitening=None)
     poses = tuple(z[:, some] for z in found.solution.local)
     residual = task.problem.linearise(found.solution.shared, poses)[:, :, -1]
-    apart = torch.cdist(task.points, task.points).fill_diagonal_(torch.inf)
-    nearest = apart.argmin(-1)
-    both = (task.used & task.used[..., nearest]).unsqueeze(2)
-    product = torch.where(both, residual * residual[..., nearest], 0.0).sum((1, 2, 3))
-    return product / torch.where(both, residual.square(), 0.0).sum((1, 2, 3)).clamp(min=1e-300)
+    N = len(task.points)
+    each = spread_evenly(N, min(N, SAMPLE_POINTS), task.points.device)
+    nearest = _nearest(task.points, each)
+    both = (task.used[..., each] & task.used[..., nearest]).unsqueeze(2)
+    own = residual[..., each]
+    product = torch.where(both, own * residual[..., nearest], 0.0).sum((1, 2, 3))
+    return product / torch.where(both, own.square(), 0.0).sum((1, 2, 3)).clamp(min=1e-300)
+
+
+def _nearest(points: Tensor, some: Tensor) -> Tensor:
+    """The nearest other point of some `(n,)` of the points `(N, 3)`; of several as near, the first."""
+    found = []
+    for rows in some.split(max(1, MOST_PAIRS // len(points))):
+        apart = torch.cdist(points[rows], points)
+        apart[torch.arange(len(rows), device=points.device), rows] = torch.inf
+        found.append(apart.argmin(-1))
+    return torch.cat(found)
 
 
 def second_look(

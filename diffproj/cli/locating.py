@@ -14,6 +14,7 @@ from diffproj.calibration.locate import locate
 from diffproj.calibration.observations import Seen
 from diffproj.calibration.parametrisation import Parametrisation
 from diffproj.calibration.refine import refine
+from diffproj.calibration.remark import Kind
 from diffproj.calibration.result import Calibration, CalibrationError
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
 from diffproj.cli.inputs import check_not_the_same, check_writable, writing
@@ -55,6 +56,9 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(f"--draw: want PHOTO, or the image's size in {options.camera}, got neither")
     view = options.photograph.name if options.photograph is not None else options.landmarks.stem
     found = _located(options, camera, calibration, surveyed, view, size)
+    for remark in found.findings[0]:
+        if remark.kind == Kind.BELOW:
+            warnings.warn(f"{options.landmarks}: {remark.sentence}", stacklevel=1)
     told = document(options, found, surveyed, _free(options, camera), calibration is not None)
     told["warnings"] = options.warned
     if options.draw is not None:

@@ -1,6 +1,7 @@
 """What `diffproj measure` found, as one JSON document: points count from 1, and what is not known is `None`."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.measurement import Measurement
 from diffproj.measurement.quantity import Quantity
+from diffproj.measurement.shapes import crosses_itself
 
 REASONS = {
     Reason.NOT_FINITE: "the pixel is no number",
@@ -57,9 +59,10 @@ def document(
             remarks.append(f"The length {start} to {end} is below three deviations: it cannot be told from 0.")
     area = None
     if len(points) > 2:
-        area = {"name": f"{names[0]} to {names[-1]}", **_quantities(measured.area())[0]}
-    normal = plane.normal.tolist()
-    if area is not None and area["value"] is not None and crosses(measured.points.tolist(), normal):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of outlines that cross themselves, of which a remark below tells
+            area = {"name": f"{names[0]} to {names[-1]}", **_quantities(measured.area())[0]}
+    if area is not None and area["value"] is not None and bool(crosses_itself(measured.points)):
         remarks.append("The outline crosses itself, so its area means little: give the points in order around it.")
     elif area is not None and area["significant"] is False and area["deviation"] is not None:
         remarks.append("The area is below three deviations: it cannot be told from 0.")
@@ -80,7 +83,7 @@ def document(
         "view_rms": known(float(scene.calibration.view_rms[scene.view])),
         "unit": scene.square.unit,
         "square": None if scene.has_landmarks else scene.square.value,
-        "plane": [*normal, float(plane.offset)],
+        "plane": [*plane.normal.tolist(), float(plane.offset)],
         "height": height,
         "plane_in_words": described(plane, None if scene.has_landmarks else height, scene.square.unit),
         "pixel_sigma": noise.sigma,
@@ -168,20 +171,3 @@ def _quantities(found: Quantity) -> list[dict[str, Any]]:
         }
         for value, deviation, below, above, significant in zip(*(column.tolist() for column in columns), strict=True)
     ]
-
-
-def crosses(points: list[list[float]], normal: Sequence[float]) -> bool:
-    """Whether two sides of the outline cross, seen along the axis that the plane's normal is nearest to."""
-    away = max(range(3), key=lambda axis: abs(normal[axis]))
-    flat = [[x for axis, x in enumerate(point) if axis != away] for point in points]
-    n = len(flat)
-    sides = [(flat[i], flat[(i + 1) % n]) for i in range(n)]
-
-    def turn(a: list[float], b: list[float], c: list[float]) -> float:
-        return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-
-    return any(
-        turn(a, b, c) * turn(a, b, d) < 0 and turn(c, d, a) * turn(c, d, b) < 0
-        for i, (a, b) in enumerate(sides)
-        for c, d in sides[i + 2 :]
-    )

@@ -20,7 +20,7 @@ from diffproj.measurement.folded import longest_first, norm_variance
 from diffproj.measurement.intervals import angle_interval, curved_interval, norm_interval
 from diffproj.measurement.propagation import Noise, Propagated, kink_variance, without_unknown
 from diffproj.measurement.quantity import Bounds, Quantity, described
-from diffproj.measurement.shapes import area_vector, difference, length, turn
+from diffproj.measurement.shapes import area_vector, difference, length, turn, warn_of_crossings
 from diffproj.measurement.sight import Sight
 from diffproj.measurement.student import check_level
 
@@ -214,7 +214,7 @@ class Measurement(Copied, Shown):
     def area(self, corners: Sequence[int] | None = None) -> Quantity:
         """The area of the polygon with these corners in order (all points if left out), in squared world units.
 
-        Parts of an outline that crosses itself cancel.
+        Parts of an outline that crosses itself cancel; a warning says so.
         """
         if corners is None:
             every = torch.arange(self.points.shape[-2], device=self.points.device).unsqueeze(0)
@@ -226,6 +226,8 @@ class Measurement(Copied, Shown):
             every = self._numbers("corners", index.unsqueeze(0))
         if every.shape[-1] < 3:
             raise ValueError(f"corners: want at least 3, got {every.shape[-1]}")
+        places, spread = (part.detach()[..., every[0], :] for part in (self.points, self.deviations))
+        warn_of_crossings(places, spread, self.valid[..., every[0]])
         return self._norms(area_vector, every)
 
     def summary(self) -> str:

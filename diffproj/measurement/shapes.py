@@ -8,6 +8,13 @@ and so a covariance, where its length has none.
 import torch
 from torch import Tensor
 
+from diffproj._core.warn import warn_caller
+
+MOST_CORNERS = 1000
+"""Whose sides are compared with each other."""
+SURE = 3.0
+"""Deviations by which a corner must lie off a side."""
+
 
 def difference(points: Tensor) -> tuple[Tensor, Tensor]:
     """From the first of two points `(2, 3)` to the second; and false."""
@@ -18,6 +25,41 @@ def area_vector(points: Tensor) -> tuple[Tensor, Tensor]:
     """At right angles to the outline of points `(k, 3)`, as long as its area; and false."""
     around = torch.linalg.cross(points - points[:1], points.roll(-1, 0) - points[:1]).sum(0)
     return around / 2, torch.zeros_like(points[0, 0], dtype=torch.bool)
+
+
+def crosses_itself(points: Tensor, sure: Tensor | None = None) -> Tensor:
+    """Whether the outline of points `(..., k, 3)` on a plane crosses itself `(...)`, its corners being no crossings.
+
+    `sure (..., k)` is how far a corner must lie off another side for that, 0 if left out: those of points on a line are
+    on either side of it by chance.
+    """
+    points = points.detach()
+    normal = torch.linalg.cross(points - points[..., :1, :], points.roll(-1, -2) - points[..., :1, :])
+    largest = normal.square().sum(-1).argmax(-1)  # any two arms that are not on a line tell the plane
+    normal = normal.gather(-2, largest[..., None, None].expand(*largest.shape, 1, 3))
+    normal = (normal / length(normal).clamp(min=torch.finfo(normal.dtype).tiny).unsqueeze(-1)).unsqueeze(-3)
+    a, b = points.unsqueeze(-2), points.roll(-1, -2).unsqueeze(-2)  # (..., k, 1, 3): the sides' ends
+    least = torch.zeros_like(points[..., 0]) if sure is None else sure.detach()
+
+    def side(of: Tensor, least: Tensor) -> Tensor:
+        """On which side of each side's line points `(..., 1, k, 3)` lie, `(..., k, k)`; 0 within `(..., k)` of it."""
+        off = (torch.linalg.cross(b - a, of - a) * normal).sum(-1)
+        return torch.where(off.abs() > least.unsqueeze(-2) * length(b - a), off.sign(), 0.0)
+
+    parted = side(a.transpose(-3, -2), least) * side(b.transpose(-3, -2), least.roll(-1, -1)) < 0
+    return (parted & parted.mT).flatten(-2).any(-1)
+
+
+def warn_of_crossings(points: Tensor, deviations: Tensor, valid: Tensor) -> None:
+    """Warn of outlines `(..., k, 3)` that surely cross themselves, where all of their corners `(..., k)` are valid."""
+    if not 3 < points.shape[-2] <= MOST_CORNERS:
+        return
+    sure = SURE * length(deviations).nan_to_num(0.0)
+    if bool((valid.all(-1) & crosses_itself(points, sure)).any()):
+        warn_caller(
+            "area: the outline crosses itself, and what lies on its two sides cancels: give its corners in their order "
+            "around, or the areas one by one"
+        )
 
 
 def turn(points: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from diffproj import synthetic
 from diffproj.calibration.fit import Fit
 from diffproj.calibration.focal_grid import BEST, lowest
 from diffproj.calibration.parametrisation import POSE
-from diffproj.calibration.second_look import ALIKE, LOWER, _first_of_alike, lower_fit
+from diffproj.calibration.second_look import ALIKE, LOWER, MOST_PAIRS, _first_of_alike, _nearest, lower_fit
 from diffproj.calibration.solver import Solution, Status, equations_at
 from diffproj.calibration.task import Task
 
@@ -24,6 +24,20 @@ def test_of_starts_that_lead_to_one_place_the_first_goes_on() -> None:
     low, alike, high = 2.0, 2.0 * (1 + ALIKE / 2), 2.0 * (1 + 3 * ALIKE)
     costs = torch.tensor([[low, high], [alike, low], [high, alike], [low, high]], dtype=D)
     assert _first_of_alike(costs).tolist() == [[True, True], [False, True], [True, False], [False, False]]
+
+
+def test_neighbours_of_many_points_are_found_in_parts() -> None:
+    """Those that all distances at once tell, of a grid with its equal ones too, some 20 points a part."""
+    count = MOST_PAIRS // 20
+    points = torch.rand(count, 3, generator=torch.Generator().manual_seed(1), dtype=D)
+    some = torch.arange(0, count, count // 50)
+    apart = torch.cdist(points[some], points)
+    apart[torch.arange(len(some)), some] = torch.inf
+    assert torch.equal(_nearest(points, some), apart.argmin(-1))
+    grid = BOARD.points.to(D)
+    assert torch.equal(
+        _nearest(grid, torch.arange(len(grid))), torch.cdist(grid, grid).fill_diagonal_(torch.inf).argmin(-1)
+    )
 
 
 def test_the_lowest_places_of_a_grid_are_its_valleys() -> None:

@@ -19,7 +19,7 @@ import diffproj as dp
 from diffproj import synthetic
 from diffproj.cli import shielded
 from diffproj.cli.inputs import HAND
-from diffproj.cli.measure_document import REASONS, between, crosses, listed
+from diffproj.cli.measure_document import REASONS, between, listed
 from diffproj.cli.measure_plane import equation
 from diffproj.cli.measure_tables import coordinate, shown
 from diffproj.measurement.choices import HAND_PX
@@ -347,12 +347,6 @@ def test_lists_of_numbers_are_no_options() -> None:
         "-1",
         "5,-3",
     ]
-
-
-def test_outlines_that_cross() -> None:
-    square = [[0.0, 0, 1], [1, 0, 1], [1, 0, 2], [0, 0, 2]]
-    assert not crosses(square, (0.0, -1.0, 0.0, 0.0))
-    assert crosses([square[i] for i in (0, 2, 1, 3)], (0.0, -1.0, 0.0, 0.0))
 
 
 def test_equations_and_quantities_for_people() -> None:

@@ -116,6 +116,7 @@ def test_deviations_hold_the_calibrations_covariance(name: str, javascript: Call
     same(numbers([each["deviations"] for each in seen]), measured.deviations[measured.valid])
 
 
+@pytest.mark.filterwarnings("ignore:area")  # of outlines that cross themselves
 @pytest.mark.parametrize("name", SOME)
 def test_lengths_areas_and_angles_with_their_intervals(name: str, javascript: Callable[[str, Any], Any]) -> None:
     """Among them a polygon that crosses itself, an angle near 180 degrees, and a length that noise may have made."""
