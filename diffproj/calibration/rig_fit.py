@@ -83,7 +83,9 @@ class RigFit:
     @property
     def by_camera(self) -> dict[str, Tensor]:
         """Projected minus seen corners `(V_c, N, 2)`, 0 where a corner was not used."""
-        return _by_camera(self.views, self.problem, self.problem.residuals(self.shared, self.local))
+        residuals = self.problem.residuals(self.shared, self.local)
+        self.problem.forget()
+        return _by_camera(self.views, self.problem, residuals)
 
 
 def rig_fit(
