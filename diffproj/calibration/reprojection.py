@@ -17,6 +17,7 @@ The order of the parameters is that of `parametrisation.py`; `bow.py` says what 
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,6 +28,9 @@ from diffproj.calibration.lens_derivatives import DERIVATIVES, Place
 from diffproj.calibration.parametrisation import INTRINSICS, POSE, Parametrisation, moved
 from diffproj.calibration.solver import LocalState
 from diffproj.lens.models import MODELS, LensModel
+
+KEPT = ("_panel", "_place", "_by_focal")
+"""What is kept from call to call: the panel and views of it, a hundred numbers for each corner."""
 
 
 @dataclass(eq=False)
@@ -84,6 +88,13 @@ class Reprojection:
     def _by_focal(self) -> Tensor:
         """Of the panel, u by f_x and v by f_y `(P, V, 2, N)`."""
         return self._panel[:, :, :2].diagonal(dim1=2, dim2=3).movedim(-1, 2)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in KEPT}
+
+    def forget(self) -> None:
+        """Let go of the panel, which is kept from call to call; the next makes it anew."""
+        self.__dict__ = self.__getstate__()
 
     def part(self, which: Tensor) -> "Reprojection":
         """The problems of some of the cameras `(n,)`."""

@@ -56,8 +56,9 @@ def calibrate_rig(
 
     Args:
         views_by_camera: corners `(V, N, 2)` by the camera's name. Cameras may miss any moments, and views any corners;
-            a view with fewer than 4 takes no part. Sizes may differ. Or a list with those of one rig each: all their
-            cameras on their own are calibrated side by side.
+            a view with fewer than 4 takes no part. Sizes may differ. Or a list with those of one rig each: their
+            cameras on their own are calibrated side by side, and so are rigs of as many cameras and about as many
+            moments refined.
         target: a board, `Landmarks`, or anything with `.points (N, 3)`; its unit is the world's. The places of
             landmarks with a sigma are found along with the rig, for all cameras see them off in the same way.
         distortion: which lens to fit, as for `calibrate`; or one by camera.

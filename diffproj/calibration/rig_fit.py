@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -80,10 +81,12 @@ class RigFit:
         """How many shared unknowns are free."""
         return self.parameters.size if self.basis is None else self.basis.shape[-1]
 
-    @property
+    @cached_property
     def by_camera(self) -> dict[str, Tensor]:
         """Projected minus seen corners `(V_c, N, 2)`, 0 where a corner was not used."""
-        return _by_camera(self.views, self.problem, self.problem.residuals(self.shared, self.local))
+        residuals = self.problem.residuals(self.shared, self.local)
+        self.problem.forget()
+        return _by_camera(self.views, self.problem, residuals)
 
 
 def rig_fit(

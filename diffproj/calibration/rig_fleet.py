@@ -60,19 +60,23 @@ def each_rig(
             )
         except ValueError as error:
             refused(number, error)
-    together = dict(zip(tasks, alone_together([task.asked for task in tasks.values()]), strict=True))
-    for some in _some_at_a_time(tasks):
-        ready = [_from_its_cameras(tasks[number], together[number]) for number in some]
-        for number, rig in zip(some, side_by_side(ready), strict=True):
-            if isinstance(rig, ValueError):
-                refused(number, rig)
-            else:
-                found[number] = rig
-            if chosen.progress is not None:
-                chosen.progress(len(found), len(rigs))
+    for number, rig in zip(tasks, calibrated_together(list(tasks.values())), strict=True):
+        if isinstance(rig, ValueError):
+            refused(number, rig)
+        else:
+            found[number] = rig
+        if chosen.progress is not None:
+            chosen.progress(len(found), len(rigs))
     if rigs and len(mistakes) == len(rigs):
         raise mistakes[0]
     return [found[number] for number in range(len(rigs))]
+
+
+def calibrated_together(tasks: Sequence[RigTask]) -> Iterator[RigCalibration | CalibrationError | ValueError]:
+    """Each rig, or why there is none, in their order."""
+    own = alone_together([task.asked for task in tasks])
+    for some in _some_at_a_time(tasks):
+        yield from side_by_side([_from_its_cameras(tasks[number], own[number]) for number in some])
 
 
 def _from_its_cameras(task: RigTask, own: Mapping[str, Alone] | Exception) -> Refinement[RigCalibration]:
@@ -82,19 +86,18 @@ def _from_its_cameras(task: RigTask, own: Mapping[str, Alone] | Exception) -> Re
     return (yield from finished(task, own))
 
 
-def _some_at_a_time(tasks: Mapping[int, RigTask]) -> Iterator[list[int]]:
+def _some_at_a_time(tasks: Sequence[RigTask]) -> list[list[int]]:
     """Rigs by their numbers, as many as are kept in memory at a time."""
-    some: list[int] = []
+    batches: list[list[int]] = []
     views = 0
-    for number, task in tasks.items():
+    for number, task in enumerate(tasks):
         own = sum(map(len, task.asked.views.where.values()))
-        if some and views + own > MOST_VIEWS:
-            yield some
-            some, views = [], 0
-        some.append(number)
+        if not batches or views + own > MOST_VIEWS:
+            batches.append([])
+            views = 0
+        batches[-1].append(number)
         views += own
-    if some:
-        yield some
+    return batches
 
 
 def _of_each(argument: str, given: Any, count: int) -> list[Any]:

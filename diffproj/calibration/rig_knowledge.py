@@ -63,18 +63,18 @@ class RigKnowledge:
         positions: of intrinsics and coefficients that are known `(k,)`, the same in all rigs.
         mean, deviation: of these `(P, k)`.
         places: of cameras.
-        variance: of a residual of weight 1, against which all of it weighs, `(P,)` or one for all.
+        variance: of a residual of weight 1, against which all of it weighs `(P,)`.
     """
 
     positions: Tensor
     mean: Tensor
     deviation: Tensor
     places: tuple[KnownPlace, ...]
-    variance: float | Tensor = 1.0
+    variance: Tensor
 
     def against(self, variance: float) -> "RigKnowledge":
         """The same against residuals of this variance."""
-        return replace(self, variance=variance)
+        return replace(self, variance=torch.full_like(self.variance, variance))
 
     @property
     def of(self) -> tuple[object, ...]:
@@ -94,8 +94,7 @@ class RigKnowledge:
         places = tuple(
             replace(own, **of([one.places[number] for one in ones])) for number, own in enumerate(self.places)
         )
-        variance = take([torch.as_tensor(one.variance).to(one.mean).expand(len(one.mean)) for one in ones])
-        return replace(self, **of(ones), places=places, variance=variance)
+        return replace(self, **of(ones), places=places, variance=take([one.variance for one in ones]))
 
     def rows(self, shared: Tensor, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         """How far off `(P, n)` unknowns `(P, s)` with cameras at `(P, C, 3, 3)`, `(P, C, 3)` are, and the Jacobian.
@@ -110,7 +109,7 @@ class RigKnowledge:
             off, slope = place.rows(R[:, place.camera], t[:, place.camera], shared[:, start : start + 3])
             offs.append(off)
             slopes.append(torch.nn.functional.pad(slope, (start, size - start - slope.shape[-1])))
-        root = torch.as_tensor(self.variance).to(shared).sqrt().reshape(-1, 1)
+        root = self.variance.sqrt().unsqueeze(-1)
         return root * torch.cat(offs, dim=-1), root.unsqueeze(-1) * torch.cat(slopes, dim=-2)
 
 

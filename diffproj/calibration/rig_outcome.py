@@ -114,6 +114,7 @@ class _Late:
     def __call__(self) -> Covariance:
         if self.known is None:
             self.known = rig_covariance(self.found, self.noise)
+            self.found.problem.forget()
         return self.known
 
 

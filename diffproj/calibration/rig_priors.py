@@ -91,7 +91,7 @@ def rig_knowledge(
     if not numbers and not places:
         return None
     where, mean, deviation = torch.stack(numbers).T if numbers else like.new_zeros(3, 0)
-    return RigKnowledge(where.long(), mean.unsqueeze(0), deviation.unsqueeze(0), tuple(places))
+    return RigKnowledge(where.long(), mean.unsqueeze(0), deviation.unsqueeze(0), tuple(places), like.new_ones(1))
 
 
 def _reference(kind: Parametrisation, known: Camera | None, size: tuple[int, int] | None, like: Tensor) -> Tensor:

@@ -109,8 +109,8 @@ class Group:
             weights,
         )
 
-    @classmethod
-    def joined(cls, groups: Mapping[int, "Group"], moments: int) -> "Group":
+    @staticmethod
+    def joined(groups: Mapping[int, "Group"], moments: int) -> "Group":
         """Those of many rigs, by the rig's number, which have up to so many moments."""
         one, weights = next(iter(groups.values())), None
         if any(group.weights is not None for group in groups.values()):
@@ -229,6 +229,11 @@ class RigProblem:
     def residuals(self, shared: Tensor, local: LocalState) -> list[Tensor]:
         """Projected minus seen corners `(n, 2, N)` of each group."""
         return [self.panel(group, shared, local)[:, -1].clone() for group in self.groups]
+
+    def forget(self) -> None:
+        """Let go of what is kept from call to call, of which a result has no need."""
+        for group in self.groups:
+            group.reprojection.forget()
 
     def retract(self, local: LocalState, step: Tensor) -> LocalState:
         """Poses moved by steps `(1, M, 6)`."""

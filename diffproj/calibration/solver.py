@@ -227,7 +227,8 @@ def solve(
     terms = _Terms(problem, local_size, weights, loss, prior, every)
     cost, equations = terms.at(shared, local)
     state = _State(shared, local, cost, equations)
-    control = DampingControl(_array(cost), _array(torch.as_tensor(negligible).to(cost).expand_as(cost)))
+    negligible = negligible if isinstance(negligible, Tensor) else torch.full_like(cost, negligible)
+    control = DampingControl(_array(cost), _array(negligible))
     everyone = Everyone(state, control)
     for iteration in range(1, max_iterations + 1):
         along = state.equations.along(basis)
