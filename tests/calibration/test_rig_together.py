@@ -39,7 +39,7 @@ def solved(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def same(one: object, other: dp.RigCalibration) -> None:
-    """The same to 1e-9; measured are 2e-12 in the cameras and 3e-8 in the covariance."""
+    """The same, but for the order in which sums are taken."""
     assert isinstance(one, dp.RigCalibration), one
     assert (one.status, one.iterations, one.names) == (other.status, other.iterations, other.names)
     assert one.moments == other.moments
@@ -126,6 +126,21 @@ def test_options_hold_for_each(options: dict[str, Any], outliers: float, solved:
     assert max(solved) == 3
     for one, true in zip(found, rigs, strict=True):
         same(one, dp.calibrate_rig(true.views, true.board, **options))
+
+
+def test_cameras_of_unlike_lenses_and_a_camera_that_is_missing(solved: list[int]) -> None:
+    rigs = [scene(3, moments, missing=0.2, seed=seed) for moments, seed in ((10, 2), (12, 5), (11, 8))]
+    views = [dict(one.views) for one in rigs]
+    lenses = {"cam0": "brown5", "cam1": "brown4", "cam2": "fisheye"}
+    for one, seen in zip(dp.calibrate_rig(views, rigs[0].board, distortion=lenses), views, strict=True):
+        same(one, dp.calibrate_rig(seen, rigs[0].board, distortion=lenses))
+    assert max(solved) == 3
+    del views[1]["cam1"]
+    solved.clear()
+    found = dp.calibrate_rig(views, rigs[0].board)
+    assert sorted(set(solved)) == [1, 2]
+    for one, seen in zip(found, views, strict=True):
+        same(one, dp.calibrate_rig(seen, rigs[0].board))
 
 
 @pytest.mark.parametrize("priors", [None, {"cam1.baseline": (800.0, 50.0)}], ids=["", "priors"])
