@@ -11,6 +11,8 @@ import pytest
 import torch
 
 import diffproj as dp
+from diffproj.calibration.parametrisation import Parametrisation
+from diffproj.calibration.pose_parameters import PoseParameters
 from diffproj.calibration.solver import Status
 
 D = torch.float64
@@ -520,3 +522,14 @@ def test_a_place_far_from_the_origin_wants_float64() -> None:
         warnings.simplefilter("error")
         dp.adjust(far, **known)  # type: ignore[arg-type]
         dp.adjust(dp.Camera.mounted(60.0, 50.0, fov_deg=70.0, size=(1600, 1200)).to(torch.float32), **known)  # type: ignore[arg-type]
+
+
+def test_a_lens_can_be_held_where_there_is_one(K: torch.Tensor, lens: dp.BrownConrady) -> None:
+    for own, names in ((lens, ("k1", "k2", "p1", "p2", "k3")), (None, ())):
+        parameters = PoseParameters(Parametrisation.of(dp.Camera(K, distortion=own)))
+        if names:
+            assert [parameters.names[i] for i in parameters.positions("fixed", "distortion")] == list(names)
+        else:
+            with pytest.raises(ValueError, match="fixed: want names from .*, got 'distortion'"):
+                parameters.positions("fixed", "distortion")
+        assert [parameters.names[i] for i in parameters.positions("fixed", "principal_point")] == ["c_x", "c_y"]

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import diffproj as dp
+from diffproj.calibration.advice import _second_spread
 from diffproj.lens.models import LensModel
 
 D = torch.float64
@@ -128,3 +129,13 @@ def test_a_k_with_skew_is_named() -> None:
     verdict = dp.calibrate(views, BOARD).verdict
     assert "a K without skew does not fit the camera. Next: first the skew that the remark on the res" in verdict
     assert dp.calibrate(views, BOARD, skew=True).verdict.startswith("Good")
+
+
+def test_a_board_seen_from_behind_leans_as_from_the_front() -> None:
+    normals = torch.nn.functional.normalize(
+        torch.tensor([[0.1, 0.2, 1], [-0.3, 0.1, 1], [0.2, -0.4, 1]], dtype=D), dim=-1
+    )
+    turned = normals * torch.tensor([[1.0], [-1], [-1]], dtype=D)
+    assert _second_spread(turned) == pytest.approx(_second_spread(normals))
+    along = torch.nn.functional.normalize(torch.tensor([[0.3, 0.0, 1], [-0.1, 0.0, 1]], dtype=D), dim=-1)
+    assert _second_spread(along) == pytest.approx(0, abs=1e-9)  # leaning to the left and right alone

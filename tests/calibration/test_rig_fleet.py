@@ -99,6 +99,8 @@ def test_each_may_have_its_own_moments_cameras_and_weights(scenes: list[Scene]) 
         assert found[i].shape == "bow"  # type: ignore[union-attr]
     with pytest.raises(ValueError, match="moments: want a list of 2, one for each rig, got 1"):
         dp.calibrate_rig([first.views, third.views], first.board, moments=numbers[:1])
+    with pytest.raises(ValueError, match="weights: want a list of 2, one for each rig, got 3"):
+        dp.calibrate_rig([first.views, third.views], first.board, weights=[None, None, None])
     half = dp.calibrate_rig([first.views, third.views], first.board, cameras=[first.cameras, None], fixed=("focal",))
     assert isinstance(half[0], dp.RigCalibration)
     assert isinstance(half[1], dp.CalibrationError)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from diffproj.measurement.folded import upper_bound
+from diffproj.measurement.propagation import _firsts
 from diffproj.measurement.quantity import Quantity
 from diffproj.measurement.shapes import area_vector, difference, length, turn
 
@@ -72,3 +73,8 @@ def test_a_quantity_alone_has_the_interval_of_its_deviation() -> None:
     low, high = Quantity(torch.tensor([3.0, -1.0], dtype=D), torch.tensor([1.0, 0.0], dtype=D)).interval(0.95)
     torch.testing.assert_close(low, torch.tensor([3 - 1.959963985, -1.0], dtype=D))
     torch.testing.assert_close(high, torch.tensor([3 + 1.959963985, -1.0], dtype=D))
+
+
+def test_points_that_are_named_twice_count_once() -> None:
+    index = torch.tensor([[0, 1, 0, 1], [2, 2, 2, 3], [4, 5, 6, 7]])
+    assert _firsts(index).tolist() == [[1, 1, 0, 0], [1, 0, 0, 1], [1, 1, 1, 1]]
