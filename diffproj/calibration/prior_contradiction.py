@@ -48,8 +48,8 @@ class PriorContradiction(NamedTuple):
 def prior_contradictions(found: Fit, which: Tensor) -> dict[int, PriorContradiction]:
     """Those of cameras `(n,)` whose views contradict a prior, by their number."""
     measured = found.measured_precision()
-    if measured is None or found.task.objective != "image" or len(which) == 0:
-        return {}
+    if measured is None or found.task.objective != "image" or found.task.free or len(which) == 0:
+        return {}  # free points take up what a wrong prior bends
     with torch.no_grad():
         part, names = found.part(which), found.task.parameters.few_names
         prior, shared = part.task.prior, part.solution.shared
@@ -57,10 +57,8 @@ def prior_contradictions(found: Fit, which: Tensor) -> dict[int, PriorContradict
         seen = bowls(part.task, shared, part.solution.local)
         T = part.task.basis
         T = torch.eye(shared.shape[-1], dtype=shared.dtype, device=shared.device).expand_as(known) if T is None else T
-        # All but the priors stays: what keeps a lens from folding, a target's points in their frame.
-        whole = part.task.whole_prior
-        rest = torch.zeros_like(known) if whole is None else whole.whole - known
-        rest = rest + NEARLY_NONE * known
+        # All but the priors stays: what keeps a lens from folding.
+        rest = prior.whole - known + NEARLY_NONE * known  # type: ignore[union-attr]
         off = (shared - prior.mean).unsqueeze(-1)  # type: ignore[union-attr]
         H = seen.H.sum(1) + T.mT @ rest @ T
         g = seen.g.sum(1).unsqueeze(-1) + T.mT @ rest @ off

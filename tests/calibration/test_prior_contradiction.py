@@ -58,6 +58,26 @@ def test_right_priors_are_left_alone(alone):
         assert "prior" not in found.remarks[0]
 
 
+@pytest.mark.parametrize(
+    "options",
+    [{"shape": "bow"}, {"pixel_sigma": 0.15}, {"loss": dp.Huber(0.3)}, {"reject_outliers": True}],
+    ids=lambda options: next(iter(options)),
+)
+def test_it_is_told_whatever_else_is_asked_for(options, alone):
+    focal = torch.stack([alone.camera.K[0, 0], alone.camera.K[1, 1]])
+    right = dp.calibrate(VIEWS, BOARD, priors={"focal": (focal, 2.0)}, throw=False, **options)
+    assert "prior" not in right.remarks[0]
+    wrong = dp.calibrate(VIEWS, BOARD, priors={"focal": (600.0, 1.0)}, throw=False, **options)
+    assert "the views contradict the prior on f_" in wrong.remarks[0]
+
+
+def test_free_points_and_the_plane_objective_are_not_asked():
+    """Nothing is said of them, and nothing fails."""
+    for options in ({"shape": "free"}, {"objective": "plane"}):
+        found = dp.calibrate(VIEWS, BOARD, priors={"focal": (536.0, 3.0)}, throw=False, **options)
+        assert "prior" not in found.remarks[0]
+
+
 def test_a_prior_that_the_views_say_nothing_of_is_not_contradicted():
     """One view with the principal point held by a prior: nothing tells that it is elsewhere."""
     found = dp.calibrate(
