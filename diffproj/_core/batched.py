@@ -135,7 +135,9 @@ class Batched(Copied, Shown):
             raise TypeError(f"batch_shape: want whole numbers, got {tuple(shape)}")
         new = len(shape) - len(own)
         wanted = [own[k - new] if length == -1 and k >= new else length for k, length in enumerate(shape)]
-        fits = new >= 0 and all(0 <= length < sys.maxsize for length in wanted[:new])
+        # That of a graph is a length, and a comparison would limit the graph to it.
+        added = [length for length in wanted[: max(new, 0)] if not isinstance(length, torch.SymInt)]
+        fits = new >= 0 and all(0 <= length < sys.maxsize for length in added)
         if not fits or any(length not in (1, want) for length, want in zip(own, wanted[new:], strict=True)):
             raise ValueError(f"batch_shape: want one that {tuple(own)} broadcasts to, got {tuple(shape)}")
         return torch.Size(wanted)

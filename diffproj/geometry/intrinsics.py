@@ -62,7 +62,7 @@ def normalised(
     """
     limit = torch.finfo(pixels.dtype).max ** SQUARED
     derivative = wants_derivative(pixels, K)
-    if is_short(pixels) and not derivative and has_values(pixels, K):
+    if not derivative and has_values(pixels, K) and is_short(pixels):  # in this order: a length is no part of a graph
         return _normalised_short(pixels.numpy(force=True), K.numpy(force=True), limit)
     center = K[..., :2, 2].unsqueeze(-1).unbind(-2)
     u, v = pixels.unbind(-1) if derivative else coordinates(pixels)

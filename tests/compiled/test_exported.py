@@ -75,6 +75,27 @@ def test_any_batch_and_no_operators_of_our_own(what: str, lens: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("lens", slow_behind(["none", "brown5", "fisheye"]))
+def test_a_warp_of_each_sample_in_a_batch_of_any_length(lens: str) -> None:
+    class Warped(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.projector = case("projector", lens)[0]
+
+        def forward(self, pixels: torch.Tensor, warp: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            return self.projector(pixels, warp=warp)
+
+    module, batch = Warped(), {0: torch.export.Dim("batch")}
+    warp = torch.eye(3) + torch.zeros(3, 3, 3)
+    warp[:, 0, 2] = torch.arange(3.0)
+    program = torch.export.export(module, (PIXELS, warp), dynamic_shapes=(batch, batch), strict=False)
+    assert not own_operators(program)
+    for count in (2, 3, 6):
+        inputs = PIXELS.repeat(2, 1, 1)[:count], warp.repeat(2, 1, 1)[:count]
+        for got, want in zip(program.module()(*inputs), module(*inputs), strict=True):
+            torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-3)
+
+
 def test_next_to_a_fold_an_exported_lens_is_right_or_not_valid() -> None:
     lens = dp.BrownConrady(torch.tensor([-0.35, 0.05, 1e-3, 1e-4, 0.0], dtype=torch.float64))
     assert lens.domain.isfinite()
