@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from diffproj._core.arguments import instance, number
-from diffproj.calibration.result import Calibration, as_calibration
+from diffproj.calibration.results.calibration import Calibration, as_calibration
 from diffproj.landmarks_figure import landmarks as landmarks
 from diffproj.measurement.accuracy_map import AccuracyMap
 from diffproj.paper.experiment import Experiment

@@ -5,7 +5,7 @@ from jaxtyping import Shaped
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from diffproj.calibration.result import Calibration, as_calibration
+from diffproj.calibration.results.calibration import Calibration, as_calibration
 
 SEEN, PROJECTED, REJECTED = "#d6336c", "#0b6bcb", "#e8590c"
 OUTLINE = [withStroke(linewidth=2.5, foreground="white")]

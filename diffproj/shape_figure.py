@@ -6,7 +6,7 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from diffproj.calibration.result import Calibration, as_calibration
+from diffproj.calibration.results.calibration import Calibration, as_calibration
 
 ARROW = 0.06
 """Length of a displacement within the plane as large as their RMS, as a part of the target's longer side."""

@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal, Unpack, overload
 
 from diffproj.calibration.circle_centres import with_true_centres
+from diffproj.calibration.fitting.options import CalibrationOptions, Options, calibration_options
 from diffproj.calibration.fleet import each_calibrated
 from diffproj.calibration.lens_choice import chosen_lens
 from diffproj.calibration.one_lens import calibrated
-from diffproj.calibration.options import CalibrationOptions, Options, calibration_options
-from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.calibration.results.calibration import Calibration, CalibrationError
 from diffproj.lens.models import LensModel
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views, as_views

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.camera import Camera
 from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.target import Target

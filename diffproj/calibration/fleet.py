@@ -14,15 +14,15 @@ from typing import Any
 import torch
 
 from diffproj._core.arguments import Array, called, tensor_of
-from diffproj.calibration.data import BOARD_SIZE, Data
-from diffproj.calibration.entangled import Entangled
-from diffproj.calibration.fit import Fit
+from diffproj.calibration.fitting.data import BOARD_SIZE, Data
+from diffproj.calibration.fitting.fit import Fit
+from diffproj.calibration.fitting.options import Options
+from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.one_lens import fitted
-from diffproj.calibration.options import Options
 from diffproj.calibration.outcome import outcome
-from diffproj.calibration.remarks import remarks
-from diffproj.calibration.result import Calibration, CalibrationError
-from diffproj.calibration.solver import Status
+from diffproj.calibration.results.calibration import Calibration, CalibrationError
+from diffproj.calibration.trust.entangled import Entangled
+from diffproj.calibration.trust.remarks import remarks
 from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.target import Target, points_of
 from diffproj.targets.views import Views, as_views

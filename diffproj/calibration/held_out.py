@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from diffproj.calibration.fitting.options import Options
+from diffproj.calibration.least_squares.losses import Loss
 from diffproj.calibration.locate import located as located_without_warning
-from diffproj.calibration.losses import Loss
 from diffproj.calibration.one_lens import calibrated
-from diffproj.calibration.options import Options
-from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.calibration.results.calibration import Calibration, CalibrationError
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.plane import Plane
 from diffproj.lens.models import LensModel

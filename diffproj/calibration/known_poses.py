@@ -12,26 +12,26 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from diffproj.calibration.adjusted_covariance import pose_errors
-from diffproj.calibration.ambiguity import OtherPoses, difference
-from diffproj.calibration.constraints import Priors
-from diffproj.calibration.covariance import Covariance
-from diffproj.calibration.data import Data
-from diffproj.calibration.descent import Found, Task, best, descended, spare
-from diffproj.calibration.fit import MAX_REJECTION_ROUNDS, Fit, inliers
-from diffproj.calibration.knowledge import Knowledge, knowledge, prior_shapes
-from diffproj.calibration.noise import level, noise_of, own_noise
-from diffproj.calibration.observations import Seen
-from diffproj.calibration.options import Options
-from diffproj.calibration.other_poses import APART
+from diffproj.calibration.evidence.adjusted_covariance import pose_errors
+from diffproj.calibration.evidence.descent import Found, Task, best, descended, spare
+from diffproj.calibration.evidence.knowledge import Knowledge, knowledge, prior_shapes
+from diffproj.calibration.evidence.observations import Seen
+from diffproj.calibration.evidence.pose_parameters import TURNS
+from diffproj.calibration.fitting.data import Data
+from diffproj.calibration.fitting.fit import MAX_REJECTION_ROUNDS, Fit, inliers
+from diffproj.calibration.fitting.options import Options
+from diffproj.calibration.fitting.surveyed import in_common, whitening
+from diffproj.calibration.fitting.task import Task as Seeing
+from diffproj.calibration.least_squares.solver import Solution, Status, equations_at
 from diffproj.calibration.outcome import outcome
-from diffproj.calibration.parametrisation import POSE
-from diffproj.calibration.pose_parameters import TURNS
-from diffproj.calibration.remark import Kind, Remark, Remarks
-from diffproj.calibration.result import Calibration, CalibrationError
-from diffproj.calibration.solver import Solution, Status, equations_at
-from diffproj.calibration.surveyed import in_common, whitening
-from diffproj.calibration.task import Task as Seeing
+from diffproj.calibration.problem.constraints import Priors
+from diffproj.calibration.problem.parametrisation import POSE
+from diffproj.calibration.results.ambiguity import OtherPoses, difference
+from diffproj.calibration.results.calibration import Calibration, CalibrationError
+from diffproj.calibration.results.covariance import Covariance
+from diffproj.calibration.results.remark import Kind, Remark, Remarks
+from diffproj.calibration.trust.noise import level, noise_of, own_noise
+from diffproj.calibration.trust.other_poses import APART
 from diffproj.geometry.camera import Camera
 
 OTHER_STEPS = 30

@@ -14,15 +14,15 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import tensor_of
-from diffproj.calibration.comparison import LensComparison
-from diffproj.calibration.constraints import of_points
+from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.held_out import Errors, folds_of, without_corners, without_views
 from diffproj.calibration.one_lens import calibrated
-from diffproj.calibration.options import Options
-from diffproj.calibration.parametrisation import BOW, INTRINSICS
-from diffproj.calibration.remark import OF_THE_CAMERA
-from diffproj.calibration.result import Calibration, CalibrationError
-from diffproj.calibration.verdict import LacksViews
+from diffproj.calibration.problem.constraints import of_points
+from diffproj.calibration.problem.parametrisation import BOW, INTRINSICS
+from diffproj.calibration.results.calibration import Calibration, CalibrationError
+from diffproj.calibration.results.comparison import LensComparison
+from diffproj.calibration.results.remark import OF_THE_CAMERA
+from diffproj.calibration.trust.verdict import LacksViews
 from diffproj.lens.models import MODELS, LensModel
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views

@@ -11,21 +11,21 @@ from torch import Tensor
 
 from diffproj._core.arguments import flag, words
 from diffproj._core.warn import warn_caller
-from diffproj.calibration import start
-from diffproj.calibration.adjustment import Adjustment
-from diffproj.calibration.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.circle_centres import with_true_centres
-from diffproj.calibration.constraints import Priors
-from diffproj.calibration.data import Data
-from diffproj.calibration.fit import Fit, fit
+from diffproj.calibration.evidence.adjustment import Adjustment
+from diffproj.calibration.fitting import start
+from diffproj.calibration.fitting.data import Data
+from diffproj.calibration.fitting.fit import Fit, fit
+from diffproj.calibration.fitting.options import LocateOptions, Options, locate_options
+from diffproj.calibration.fitting.second_look import lower_fit
 from diffproj.calibration.known_poses import known_poses
-from diffproj.calibration.mismatch import CameraMismatchWarning, described
-from diffproj.calibration.options import LocateOptions, Options, locate_options
+from diffproj.calibration.least_squares.solver import Equations, Solution, Status, equations_at
 from diffproj.calibration.outcome import outcome
-from diffproj.calibration.parametrisation import POSE, Parametrisation
-from diffproj.calibration.result import Calibration
-from diffproj.calibration.second_look import lower_fit
-from diffproj.calibration.solver import Equations, Solution, Status, equations_at
+from diffproj.calibration.problem.constraints import Priors
+from diffproj.calibration.problem.parametrisation import POSE, Parametrisation
+from diffproj.calibration.results.ambiguity import AmbiguousPoseWarning
+from diffproj.calibration.results.calibration import Calibration
+from diffproj.calibration.results.mismatch import CameraMismatchWarning, described
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.targets.boards import origin_doubt
 from diffproj.targets.chessboard import Chessboard

@@ -13,16 +13,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj.calibration.data import Data
-from diffproj.calibration.entangled import DENOMINATOR
-from diffproj.calibration.fit import Fit
-from diffproj.calibration.options import Options
+from diffproj.calibration.fitting.data import Data
+from diffproj.calibration.fitting.fit import Fit
+from diffproj.calibration.fitting.options import Options
+from diffproj.calibration.fitting.positive_focal import with_positive_focal_lengths
+from diffproj.calibration.fitting.second_look import second_look
+from diffproj.calibration.fitting.start import Straightened
 from diffproj.calibration.outcome import minimised
-from diffproj.calibration.parametrisation import SKEW, Parametrisation, Pose
-from diffproj.calibration.positive_focal import with_positive_focal_lengths
+from diffproj.calibration.problem.parametrisation import SKEW, Parametrisation, Pose
 from diffproj.calibration.restraint import restrained
-from diffproj.calibration.second_look import second_look
-from diffproj.calibration.start import Straightened
+from diffproj.calibration.trust.entangled import DENOMINATOR
 from diffproj.lens.models import MODELS
 
 SHORT = 5

@@ -5,20 +5,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj.calibration import start
-from diffproj.calibration.data import Data
-from diffproj.calibration.fit import Fit
-from diffproj.calibration.free_points import with_free_points
+from diffproj.calibration.fitting import start
+from diffproj.calibration.fitting.data import Data
+from diffproj.calibration.fitting.fit import Fit
+from diffproj.calibration.fitting.free_points import with_free_points
+from diffproj.calibration.fitting.options import Options
+from diffproj.calibration.fitting.own_frame import are_solid
+from diffproj.calibration.fitting.second_look import lower_fit
+from diffproj.calibration.fitting.space_start import space_starts
+from diffproj.calibration.fitting.start import Straightened
 from diffproj.calibration.nested import Nested
-from diffproj.calibration.options import Options
 from diffproj.calibration.outcome import outcome
-from diffproj.calibration.own_frame import are_solid
-from diffproj.calibration.parametrisation import Parametrisation, Pose
+from diffproj.calibration.problem.parametrisation import Parametrisation, Pose
 from diffproj.calibration.restraint import unfolded
-from diffproj.calibration.result import Calibration
-from diffproj.calibration.second_look import lower_fit
-from diffproj.calibration.space_start import space_starts
-from diffproj.calibration.start import Straightened
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.lens.models import LensModel, model_named
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views

@@ -7,29 +7,29 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from diffproj.calibration.adequacy import poses_only
-from diffproj.calibration.ambiguity import OtherPoses
-from diffproj.calibration.compatibility import mismatch
-from diffproj.calibration.constraints import free_basis, held_at, make_prior, of_camera, of_points
-from diffproj.calibration.covariance import Covariance, points_turned, reshaped
-from diffproj.calibration.data import Data
-from diffproj.calibration.eliminated import local_inverse
-from diffproj.calibration.entangled import Entangled
-from diffproj.calibration.fit import Fit, fit
-from diffproj.calibration.handedness import upside_down
-from diffproj.calibration.mismatch import Mismatch
-from diffproj.calibration.noise import Noise, level, noise_of
-from diffproj.calibration.options import Options
-from diffproj.calibration.other_intrinsics import mismatch_of_a_camera
-from diffproj.calibration.other_poses import other_poses
-from diffproj.calibration.parametrisation import SKEW, Parametrisation
-from diffproj.calibration.remark import Kind, Remark, Remarks
-from diffproj.calibration.remarks import remarks
-from diffproj.calibration.result import Calibration, CalibrationError
-from diffproj.calibration.solver import Prior, Status
-from diffproj.calibration.surveyed import in_common
-from diffproj.calibration.uncertainty import covariance_of
-from diffproj.calibration.verdict import verdicts
+from diffproj.calibration.fitting.data import Data
+from diffproj.calibration.fitting.fit import Fit, fit
+from diffproj.calibration.fitting.options import Options
+from diffproj.calibration.fitting.surveyed import in_common
+from diffproj.calibration.least_squares.eliminated import local_inverse
+from diffproj.calibration.least_squares.solver import Prior, Status
+from diffproj.calibration.problem.constraints import free_basis, held_at, make_prior, of_camera, of_points
+from diffproj.calibration.problem.parametrisation import SKEW, Parametrisation
+from diffproj.calibration.results.ambiguity import OtherPoses
+from diffproj.calibration.results.calibration import Calibration, CalibrationError
+from diffproj.calibration.results.covariance import Covariance, points_turned, reshaped
+from diffproj.calibration.results.mismatch import Mismatch
+from diffproj.calibration.results.remark import Kind, Remark, Remarks
+from diffproj.calibration.trust.adequacy import poses_only
+from diffproj.calibration.trust.compatibility import mismatch
+from diffproj.calibration.trust.entangled import Entangled
+from diffproj.calibration.trust.handedness import upside_down
+from diffproj.calibration.trust.noise import Noise, level, noise_of
+from diffproj.calibration.trust.other_intrinsics import mismatch_of_a_camera
+from diffproj.calibration.trust.other_poses import other_poses
+from diffproj.calibration.trust.remarks import remarks
+from diffproj.calibration.trust.uncertainty import covariance_of
+from diffproj.calibration.trust.verdict import verdicts
 from diffproj.geometry.camera import Camera
 from diffproj.targets.landmarks import Landmarks
 

@@ -5,14 +5,14 @@ from typing import Unpack
 from kornia.geometry.camera import PinholeCamera
 
 from diffproj._core.arguments import flag
-from diffproj.calibration import start
 from diffproj.calibration.circle_centres import with_true_centres
-from diffproj.calibration.data import Data
-from diffproj.calibration.free_points import with_free_points
-from diffproj.calibration.implicit import differentiated
-from diffproj.calibration.options import CalibrationOptions, calibration_options
+from diffproj.calibration.fitting import start
+from diffproj.calibration.fitting.data import Data
+from diffproj.calibration.fitting.free_points import with_free_points
+from diffproj.calibration.fitting.implicit import differentiated
+from diffproj.calibration.fitting.options import CalibrationOptions, calibration_options
 from diffproj.calibration.outcome import minimised, outcome
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views

@@ -17,13 +17,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj.calibration.entangled import DENOMINATOR
-from diffproj.calibration.fit import Fit, fit
-from diffproj.calibration.parametrisation import Pose
-from diffproj.calibration.reach import folds_at_corners, reaches_image
-from diffproj.calibration.solver import Prior, Status
-from diffproj.calibration.task import Task
-from diffproj.calibration.two_poses import replaced, view_costs
+from diffproj.calibration.fitting.fit import Fit, fit
+from diffproj.calibration.fitting.task import Task
+from diffproj.calibration.fitting.two_poses import replaced, view_costs
+from diffproj.calibration.least_squares.solver import Prior, Status
+from diffproj.calibration.problem.parametrisation import Pose
+from diffproj.calibration.trust.entangled import DENOMINATOR
+from diffproj.calibration.trust.reach import folds_at_corners, reaches_image
 
 FIRST = 1.0
 """Deviation to which the terms below the line are held at first: what each adds to the denominator half an image's

@@ -15,13 +15,13 @@ from torch import Tensor
 from diffproj._core.arguments import checked_seed, whole_number
 from diffproj._core.shown import Shown
 from diffproj.calibration.circle_centres import with_true_centres
-from diffproj.calibration.data import Data
-from diffproj.calibration.distinct import alike
+from diffproj.calibration.fitting.data import Data
+from diffproj.calibration.fitting.options import CalibrationOptions, Options, calibration_options
 from diffproj.calibration.held_out import errors_of, folds_of, repeated, without_views
+from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.one_lens import calibrated
-from diffproj.calibration.options import CalibrationOptions, Options, calibration_options
-from diffproj.calibration.result import Calibration, CalibrationError
-from diffproj.calibration.solver import Status
+from diffproj.calibration.results.calibration import Calibration, CalibrationError
+from diffproj.calibration.results.distinct import alike
 from diffproj.lens.models import LensModel
 from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.target import Target

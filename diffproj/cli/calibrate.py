@@ -5,7 +5,7 @@ import functools
 from pathlib import Path
 from typing import get_args
 
-from diffproj.calibration.shape_names import Shape
+from diffproj.calibration.problem.shape_names import Shape
 from diffproj.cli.common_options import add_said, describe
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import add_orientation, camera_file, some_path

@@ -4,8 +4,8 @@ import argparse
 import math
 from typing import Any
 
-from diffproj.calibration.result import Calibration
-from diffproj.calibration.solver import Status
+from diffproj.calibration.least_squares.solver import Status
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.validation import CrossValidation
 from diffproj.lens.models import model_of
 

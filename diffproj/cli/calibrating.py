@@ -7,10 +7,10 @@ from dataclasses import replace
 from rich.markup import escape
 from rich.table import Table
 
-from diffproj.calibration.account import SENTENCES, told_of
 from diffproj.calibration.calibrate import calibrate
-from diffproj.calibration.result import Calibration
-from diffproj.calibration.solver import Status
+from diffproj.calibration.least_squares.solver import Status
+from diffproj.calibration.results.account import SENTENCES, told_of
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.validation import CrossValidation, cross_validate
 from diffproj.cli.calibrate_document import document
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing

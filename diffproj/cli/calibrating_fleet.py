@@ -20,7 +20,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from diffproj.calibration.calibrate import calibrate_and_tell
-from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.calibration.results.calibration import Calibration, CalibrationError
 from diffproj.cli.fleet_file import append, done_before, line_of
 from diffproj.cli.fleet_folder import Folder, Searched, on_one_core, searched
 from diffproj.cli.inputs import check_writable, writing

@@ -3,8 +3,8 @@
 import argparse
 from typing import Any
 
-from diffproj.calibration.result import Calibration
-from diffproj.calibration.rig_result import RigCalibration
+from diffproj.calibration.results.calibration import Calibration
+from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.cli.inputs import check_not_the_same, check_writable
 from diffproj.cli.terminal import as_json, result
 from diffproj.files.document import Document

@@ -7,7 +7,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from diffproj._core.atomic import write_whole
-from diffproj.calibration.result import CalibrationError
+from diffproj.calibration.results.calibration import CalibrationError
 from diffproj.cli.inputs import check_folder, writing
 from diffproj.cli.photographs import photographs, search
 from diffproj.cli.terminal import RESULTS, as_json, in_options, progress_bars, result, working

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from diffproj._core.atomic import write_whole
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.cli.fleet_folder import Searched
 from diffproj.files import own_json
 from diffproj.files.trees import json_lines

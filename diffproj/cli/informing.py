@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.cli.converting import name_in, named
 from diffproj.cli.terminal import alert, as_json, result
 from diffproj.files.document import Document

@@ -7,8 +7,8 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from diffproj.calibration.parametrisation import Parametrisation
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.problem.parametrisation import Parametrisation
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.cli.known_beforehand import FOCAL, PLACE, POSE, Known
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.mounting import rotation_from_mounting

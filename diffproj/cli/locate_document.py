@@ -8,8 +8,8 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from diffproj.calibration.adjustment import mounting_covariance
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.evidence.adjustment import mounting_covariance
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.cli.landmarks_file import Surveyed
 from diffproj.cli.terminal import RESULTS, aligned, counted, in_options, known, result, rounded
 from diffproj.cli.units import heading

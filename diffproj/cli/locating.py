@@ -8,14 +8,14 @@ from typing import Any
 
 from torch import Tensor
 
-from diffproj.calibration.adjust import adjust
-from diffproj.calibration.adjusted_view import of_view
+from diffproj.calibration.evidence.adjust import adjust
+from diffproj.calibration.evidence.adjusted_view import of_view
+from diffproj.calibration.evidence.observations import Seen
 from diffproj.calibration.locate import locate
-from diffproj.calibration.observations import Seen
-from diffproj.calibration.parametrisation import Parametrisation
+from diffproj.calibration.problem.parametrisation import Parametrisation
 from diffproj.calibration.refine import refine
-from diffproj.calibration.remark import Kind
-from diffproj.calibration.result import Calibration, CalibrationError
+from diffproj.calibration.results.calibration import Calibration, CalibrationError
+from diffproj.calibration.results.remark import Kind
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
 from diffproj.cli.inputs import check_not_the_same, check_writable, writing
 from diffproj.cli.known_beforehand import FOCAL, POSE

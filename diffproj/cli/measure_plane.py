@@ -7,7 +7,7 @@ import argparse
 
 import torch
 
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.cli.scene import Scene
 from diffproj.cli.units import Length, in_unit
 from diffproj.geometry.plane import Plane

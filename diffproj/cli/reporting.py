@@ -10,7 +10,7 @@ from diffproj._core.atomic import write_whole
 from diffproj.cli.inputs import check_writable, writing
 
 if TYPE_CHECKING:  # the help needs neither
-    from diffproj.calibration.result import Calibration
+    from diffproj.calibration.results.calibration import Calibration
     from diffproj.calibration.validation import CrossValidation
     from diffproj.targets.detection import Searched
 

@@ -8,7 +8,7 @@ import warnings
 from importlib import import_module
 from pathlib import Path
 
-from diffproj.calibration.result import CalibrationError
+from diffproj.calibration.results.calibration import CalibrationError
 from diffproj.cli.terminal import NOTES, VOICE, alert, failure, in_options, speak
 
 

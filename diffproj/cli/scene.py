@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 
 from diffproj.calibration.locate import locate
-from diffproj.calibration.result import Calibration, CalibrationError
-from diffproj.calibration.rig_result import RigCalibration
+from diffproj.calibration.results.calibration import Calibration, CalibrationError
+from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.cli.photographs import one_photograph, search
 from diffproj.cli.terminal import detail, progress_bars
 from diffproj.cli.units import Length, agreed, heading

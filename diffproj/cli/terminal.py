@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from diffproj._core import shown
-from diffproj.calibration.result import CalibrationError
-from diffproj.calibration.solver import Status
+from diffproj.calibration.least_squares.solver import Status
+from diffproj.calibration.results.calibration import CalibrationError
 from diffproj.cli.command_line import leave_output
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from torch import Tensor
 
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.files import colmap_records, colmap_rig_records
 from diffproj.files.colmap_records import MODELS, NOTICE, CameraRecord, ImageRecord
 from diffproj.files.document import Document

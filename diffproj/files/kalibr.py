@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import coefficients, first_brown, is_fisheye, kind_of, lens_of

@@ -8,8 +8,8 @@ import numpy as np
 
 from diffproj._core.arguments import called, file_path
 from diffproj._core.warn import warn_caller
-from diffproj.calibration.result import Calibration
-from diffproj.calibration.rig_result import RigCalibration
+from diffproj.calibration.results.calibration import Calibration
+from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.files import own_json
 from diffproj.files.document import Document
 from diffproj.files.formats import FormatName, PathLike, format_of

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import brown, coefficients, first_brown, fisheye, is_fisheye, unused

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.files import named
 from diffproj.files.document import Document
 from diffproj.files.found import Found

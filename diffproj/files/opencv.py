@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.files import named
 from diffproj.files.document import Document
 from diffproj.files.found import Found

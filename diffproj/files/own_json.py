@@ -28,8 +28,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffproj.calibration.result import Calibration
-from diffproj.calibration.rig_result import RigCalibration
+from diffproj.calibration.results.calibration import Calibration
+from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.files.document import Document
 from diffproj.files.found import Found, NotOneCameraError
 from diffproj.files.numbers import image_size

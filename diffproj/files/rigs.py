@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from diffproj._core.arguments import choice
-from diffproj.calibration.rig_result import RigCalibration
+from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.files import colmap, colmap_records, colmap_rig_records, kalibr, own_json
 from diffproj.files.colmap_records import ImageRecord
 from diffproj.files.colmap_rig_records import FrameRecord, RigRecord, SensorRecord

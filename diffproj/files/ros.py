@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import coefficients, is_fisheye, kind_of, lens_of

@@ -4,8 +4,8 @@ from kornia.geometry.camera import PinholeCamera
 
 from diffproj._core.arguments import file_path
 from diffproj._core.atomic import write_all_whole
-from diffproj.calibration.result import Calibration
-from diffproj.calibration.rig_result import RigCalibration
+from diffproj.calibration.results.calibration import Calibration
+from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.files import rigs
 from diffproj.files.formats import FormatName, PathLike, format_to_write
 from diffproj.geometry.camera import Camera, as_camera

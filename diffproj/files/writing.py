@@ -2,7 +2,7 @@
 
 import torch
 
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.camera import Camera
 
 

@@ -19,8 +19,8 @@ from torch import Tensor
 from diffproj._core import arguments
 from diffproj._core.arguments import called, numbers, whole_number
 from diffproj._core.shown import Shown, number
-from diffproj.calibration.region import in_region
-from diffproj.calibration.result import Calibration, as_calibration
+from diffproj.calibration.results.calibration import Calibration, as_calibration
+from diffproj.calibration.results.region import in_region
 from diffproj.geometry.back_projection import ground_resolution
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.grid import pixel_grid

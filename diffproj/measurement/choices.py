@@ -9,11 +9,11 @@ from torch import Tensor
 from diffproj._core.arguments import Array, first_of
 from diffproj._core.numerics import check_tensor
 from diffproj._core.warn import warn_caller
-from diffproj.calibration import ambiguity, mismatch
-from diffproj.calibration.adjustment import Adjustment
-from diffproj.calibration.mismatch import CameraMismatchWarning
-from diffproj.calibration.parametrisation import POSE
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.evidence.adjustment import Adjustment
+from diffproj.calibration.problem.parametrisation import POSE
+from diffproj.calibration.results import ambiguity, mismatch
+from diffproj.calibration.results.calibration import Calibration
+from diffproj.calibration.results.mismatch import CameraMismatchWarning
 
 PixelSigma = float | Tensor | Array | Literal["detector"] | None
 """A number of pixels, one or two or a covariance for each pixel; `"detector"` stands for that of the calibration's

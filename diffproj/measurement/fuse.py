@@ -32,7 +32,7 @@ from torch.utils._pytree import tree_leaves
 
 from diffproj._core.arguments import called
 from diffproj._core.numerics import broadcast_batches
-from diffproj.calibration.mismatch import CameraDisagreementWarning
+from diffproj.calibration.results.mismatch import CameraDisagreementWarning
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.agreement import chances, chi_square, disagreeing, inverse, joined, without
 from diffproj.measurement.measurement import Measurement

@@ -10,7 +10,7 @@ order where they move in proportion (a cubature rule). Where a moved lens does n
 import torch
 from torch import Tensor
 
-from diffproj.calibration.parametrisation import POSE, Parametrisation, moved
+from diffproj.calibration.problem.parametrisation import POSE, Parametrisation, moved
 from diffproj.geometry.back_projection import PlaneMap
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane

@@ -28,9 +28,9 @@ from torch import Tensor
 
 from diffproj._core.arguments import Array
 from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64, transform
-from diffproj.calibration.parametrisation import POSE, Parametrisation
-from diffproj.calibration.region import in_region
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.problem.parametrisation import POSE, Parametrisation
+from diffproj.calibration.results.calibration import Calibration
+from diffproj.calibration.results.region import in_region
 from diffproj.geometry.back_projection import back_project, warn_if_rounded
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.intrinsics import pixel_to_normalized

@@ -12,8 +12,8 @@ from torch import Tensor
 from diffproj._core import arguments
 from diffproj._core.copying import Copied
 from diffproj._core.shown import Shown, counted, rounded
-from diffproj.calibration.covariance import zero_where_infinite
-from diffproj.calibration.region import in_region
+from diffproj.calibration.results.covariance import zero_where_infinite
+from diffproj.calibration.results.region import in_region
 from diffproj.geometry.back_projection import Reason, explain
 from diffproj.measurement.ellipses import Ellipses, plane_ellipses
 from diffproj.measurement.folded import longest_first, norm_variance

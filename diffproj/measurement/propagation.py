@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from diffproj.calibration.covariance import zero_where_infinite
+from diffproj.calibration.results.covariance import zero_where_infinite
 from diffproj.measurement.sight import Sight, Straight
 
 

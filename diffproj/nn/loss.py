@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from diffproj._core.arguments import Array, booleans, number
 from diffproj._core.numerics import check_tensor, has_values
-from diffproj.calibration.losses import Loss, check_loss
+from diffproj.calibration.least_squares.losses import Loss, check_loss
 
 
 class CountedLoss(NamedTuple):
@@ -43,7 +43,7 @@ class PlaneLoss(nn.Module):
         pull: what an invalid point adds for each radian by which its ray misses the plane, in the unit of the loss.
 
     Raises:
-        TypeError: `loss` is not a robust loss (`diffproj.calibration.losses.Loss`), or `pull` no number.
+        TypeError: `loss` is not a robust loss (`diffproj.calibration.least_squares.losses.Loss`), or `pull` no number.
         ValueError: `pull` is negative or not finite.
 
     Example:

@@ -9,8 +9,8 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
 from diffproj._core.numerics import in_float64
-from diffproj.calibration.parametrisation import POSE
-from diffproj.calibration.result import Calibration, as_calibration
+from diffproj.calibration.problem.parametrisation import POSE
+from diffproj.calibration.results.calibration import Calibration, as_calibration
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.lens.models import model_of
 from diffproj.nn.partial import GeometryModule

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from diffproj._core.arguments import Array, called, choice
 from diffproj._core.numerics import check_tensor, dot, has_values
-from diffproj.calibration.rig_result import RigCalibration
+from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.cayley import turned
 from diffproj.geometry.rotations import check_pose

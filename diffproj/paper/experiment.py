@@ -20,8 +20,8 @@ from diffproj._core.arguments import flag
 from diffproj._core.shown import Shown
 from diffproj.calibration.calibrate import calibrate
 from diffproj.calibration.locate import locate
-from diffproj.calibration.result import Calibration
-from diffproj.calibration.shape_names import Shape
+from diffproj.calibration.problem.shape_names import Shape
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.plane import Plane
 from diffproj.lens.models import LensModel

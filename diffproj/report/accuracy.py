@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from markupsafe import Markup
 
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.accuracy_map import AccuracyMap

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import torch
 
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.validation import CrossValidation
 from diffproj.geometry.plane import Plane
 from diffproj.report.accuracy import accuracy_part

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from markupsafe import Markup
 
-from diffproj.calibration.region import in_region
+from diffproj.calibration.results.region import in_region
 from diffproj.report import svg
 from diffproj.report.document import Part, render
 from diffproj.report.facts import Facts

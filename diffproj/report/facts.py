@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from diffproj.calibration.region import DIRECTIONS
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
+from diffproj.calibration.results.region import DIRECTIONS
 from diffproj.report.document import shortened
 
 NAME = 80

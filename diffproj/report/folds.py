@@ -7,7 +7,7 @@ from jaxtyping import Float
 from markupsafe import Markup
 from torch import Tensor
 
-from diffproj.calibration.result import CalibrationError
+from diffproj.calibration.results.calibration import CalibrationError
 from diffproj.calibration.validation import CrossValidation, cross_validate
 from diffproj.report import svg
 from diffproj.report.document import Part, render

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from markupsafe import Markup
 from torch import Tensor
 
-from diffproj.calibration.border import border_with_rays
+from diffproj.calibration.results.border import border_with_rays
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import MODELS
 from diffproj.report import svg

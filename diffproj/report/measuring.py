@@ -10,7 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.arguments import called, choice
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.choices import HAND_PX

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from diffproj._core.arguments import file_path
 from diffproj._core.atomic import write_whole
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.choices import HAND_PX

@@ -13,8 +13,8 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.arguments import number
-from diffproj.calibration.parametrisation import POSE, Parametrisation, moved
-from diffproj.calibration.result import Calibration
+from diffproj.calibration.problem.parametrisation import POSE, Parametrisation, moved
+from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.lens.models import coefficients_of, model_of

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import torch
 
 from diffproj._core.shown import rounded
-from diffproj.calibration.account import told_of
-from diffproj.calibration.border import border_with_rays
-from diffproj.calibration.distinct import alike, described
+from diffproj.calibration.results.account import told_of
+from diffproj.calibration.results.border import border_with_rays
+from diffproj.calibration.results.distinct import alike, described
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.choices import HAND_PX
 from diffproj.measurement.measure import measure

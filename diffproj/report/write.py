@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, cast, get_args
 
 from diffproj._core.arguments import called, choice, file_path, whole_number
 from diffproj._core.atomic import write_whole
-from diffproj.calibration.advice import POSES_ONLY
-from diffproj.calibration.result import Calibration
-from diffproj.calibration.rig_result import RigCalibration
+from diffproj.calibration.results.advice import POSES_ONLY
+from diffproj.calibration.results.calibration import Calibration
+from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.calibration.validation import CrossValidation
 from diffproj.targets.images import Orientation, Source
 from diffproj.targets.target import Target, points_of

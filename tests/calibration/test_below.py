@@ -8,7 +8,7 @@ import torch
 
 import diffproj as dp
 from diffproj import cli
-from diffproj.calibration.remark import Kind
+from diffproj.calibration.results.remark import Kind
 
 SIZE = (1920, 1080)
 GROUND = torch.tensor([[x, y, 0.0] for x in (-5, 0, 5) for y in (0, 5, 12)], dtype=torch.float64)

@@ -611,7 +611,7 @@ def test_the_full_covariance_is_the_dense_inverse() -> None:
     torch.testing.assert_close(full, full.mT, rtol=1e-9, atol=1e-16)
     scale = full.diagonal().clamp(min=1e-30).rsqrt()
     assert torch.linalg.eigvalsh(full * scale * scale[:, None])[0] > -1e-9
-    from diffproj.calibration.reprojection import Reprojection
+    from diffproj.calibration.problem.reprojection import Reprojection
 
     coefficients = found.camera.distortion.coefficients
     K = found.camera.K

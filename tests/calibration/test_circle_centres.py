@@ -7,8 +7,8 @@ import torch
 
 import diffproj as dp
 from diffproj.calibration.circle_centres import middle_minus_centre
+from diffproj.calibration.fitting.options import calibration_options
 from diffproj.calibration.one_lens import calibrated
-from diffproj.calibration.options import calibration_options
 
 D = torch.float64
 BOARD = dp.CircleGrid(7, 5, spacing=20.0, diameter=17.0)

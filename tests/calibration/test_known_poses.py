@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import diffproj as dp
-from diffproj.calibration.adjustment import mounting_covariance
+from diffproj.calibration.evidence.adjustment import mounting_covariance
 
 D = torch.float64
 GROUND = dp.Plane.z(0.0)

@@ -95,7 +95,7 @@ def without_size(views: dp.Views) -> dp.Views:
     return dp.Views(views.pixels, views.visible)
 
 
-SAYS_MORE = pytest.mark.filterwarnings("ignore::diffproj.calibration.mismatch.CameraMismatchWarning")
+SAYS_MORE = pytest.mark.filterwarnings("ignore::diffproj.calibration.results.mismatch.CameraMismatchWarning")
 """That residuals want other intrinsics is told as well."""
 
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import diffproj as dp
-from diffproj.calibration.remark import Remark
+from diffproj.calibration.results.remark import Remark
 from diffproj.cli import calibrating
 from diffproj.targets.detection import Searched
 from tests.cli.commands import runner

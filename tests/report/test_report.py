@@ -18,7 +18,7 @@ import pytest
 import torch
 
 import diffproj as dp
-from diffproj.calibration.region import in_region
+from diffproj.calibration.results.region import in_region
 from diffproj.report.accuracy import accuracy_part
 from diffproj.report.coverage import covered_share
 from diffproj.report.facts import Facts, tilts_of

@@ -1,0 +1,1 @@
+"""Where a camera is, from evidence of any kind: landmarks, horizon, lengths, vanishing points."""

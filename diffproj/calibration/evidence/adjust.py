@@ -1,0 +1,187 @@
+"""`adjust`: where a camera is and how it looks, from any evidence, by least squares; differentiable if asked."""
+
+from collections.abc import Sequence
+from functools import partial
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from diffproj._core.arguments import called, flag, listing, whole_number, words
+from diffproj.calibration.evidence.adjusted_covariance import covariance_of
+from diffproj.calibration.evidence.adjustment import Adjustment
+from diffproj.calibration.evidence.descent import Found, Task, best, differentiated, spare
+from diffproj.calibration.evidence.knowledge import Knowledge, knowledge, prior_shapes
+from diffproj.calibration.evidence.observation import Observation
+from diffproj.calibration.evidence.pose_parameters import PLACE
+from diffproj.calibration.evidence.undetermined import described
+from diffproj.calibration.least_squares.losses import check_loss
+from diffproj.calibration.least_squares.solver import Status
+from diffproj.calibration.problem.constraints import Priors
+from diffproj.calibration.results.calibration import Calibration, CalibrationError
+from diffproj.calibration.results.covariance import Covariance
+from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
+from diffproj.targets.views import Views
+
+
+def adjust(
+    camera: Camera | PinholeCamera | Calibration,
+    observations: Sequence[Observation] | Observation = (),
+    *,
+    priors: Priors | None = None,
+    fixed: Sequence[str] = (),
+    free: Sequence[str] = (),
+    tied_focal: bool = True,
+    differentiable: bool = False,
+    max_iterations: int = 300,
+    throw: bool = True,
+) -> Adjustment:
+    """Find a camera's pose, and what is free of its intrinsics, from any evidence: a least-squares adjustment.
+
+    The world is that of `Camera.mounted`: z up, the ground z = 0; heights over it, tilt, roll and heading in degrees.
+    Without observations the priors alone are the evidence: a mounted camera with deviations.
+
+    Args:
+        camera: the start, of batch shape `*B`, such as `Camera.mounted(...)`; a calibration, whose covariance of the
+            intrinsics goes along. Its pose may be far off, where observations tell a better one.
+        observations: `Seen` landmarks, `Horizon`, `Heights`, `Lengths`, `VanishingPoints`, `Coplanar`, or an
+            `Observation` of your own; their batch shapes broadcast.
+        priors: what is known beforehand, by name: a standard deviation about the camera's own value, or a tuple `(mean,
+            standard deviation)`; numbers or tensors `(*B,)`. Names are `height`, `tilt`, `roll`, `heading`, `position`
+            (`x` and `y`), `focal`, `principal_point`, `distortion`, `f_x`, `k1` and so on; `turn_x`, `turn_y` and
+            `turn_z` are degrees about the camera's own axes in the place of the three angles. What has a prior is free.
+            A camera that looks straight down may lean beyond the vertical: as `Camera.mounting` has it, its tilt then
+            folds back below 90, and roll and heading, be they known, are told half a turn further.
+        fixed: names of the pose that keep the camera's values.
+        free: intrinsics that are to be found too, such as `"focal"`. All others keep the camera's values.
+        tied_focal: `f_x : f_y` keeps the camera's ratio where `focal` is free.
+        differentiable: carry gradients through the minimum, those with respect to the observations' tensors, the
+            camera's and those among the priors (implicit function theorem, exact Hessian). To first order.
+        max_iterations: of the solver.
+        throw: raise where a camera did not converge, or the evidence does not determine it; if False, look at `status`.
+
+    Returns:
+        The camera with its covariance, in float64: `measure` takes it, with a `pixel_sigma`.
+
+    Raises:
+        TypeError: no camera, no observations, or an argument of the wrong kind.
+        ValueError: an unknown name, values that cannot be, or shapes that do not fit.
+        CalibrationError: the evidence does not determine the camera, and the message says what is missing; or the
+            solver did not converge.
+
+    Example:
+        >>> import diffproj as dp
+        >>> mast = dp.Camera.mounted(2.18, 14.0, focal=800.0, size=(640, 480))
+        >>> known = dp.adjust(mast, priors={"height": 0.02, "tilt": 0.5}, fixed=("roll", "heading", "position"))
+        >>> ahead = dp.measure([[320.0, 216.2]], known, dp.Plane.z(0.0), pixel_sigma=1.0)
+        >>> print("{:.2f} m ahead ± {:.2f}".format(ahead.points[0, 1], ahead.deviations[0, 1]))
+        9.97 m ahead ± 0.43
+    """
+    known, calibration = camera, None
+    if isinstance(camera, Calibration):
+        calibration = camera
+        known = camera.cameras[..., 0] if isinstance(camera, Adjustment) else camera.camera
+    start = as_camera(known).upright()  # type: ignore[arg-type]
+    given = (observations,) if isinstance(observations, Observation) else listing("observations", observations, _WANT)
+    pieces = tuple(_checked(one) for one in given)
+    fixed, free = words("fixed", fixed, "several names"), words("free", free, "several names")
+    tied, through = flag("tied_focal", tied_focal), flag("differentiable", differentiable)
+    steps = whole_number("max_iterations", max_iterations, "a whole number of steps", least=0)
+    throw = flag("throw", throw)
+    if 0 in start.batch_shape:
+        raise ValueError(f"camera: want at least one, got batch shape {tuple(start.batch_shape)}")
+    if {"mounting", "position", *PLACE} & {*fixed, *(priors or ())} and looks_at_rounding(start.t):
+        center = start.detach().center
+        warn_of_rounding(center.norm(dim=-1), center[..., 2].abs())
+    start = start.to(torch.float64)
+    known_of = knowledge(start, priors, fixed, free, tied)
+    batch = _batch(start, pieces, known_of)
+    task = Task(pieces, start.expand(*batch), batch, known_of)
+    with torch.no_grad():
+        found = best(task, steps)
+    return _outcome(task, found, calibration, through, throw)
+
+
+_WANT = "observations such as [dp.Seen(landmarks, pixels), dp.Horizon(pixels)]"
+
+
+def _checked(observation: object) -> Observation:
+    residuals = getattr(observation, "residuals", None)
+    if isinstance(observation, type) or not isinstance(observation, Observation) or not callable(residuals):
+        raise TypeError(f"observations: want {_WANT}, got {called(observation)}")
+    check_loss(getattr(observation, "loss", None))
+    return observation
+
+
+def _batch(camera: Camera, pieces: Sequence[Observation], known: Knowledge) -> tuple[int, ...]:
+    shapes = [camera.batch_shape, *prior_shapes(known)]
+    with torch.no_grad():
+        for piece in pieces:
+            found = piece.residuals(camera)
+            if not isinstance(found, Tensor) or found.ndim < 2 or not found.is_floating_point():
+                name = type(piece).__name__
+                raise ValueError(f"{name}.residuals: want a tensor (*B, M, k) of numbers, got {called(found)}")
+            shapes.append(found.shape[:-2])
+    try:
+        batch = tuple(torch.broadcast_shapes(*shapes))
+    except RuntimeError:
+        listed = ", ".join(str(tuple(shape)) for shape in shapes)
+        raise ValueError(f"batch shapes of camera, priors and observations do not broadcast: {listed}") from None
+    if 0 in batch:
+        raise ValueError(f"priors, observations: want them of at least one camera, got batch shape {batch}")
+    return batch
+
+
+def _outcome(
+    task: Task, found: Found, calibration: Calibration | None, differentiable: bool, throw: bool
+) -> Adjustment:
+    batch = task.batch
+
+    def shaped(tensor: Tensor) -> Tensor:
+        return tensor.reshape((*batch, *tensor.shape[1:]))
+
+    with torch.no_grad():
+        covariance, names = covariance_of(task, found, calibration)
+        parts = tuple(shaped(block) for block in task.evidence(found.parameters).blocks(found.values))
+        left = spare(task, found)
+    lacking = torch.tensor([bool(each.names) for each in names], device=found.status.device)
+    status = torch.where(lacking & (found.status != Status.DIVERGED), Status.DEGENERATE, found.status)
+    causes = tuple(
+        described(each) if each.names and code == Status.DEGENERATE else ""
+        for each, code in zip(names, status.tolist(), strict=True)
+    )
+    values = differentiated(task, found) if differentiable else found.values
+    camera = found.parameters.unpack(values, batch, task.camera.size)
+    posed = camera[..., None] if batch else Camera.stack([camera])
+    views = Views.unchecked(
+        values.new_zeros(*batch, 1, 0, 2),
+        torch.zeros(*batch, 1, 0, dtype=torch.bool, device=values.device),
+        ("camera",),
+        camera.size,
+    )
+    adjusted = Adjustment(
+        camera.without_pose(),
+        posed,
+        views,
+        values.new_zeros(0, 3),
+        views.visible,
+        views.visible,
+        shaped(status),
+        shaped(found.iterations),
+        causes=causes,
+        skew=found.parameters.camera.skew,
+        _covariance=partial(_same, covariance),
+        observations=task.pieces,
+        parts=parts,
+        spare=shaped(left),
+        cost=shaped(found.cost),
+        unknown=tuple(each.names for each in names),
+    )
+    if throw and bool((status != Status.CONVERGED).any()):
+        raise CalibrationError(f"adjust: {adjusted.message}", adjusted)
+    return adjusted
+
+
+def _same(covariance: Covariance) -> Covariance:
+    return covariance

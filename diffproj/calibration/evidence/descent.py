@@ -1,0 +1,249 @@
+"""From the camera that `adjust` is given to the minimum: which start, the solver, and derivatives of where it ended."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.evidence.knowledge import Knowledge
+from diffproj.calibration.evidence.observation import Observation
+from diffproj.calibration.evidence.observations import Seen
+from diffproj.calibration.evidence.pose_parameters import PoseParameters
+from diffproj.calibration.evidence.problem import Evidence, Losses
+from diffproj.calibration.evidence.search import starts
+from diffproj.calibration.evidence.undetermined import natural
+from diffproj.calibration.least_squares.solver import Prior, Status, solve
+from diffproj.geometry.camera import Camera
+
+NEGLIGIBLE = 1e-18
+"""Cost, in squared deviations, that counts as zero: of evidence without noise."""
+TOLERANCE, ROUNDING = 1e-13, 1e-12
+"""Part of the cost that another step may still bring, and that rounding may."""
+ROBUST_STEPS, NEWTON = 40, 20
+"""Steps of reweighting, which shrink slowly under a robust loss, before at most so many of Newton's."""
+UNDETERMINED_STEPS = 30
+"""Steps where there are fewer residuals than unknowns: many places explain them, and the solver would go on long."""
+POOR = 9.0
+"""Cost per spare residual from which on other starts are tried."""
+RESTRAINT = 1e-8
+"""Weight of the start on each parameter in its natural unit: so small that it decides only what nothing else does."""
+HAIR = 1e-4
+"""Cost of half a turn away from the camera's own direction, over 4."""
+TRIED, FEW = 8, 8
+"""How many of them are followed, for how many steps before the best is followed to its minimum."""
+_STATE = ("values", "status", "iterations", "cost")
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be found of P cameras of batch shape `*B`.
+
+    Attributes:
+        pieces: the observations.
+        camera: the given one, with its graph.
+        batch: `*B`.
+        known: which parameters move, and what is known of them.
+    """
+
+    pieces: tuple[Observation, ...]
+    camera: Camera
+    batch: tuple[int, ...]
+    known: Knowledge
+
+    def own(self) -> Tensor:
+        """The camera's values `(P, q)`, with their graph."""
+        R = self.camera.R.reshape(-1, 3, 3)
+        packed = self.known.parameters(R).pack(self.camera)
+        return packed.reshape(-1, packed.shape[-1])
+
+    def evidence(
+        self, parameters: PoseParameters, more: tuple[int, ...] = (), columns: Sequence[int] | None = None
+    ) -> Evidence:
+        """The problem, with an axis of starts in front of the batch."""
+        columns = self.known.columns if columns is None else columns
+        return Evidence(self.pieces, parameters, (*more, *self.batch), self.camera.size, tuple(columns))
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where the solver ended.
+
+    Attributes:
+        parameters: with the rotations that turns are about.
+        basis: of the directions in which they move `(P, q, r)`.
+        prior: on the parameters.
+        values: `(P, q)`.
+        status: `(P,)`.
+        iterations: `(P,)`.
+        cost: `(P,)`.
+    """
+
+    parameters: PoseParameters
+    basis: Tensor
+    prior: Prior
+    values: Tensor
+    status: Tensor
+    iterations: Tensor
+    cost: Tensor
+
+
+def best(task: Task, steps: int) -> Found:
+    """The minimum from the camera's own pose; where it explains little, the best from other poses too."""
+    own, R = task.own(), task.camera.R.reshape(-1, 3, 3)
+    prior = task.known.prior(own, task.batch)
+    begin = task.known.begin(own, prior)
+    basis, none = task.known.basis(begin), torch.zeros(len(begin), dtype=torch.long, device=begin.device)
+    few = spare(task, Found(task.known.parameters(R), basis, prior, begin, none, none, begin[:, 0])) < 0
+    steps = min(steps, UNDETERMINED_STEPS) if bool(few.all()) else steps
+    found = descended(task, R, begin, prior, (), steps)
+    if not task.pieces or steps == 0:
+        return found
+    left = spare(task, found)
+    # Where there are fewer residuals than unknowns, another start tells no more.
+    poor = (found.status == Status.DIVERGED) | (~(2 * found.cost <= POOR * left.clamp(min=1)) & (left >= 0))
+    if not bool(poor.any()):
+        return found
+    camera = task.known.parameters(R).unpack(begin, (len(begin),), task.camera.size)
+    rotations, values = starts(task.pieces, task.known, camera, begin, task.batch)
+    K, P = values.shape[:2]
+    flat = rotations.flatten(0, 1)
+    blocks = task.evidence(task.known.parameters(flat), (K,), ()).residuals(values.flatten(0, 1))
+    cost = blocks.square().sum(-1).log1p().sum(-1).reshape(K, P).nan_to_num(torch.inf, torch.inf)  # mild on outliers
+    first = task.known.parameters(R).rotation(begin)
+    rows = (cost + _away(rotations, first)).topk(min(TRIED, K), dim=0, largest=False).indices
+    k, each = len(rows), torch.arange(P, device=rows.device)
+    many = Prior(*(part.expand(k, *part.shape).flatten(0, 1) for part in prior[:2]))
+    near = descended(task, rotations[rows, each].flatten(0, 1), values[rows, each].flatten(0, 1), many, (k,), FEW)
+    away = _away(near.parameters.rotation(near.values), first.repeat(k, 1, 1))
+    chosen = (near.cost + away).nan_to_num(torch.inf).reshape(k, P).argmin(0) * P + each
+    R = R if near.parameters.start is None else near.parameters.start[chosen]
+    other = descended(task, R, near.values[chosen], prior, (), steps)
+    ends = [torch.where(one.status == Status.CONVERGED, one.cost, torch.inf) for one in (other, found)]
+    better = poor & (ends[0] < ends[1])
+    start = None
+    if found.parameters.start is not None and other.parameters.start is not None:
+        start = torch.where(better[:, None, None], other.parameters.start, found.parameters.start)
+    parts = {
+        name: torch.where(better.reshape(-1, *(1,) * (old.ndim - 1)), getattr(other, name), old)
+        for name, old in ((name, getattr(found, name)) for name in _STATE)
+    }
+    return replace(found, parameters=replace(found.parameters, start=start), **parts)
+
+
+def _away(R: Tensor, first: Tensor) -> Tensor:
+    """A hair of cost for turns from the camera's own direction: of poses that explain as much, the nearer one."""
+    return HAIR * (3 - (R * first).sum((-2, -1)))
+
+
+def descended(task: Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[int, ...], steps: int) -> Found:
+    """The minimum that the solver reaches from values `(P, q)`, whose turns are about rotations `(P, 3, 3)`.
+
+    `more` is the shape of the starts that stand in front of the batch of cameras.
+    """
+    parameters = task.known.parameters(R)
+    evidence = task.evidence(parameters, more)
+    basis = task.known.basis(begin)
+    losses = [getattr(piece, "loss", None) for piece in task.pieces]
+    loss = None
+    if any(one is not None for one in losses):
+        counts = [block.shape[1] for block in evidence.blocks(begin)]
+        loss = Losses(tuple(zip(counts, losses, strict=True)))
+    found = solve(
+        evidence,
+        begin,
+        (),
+        local_size=0,
+        loss=loss,
+        prior=_restrained(task, begin, prior),
+        basis=basis,
+        max_iterations=steps if loss is None else min(steps, ROBUST_STEPS),
+        tolerance=TOLERANCE,
+        negligible=NEGLIGIBLE,
+    )
+    ended = Found(parameters, basis, prior, found.shared, found.status, found.iterations, found.cost)
+    return ended if loss is None or steps <= FEW else _polished(task, ended, more)
+
+
+def _restrained(task: Task, begin: Tensor, prior: Prior) -> Prior:
+    """The prior with a hair's weight on what nothing tells, which then stays where it began."""
+    own = prior.precision.diagonal(dim1=-2, dim2=-1)
+    hair = RESTRAINT * natural(begin, reach(task, begin)).square().reciprocal()
+    mean = torch.where(own > 0, prior.mean, begin)
+    return Prior(mean, torch.diag_embed(torch.where(own > 0, own, hair)))
+
+
+def _polished(task: Task, found: Found, more: tuple[int, ...]) -> Found:
+    """Newton's steps where robust losses slow reweighting down: near the minimum each squares what is left.
+
+    A step that raises the cost, or a curvature that is not positive, leaves a camera where the solver left it.
+    """
+    values, status, cost = found.values, found.status, found.cost
+    prior, T = found.prior, found.basis
+    for _ in range(NEWTON):
+        now, gradient, H = (part.detach() for part in _second_order(task, found.parameters, T, values, prior, more))
+        L, bent = torch.linalg.cholesky_ex(H.nan_to_num())
+        step = -torch.cholesky_solve(gradient.unsqueeze(-1), L)
+        left = -(gradient.unsqueeze(-2) @ step).flatten() / 2
+        sound = (bent == 0) & left.isfinite() & (status != Status.DIVERGED)
+        trial = torch.where(sound.unsqueeze(-1), values + (T @ step).squeeze(-1), values)
+        after = _cost(task, found.parameters, trial, prior, more)
+        better = sound & (after <= now + ROUNDING * now)
+        values, cost = torch.where(better.unsqueeze(-1), trial, values), torch.where(better, after, cost)
+        done = better & (left <= TOLERANCE * now + NEGLIGIBLE)
+        status = torch.where(done, Status.CONVERGED, status)
+        if bool((done | ~better).all()):
+            break
+    return replace(found, values=values, status=status, cost=cost)
+
+
+def differentiated(task: Task, found: Found) -> Tensor:
+    """The values `(P, q)` with their derivatives by everything that carries a graph: see `implicit.py`."""
+    T = found.basis
+    with torch.enable_grad():
+        own = task.own()
+        moving = torch.zeros(own.shape[-1], dtype=torch.bool, device=own.device)
+        moving[list(task.known.columns)] = True
+        base = torch.where(moving, found.values.detach(), own)
+        _, gradient, H = _second_order(task, found.parameters, T, base, task.known.prior(own, task.batch))
+        step = -torch.linalg.solve_ex(H, gradient.unsqueeze(-1))[0]
+        return base + (T @ (step - step.detach())).squeeze(-1)
+
+
+def _second_order(
+    task: Task, parameters: PoseParameters, T: Tensor, base: Tensor, prior: Prior, more: tuple[int, ...] = ()
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The cost `(P,)`, its gradient `(P, r)` along a basis, with its graph, and its exact second derivative."""
+    with torch.enable_grad():
+        theta = base.detach().new_zeros(len(base), T.shape[-1], requires_grad=True)
+        cost = _cost(task, parameters, base + (T @ theta.unsqueeze(-1)).squeeze(-1), prior, more)
+        gradient = torch.autograd.grad(cost.sum(), theta, create_graph=True)[0]
+        rows = [torch.autograd.grad(part.sum(), theta, retain_graph=True)[0] for part in gradient.unbind(-1)]
+    return cost, gradient, torch.stack(rows, dim=-2).detach()
+
+
+def _cost(task: Task, parameters: PoseParameters, values: Tensor, prior: Prior, more: tuple[int, ...]) -> Tensor:
+    off = torch.where(prior.precision.diagonal(dim1=-2, dim2=-1) > 0, values - prior.mean, 0.0)
+    cost = (off.unsqueeze(-2) @ prior.precision @ off.unsqueeze(-1)).flatten() / 2
+    for piece, block in zip(task.pieces, task.evidence(parameters, more).blocks(values), strict=True):
+        squared, loss = block.square().sum(-1), getattr(piece, "loss", None)
+        cost = cost + (squared if loss is None else loss.value(squared)).sum(-1) / 2
+    return cost
+
+
+def spare(task: Task, found: Found) -> Tensor:
+    """How many more residuals and priors there are than unknowns `(P,)`."""
+    blocks = task.evidence(found.parameters).blocks(found.values)
+    seen = sum((block.detach() != 0).any(-1).sum(-1) * block.shape[-1] for block in blocks)
+    known = (found.prior.precision.detach().diagonal(dim1=-2, dim2=-1) > 0).sum(-1)
+    return seen + known - found.basis.shape[-1]
+
+
+def reach(task: Task, values: Tensor) -> Tensor:
+    """The distance of what was seen `(P,)`: of surveyed points, else the height of the camera."""
+    center = values[:, -3:]
+    seen = [piece.points.detach().to(center) for piece in task.pieces if isinstance(piece, Seen)]
+    height = center[:, 2].abs().clamp(min=1e-9)
+    if not seen:
+        return height
+    return (torch.cat(seen) - center.unsqueeze(1)).norm(dim=-1).median(-1).values.maximum(1e-3 * height)

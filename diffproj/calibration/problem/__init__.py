@@ -1,0 +1,1 @@
+"""What is minimised: residuals of a target's points, by parameters that have names."""

@@ -1,0 +1,1 @@
+"""Cameras that look at one target together: calibrated jointly, with their places to each other."""

@@ -1,0 +1,233 @@
+"""The remarks on a calibration that converged: what is to be known of each camera."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.fitting.fit import Fit
+from diffproj.calibration.fitting.task import Task
+from diffproj.calibration.least_squares.solver import Status
+from diffproj.calibration.results.remark import OF_THE_CAMERA, Kind, Remark, Remarks
+from diffproj.calibration.trust.adequacy import (
+    BOW_PART,
+    EXACT_PX,
+    LENS_WORDS,
+    NOISY_PX,
+    PRINT_SHARE,
+    RADIAL_SHARE,
+    SHAPE_SHARE,
+    SHAPE_VIEWS,
+    SIGNIFICANT,
+    SMOOTH_SHARE,
+    counts,
+    other_lens,
+    poses_only,
+    wants_skew,
+)
+from diffproj.calibration.trust.entangled import Entangled, Simpler
+from diffproj.calibration.trust.leftover import Leftover, leftover
+from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
+from diffproj.calibration.trust.prior_weight import Elsewhere, weighed_anew
+from diffproj.calibration.trust.two_groups import TwoGroups, two_groups
+
+UNSURE = 0.1
+"""Deviation of a focal length, relative to it, from which on it is known roughly."""
+CONTRADICTION = 1e-4
+"""Chance of the residuals under the noise that was given below which they contradict it."""
+NOTABLE = 1.25
+"""Times that noise that residuals must be for a word."""
+BETTER = 0.8
+"""Part of what another lens would explain that two groups must save to be named in its place."""
+MOST_NAMED = 5
+"""Views that are named."""
+NO_DENOMINATOR = {"brown8": "'brown5'"} | dict.fromkeys(("brown12", "brown14"), "fixed=('k4', 'k5', 'k6')")
+"""What a lens with a denominator is without it."""
+
+
+def remarks(
+    found: Fit, status: Tensor, doubt: Entangled, names: Sequence[Sequence[str]], of_landmarks: bool = False
+) -> tuple[Remarks, ...]:
+    """The remarks on each of P cameras; none on one that did not converge.
+
+    Args:
+        found: the fit.
+        status: of each camera `(P,)`.
+        doubt: what the views hardly tell apart.
+        names: of the views of each camera.
+        of_landmarks: whether the corners are landmarks, which people click and survey.
+    """
+    task = found.task
+    converged = status == Status.CONVERGED
+    held = torch.zeros_like(converged)
+    if task.prior is not None and task.prior.known is not None:
+        held = (task.prior.precision != task.prior.known).any(-1).any(-1)
+    said: list[list[Remark]] = [[] for _ in status]
+    for p in (converged & held).nonzero().flatten().tolist():
+        said[p].append(
+            Remark(
+                "k4, k5 and k6 are held near those of a poorer lens, for without that the lens folds inside the image"
+            )
+        )
+    for p, growth in doubt.needless.items():
+        if not bool(held[p]):
+            said[p].append(
+                Remark(
+                    f"k4, k5 and k6 stand for noise, without them the residuals are {100 * growth:.1f} % larger: "
+                    f"{NO_DENOMINATOR[task.lens]} fits as well"
+                )
+            )
+    for p, other in doubt.simpler.items():
+        said[p].append(Remark(_not_told(other)))
+    for p, elsewhere in weighed_anew(found).items():
+        if bool(converged[p]):
+            said[p].append(Remark(_weighed_anew(elsewhere)))
+    for p in (converged & _unsure_focal(found)).nonzero().flatten().tolist():
+        said[p].append(Remark(_unsure(found, p)))
+    for p in (converged & _contradicts_noise(found)).nonzero().flatten().tolist():
+        reason = f"the residuals are {float(found.variance_of_residuals()[p].sqrt()):.2g} times what pixel_sigma says"
+        sentence = (
+            f"{reason}, more than chance allows: the deviations are too small; look for wrong landmarks or corners, "
+            "or give a larger pixel_sigma"
+        )
+        said[p].append(Remark(sentence, Kind.CONTRADICTION, reason))
+    sigma = found.pixel_sigma().detach()
+    which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
+    if len(which):
+        left, groups = leftover(found, which, SIGNIFICANT), two_groups(found, which)
+        wrong = prior_contradictions(found, which)
+        for i, p in enumerate(map(int, which.tolist())):
+            saved = groups[p].saved if p in groups else 0.0
+            if p in wrong:
+                said[p].append(_of_the_prior(wrong[p]))
+                if wrong[p].saved > BETTER * max(saved, float(left.smooth.share[i])):
+                    continue
+            if not of_landmarks and _uneven_print(task, left, i, p, saved):
+                said[p].append(_of_the_print(left, i))
+                continue
+            remark = _left_over(task, left, i, p, 0.0 if of_landmarks else float(sigma[p]))
+            if p in groups and saved > BETTER * float(left.smooth.share[i]):
+                said[p].append(_two_cameras(names[p], groups[p]))
+                remark = None if remark is not None and remark.kind in OF_THE_CAMERA else remark
+            said[p] += [] if remark is None else [remark]
+    return tuple(map(tuple, said))
+
+
+def _of_the_prior(wrong: PriorContradiction) -> Remark:
+    reason = f"the views contradict the prior on {wrong.name}"
+    return Remark(
+        f"{reason}: they tell {wrong.told:.6g} ± {wrong.deviation:.2g}, and it says {wrong.said:.6g} ± "
+        f"{wrong.sure:.2g}, {wrong.far:.0f} deviations off: is it of this camera, its zoom, this lens model, and "
+        "photographs of this size?",
+        Kind.WRONG_PRIOR,
+        reason,
+    )
+
+
+def _unsure_focal(found: Fit) -> Tensor:
+    """Which cameras have a focal length that is known roughly `(P,)`, as one view may leave it."""
+    variance = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, :2]
+    return (variance.sqrt() > UNSURE * found.solution.shared[:, :2].detach().abs()).any(-1)
+
+
+def _unsure(found: Fit, p: int) -> str:
+    variance = found.plain_covariance().shared[p].diagonal()[:2]
+    part = 100 * float((variance.sqrt() / found.solution.shared[p, :2].abs()).amax())
+    return (
+        f"the focal length is known only to {part:.0f} %: points put back near the target are as good as their error "
+        'bars say, others follow it; priors={"focal": (value, deviation)} or other views tilted differently tell more'
+    )
+
+
+def _contradicts_noise(found: Fit) -> Tensor:
+    """Which cameras have residuals larger than the noise that was given makes by chance `(P,)`."""
+    if not found.knows_noise:
+        return torch.zeros_like(found.solution.status, dtype=torch.bool)
+    spare = found.degrees_of_freedom().to(torch.float64)
+    squares = found.variance_of_residuals().detach().nan_to_num(0.0) * spare
+    rare = torch.special.gammaincc(spare.clamp(min=1) / 2, squares / 2) < CONTRADICTION
+    return rare & (squares > NOTABLE**2 * spare)
+
+
+def _two_cameras(names: Sequence[str], group: TwoGroups) -> Remark:
+    named = [names[view] for view in group.smaller]
+    named = named if len(named) <= MOST_NAMED else [*named[:MOST_NAMED], f"{len(named) - MOST_NAMED} more"]
+    sentence = (
+        f"{', '.join(named[:-1])} and {named[-1]} want another camera than the other views (with one for each group "
+        f"the residuals' sum of squares is {100 * group.saved:.0f} % smaller): was it one camera with one zoom and "
+        "focus, no photograph turned, cropped or resized, and one flat board? Else calibrate the groups by themselves"
+    )
+    return Remark(sentence, Kind.TWO_CAMERAS, "its views fall into two groups that want different cameras")
+
+
+def _not_told(other: Simpler) -> str:
+    it = "them" if len(other.held) > 1 else "it"
+    grown = f"{100 * other.growth:.1f} % larger" if other.growth > 0 else "no larger"
+    return (
+        f"these views hardly tell {', '.join(other.held)} from {other.name}: without {it} it is {other.there:.1f} px, "
+        f"not {other.here:.1f}, at residuals {grown}; the error bars hold both; fix {it}, or take a simpler lens"
+    )
+
+
+def _weighed_anew(other: Elsewhere) -> str:
+    return (
+        f"the priors weigh against corners that are known to 1 px, and these scatter by {other.sigma:.2g} px: with "
+        f"pixel_sigma={other.sigma:.2g} {other.name} would be about {other.there:.5g}, not {other.here:.5g}"
+    )
+
+
+def _uneven_print(task: Task, left: Leftover, i: int, p: int, saved: float) -> bool:
+    """Whether a print that is wider than high, or slanted, is what explains most of the residuals of camera `p`."""
+    if task.solid or int(task.used[p].any(-1).sum()) < SHAPE_VIEWS or not counts(left.print, i, PRINT_SHARE):
+        return False
+    others = ((left.radial, RADIAL_SHARE), (left.smooth, SMOOTH_SHARE), (left.shape, SHAPE_SHARE))
+    most = max((float(effect.share[i]) for effect, share in others if counts(effect, i, share)), default=0.0)
+    return float(left.print.share[i]) > max(most, saved)
+
+
+def _of_the_print(left: Leftover, i: int) -> Remark:
+    return Remark(
+        "the residuals repeat on the board, as if it were wider than high by more than it says, or less, or slanted "
+        f"({100 * float(left.print.share[i]):.0f} % of their sum of squares), which focal lengths take for their own: "
+        "take shape='free', which finds that, or print it at 100 % both ways and measure both sides of the whole board",
+        Kind.UNEVEN_PRINT,
+        "the board is not as wide and as high as it says",
+    )
+
+
+def _left_over(task: Task, left: Leftover, i: int, p: int, sigma: float) -> Remark | None:
+    """The remark on the residuals of camera `p`, number `i` of those that were tested; none where they are noise."""
+    if wants_skew(task, left, i):
+        part = f"{100 * float(left.skew.share[i]):.0f} % of their sum of squares"
+        return Remark(
+            f"the residuals {LENS_WORDS} over the image, as through a K with skew ({part}): take skew=True",
+            Kind.SKEW,
+            "a K without skew does not fit the camera",
+        )
+    for radial, effect, share in ((True, left.radial, RADIAL_SHARE), (False, left.smooth, SMOOTH_SHARE)):
+        if counts(effect, i, share):
+            where = "with the distance from the principal point" if radial else "over the image"
+            part = f"{100 * float(effect.share[i]):.0f} % of their sum of squares"
+            remedy = other_lens(task, p, radial)
+            return Remark(
+                f"the residuals {LENS_WORDS} {where}, as through another lens ({part}): {remedy}",
+                Kind.OTHER_LENS,
+                "this lens model does not fit the lens",
+            )
+    if int(task.used[p].any(-1).sum()) >= SHAPE_VIEWS and counts(left.shape, i, SHAPE_SHARE):
+        if counts(left.bow, i, BOW_PART * float(left.shape.share[i])):
+            return Remark(
+                "the residuals repeat on the board, as if it were bent: take shape='bow'",
+                Kind.BENT,
+                "the board is bent",
+            )
+        return Remark(
+            f"the residuals repeat on the board, whose corners lie {float(left.moved[i]):.2g} world units (RMS) "
+            "off the target's: take shape='free', which finds where they are, or a flatter or better print"
+        )
+    if sigma > NOISY_PX:
+        return Remark(
+            f"the corners scatter by {sigma:.1f} px in each coordinate, in sharp photographs by 0.1 to 0.3: "
+            "look for blur and for wrong corners"
+        )
+    return None
