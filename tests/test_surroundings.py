@@ -200,6 +200,29 @@ def pictures(shared: Shared) -> list[Any]:
     ]
 
 
+def rigs(shared: Shared) -> list[Any]:
+    views = {name: dp.example_views(name)[:6] for name in ("left", "right")}
+    priors = {"right.baseline": (83.2, 1.0), "left.focal": (533.0, 5.0)}
+    found: list[Any] = []
+    for rig in dp.calibrate_rig([views, {name: some[1:] for name, some in views.items()}], shared.board, priors=priors):
+        assert isinstance(rig, dp.RigCalibration)
+        points = rig.triangulate({name: some.pixels[1, ::9] for name, some in views.items()})
+        found += [
+            *rig.cameras.values(),
+            rig.rms,
+            rig.covariance.shared,
+            rig.summary(),
+            points.points,
+            points.covariance,
+        ]
+    return found
+
+
+def calibrations(shared: Shared) -> list[Any]:
+    twice = dp.Views(shared.views.pixels.expand(2, -1, -1, -1), size=shared.views.size)
+    return fitted(dp.calibrate(twice, shared.board, "brown4")[1])
+
+
 CALLS: dict[str, Callable[[Shared], Any]] = {
     "calibrate": lambda s: fitted(dp.calibrate(s.views, s.board, "brown4")),
     "calibrate with a prior": lambda s: fitted(
@@ -211,6 +234,8 @@ CALLS: dict[str, Callable[[Shared], Any]] = {
     "calibrate without outliers": lambda s: fitted(dp.calibrate(s.views, s.board, "brown4", reject_outliers=True)),
     "calibrate a fisheye": lambda s: fitted(dp.calibrate(s.views, s.board, "fisheye", tied_focal=True)),
     "choose a lens": lambda s: fitted(dp.calibrate(s.views, s.board, "auto")),
+    "one of many calibrations": calibrations,
+    "calibrate rigs, and triangulate": rigs,
     "refine": lambda s: fitted(
         dp.refine(s.views, s.board, s.calibration.cameras, weights=torch.tensor(2.5, dtype=D, device="cpu"))
     ),
@@ -300,6 +325,7 @@ def defaults(dtype: torch.dtype, device: str) -> Iterator[None]:
 
 QUICK = [
     "calibrate with a prior",
+    "calibrate rigs, and triangulate",
     "locate",
     "back_project",
     "explain",

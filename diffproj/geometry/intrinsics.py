@@ -152,7 +152,7 @@ def warped(
     library, (K_given, H) = arrays_of(K, matrix, double=True)
     if library is np and not H[..., 2, :2].any():  # the usual case
         upper = (H[..., None] * K_given[..., None, :, :]).sum(-2) / H[..., 2:, 2:]
-        return torch.as_tensor(upper, dtype=K.dtype), None
+        return torch.as_tensor(upper, dtype=K.dtype, device=K.device), None
     upper, Q = (torch.as_tensor(part, dtype=K.dtype, device=K.device) for part in _warped(library, K_given, H, ahead))
     return upper, Q
 

@@ -81,7 +81,7 @@ class Indexed:
 
 def _numbers(shape: torch.Size, index: Any) -> list[int]:
     """Which of all, one after the other."""
-    return index_batch(torch.arange(shape.numel()).reshape(shape), index, 0).flatten().tolist()
+    return index_batch(torch.arange(shape.numel(), device="cpu").reshape(shape), index, 0).flatten().tolist()
 
 
 def _before_views(index: Any) -> Any:

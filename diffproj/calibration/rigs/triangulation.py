@@ -144,7 +144,7 @@ def triangulated(rig: Rig, pixels_by_camera: Any, pixel_sigma: Any) -> Triangula
     eye = torch.eye(3, dtype=X.dtype, device=X.device)
     inverse = torch.linalg.inv(torch.where(valid[:, None, None], A, eye))
     root = _root(rig)
-    whole = {name: (seen[name][:, None, None] / sigma[name]).to(X) for name in pixels}
+    whole = {name: seen[name].to(X)[:, None, None] / sigma[name] for name in pixels}
     slopes = torch.cat([J[name] * whole[name] for name in pixels], dim=-2)  # (N, 2 c, 3), in deviations
     shifts = torch.cat([_by_parameters(rig, name, X) * whole[name] @ root[rig.columns[name]] for name in pixels], -2)
     off = torch.cat([residuals[name].unsqueeze(-1) * whole[name] for name in pixels], dim=-2)
