@@ -36,7 +36,7 @@ def photographs(paths: Iterable[Path], frames: int | None = None) -> list[Photog
 
     Args:
         paths: files, patterns, folders.
-        frames: of a video, each so-manieth frame; by default sharp ones.
+        frames: of a video, every n-th frame; by default sharp ones.
 
     Raises:
         ValueError: a folder holds no photograph, or a file is of a kind that has to be converted.

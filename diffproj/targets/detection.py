@@ -96,7 +96,7 @@ def detect(
         progress: called with `(done, total)` after each photograph.
         orientation: `"sensor"` counts a file's pixels as the sensor recorded them, whichever way up the camera was
             held: one lens has one principal point. `"upright"` turns each file as its EXIF data ask, as viewers do.
-        frames: of a video, take each so-manieth frame instead, sharp or not.
+        frames: of a video, take every n-th frame instead, sharp or not.
         executor: does the work on several cores or machines: any `concurrent.futures.Executor`, such as a
             `ProcessPoolExecutor`, Dask's `client.get_executor()` or `mpi4py.futures`. Each worker reads its own files.
 

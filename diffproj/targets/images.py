@@ -47,7 +47,7 @@ def listed(photographs: Source | Iterable[Source], frames: int | None = None) ->
     Args:
         photographs: a file, a folder (its photographs in natural order: `view2` before `view10`; hidden files are
             none), a pattern such as `photos/left*.jpg`, an array, a tensor, or a list of files, arrays and tensors.
-        frames: of a video, each so-manieth frame; by default sharp ones from all its parts.
+        frames: of a video, every n-th frame; by default sharp ones from all its parts.
 
     Raises:
         TypeError: an entry is none of these.

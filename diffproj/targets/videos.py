@@ -26,8 +26,8 @@ class Frame(NamedTuple):
         video: the file.
         number: of the frame, from 0.
         png: the grey image.
-        sharpness: for which it was chosen, so that others may show the board at the same place; None for one of each
-            so-manieth frame.
+        sharpness: for which it was chosen, so that others may show the board at the same place; None where every
+            n-th frame was asked for.
     """
 
     video: Path
@@ -42,17 +42,24 @@ class Frame(NamedTuple):
 
 
 def frames_of(video: Path, every: int | None) -> list[Frame]:
-    """Frames of a video: each so-manieth, or the sharpest of each of at most 60 equal parts.
+    """Frames of a video: every n-th, or the sharpest of each of at most 60 equal parts.
 
     Raises:
         ValueError: OpenCV reads no frame of it.
     """
-    count = sum(1 for _ in _decoded(video))
-    if not count:
+    frames = _sharpest(video) if every is None else _each(video, every)
+    if not frames:
         raise ValueError(f"{video}: want a video, got a file of which OpenCV reads no frame")
-    if every is not None:
-        return [_kept(video, n, image, None) for n, image in islice(enumerate(_decoded(video)), 0, None, every)]
-    length = -(-count // MOST)
+    return frames
+
+
+def _each(video: Path, every: int) -> list[Frame]:
+    return [_kept(video, n, image, None) for n, image in islice(enumerate(_decoded(video)), 0, None, every)]
+
+
+def _sharpest(video: Path) -> list[Frame]:
+    """Of each of at most 60 equal parts."""
+    length = -(-sum(1 for _ in _decoded(video)) // MOST)
     frames: list[Frame] = []
     best = -1.0
     for number, image in enumerate(_decoded(video)):
