@@ -181,7 +181,8 @@ def test_neither_copies_nor_company_nor_order_change_the_minimum() -> None:
     for copies in (2, 10, 11):
         views = dp.Views(pixels.expand(copies, *pixels.shape), size=(640, 480))
         together = dp.calibrate(views, BOARD, "brown4")
-        assert torch.equal(together.camera.K, alone.camera.K.expand(copies, 3, 3))
+        # To the bit on some processors; on others PyTorch multiplies batches in another order than single matrices.
+        torch.testing.assert_close(together.camera.K, alone.camera.K.expand(copies, 3, 3), rtol=1e-12, atol=0)
     order = [3, 5, 0, 4, 2, 1]
     other = dp.calibrate(dp.Views(pixels[order], size=(640, 480)), BOARD, "brown4")
     torch.testing.assert_close(other.camera.K, alone.camera.K, rtol=1e-6, atol=0)
