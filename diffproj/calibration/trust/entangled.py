@@ -14,7 +14,9 @@ to the other, the mean square of the error of the parameters that were kept is
 if the simpler camera is the right one, and no more if it is not.
 
 Of a camera that hardly knows its principal point, as through a long lens, the lens itself is asked about likewise:
-terms that stand for noise bend the image about any point that suits them, and seem to know it well.
+terms that stand for noise bend the image about any point that suits them, and seem to know it well. The poorer lens may
+end at the same point, and yet know it far less well. If it is the right one, the point is only known so well: then the
+covariance is the larger one of this and the poorer lens's own.
 """
 
 from dataclasses import dataclass, replace
@@ -52,6 +54,8 @@ FAR = 2.0
 """Deviations of an intrinsic parameter beyond which its error bar does not cover another value."""
 TELLING_VIEWS = 3
 """Views from which on the lens is doubted: fewer do not tell how far corners err together."""
+PINNED = 1.5
+"""Times its deviation that an intrinsic parameter may have through a poorer lens; beyond, the lens's terms pin it."""
 REAL = 3.5
 """Deviations of a normal variable from which on a term of the lens is no noise."""
 
@@ -65,16 +69,23 @@ class Simpler:
         name: of the intrinsic parameter that differs most, in deviations.
         here: its value in the calibration.
         there: its value in the simpler camera.
+        deviations: of it here, and there if that is asked.
         growth: part by which the residuals are larger there.
-        step: from the shared parameters here to those there `(s,)`.
+        doubt: what the covariance of the shared parameters has to grow by `(s, s)`.
     """
 
     held: tuple[str, ...]
     name: str
     here: float
     there: float
+    deviations: tuple[float, float]
     growth: float
-    step: Tensor
+    doubt: Tensor
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether it is another value there; else it is only known less well."""
+        return abs(self.there - self.here) > FAR * self.deviations[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,19 +142,20 @@ class Entangled:
         """The covariance `(P, ...)` with the doubt in it."""
         if not self.simpler:
             return covariance
-        step = torch.zeros_like(covariance.shared[..., 0])
+        shared = covariance.shared.clone()
         for p, other in self.simpler.items():
-            step[p] = other.step.to(step)
-        return replace(covariance, shared=covariance.shared + step.unsqueeze(-1) * step.unsqueeze(-2))
+            shared[p] += other.doubt.to(shared)
+        return replace(covariance, shared=shared)
 
 
 def _simpler(found: Fit, numbers: list[int], choices: list[tuple[str, ...]], every: bool = False) -> dict[int, Simpler]:
     """The first of some choices of what is held that the corners hardly notice, where the camera is another one then.
 
-    With `every`, the first of all choices with which it is another one.
+    With `every`, the first of all choices with which it is another one, or known far less well.
     """
     told: dict[int, Simpler] = {}
-    deviations = covariance_of(found).shared.diagonal(dim1=-2, dim2=-1).sqrt()[:, : len(INTRINSICS)]
+    covariance = covariance_of(found).shared
+    deviations = _deviations(covariance)
     left = torch.arange(len(numbers), device=deviations.device)
     for held in choices:
         whole = found.part(left)
@@ -155,16 +167,42 @@ def _simpler(found: Fit, numbers: list[int], choices: list[tuple[str, ...]], eve
         step = without.solution.shared - whole.solution.shared
         off = step[:, : len(INTRINSICS)].abs() / deviations[left]
         off = torch.where(deviations[left] > 0, off, 0.0)
+        doubt, poorer = step.unsqueeze(-1) * step.unsqueeze(-2), deviations[left]
+        if every:
+            known = covariance_of(without).shared
+            doubt, poorer = doubt + _excess(known, covariance[left] + doubt), _deviations(known)
+        pinned = torch.where((deviations[left] > 0) & poorer.isfinite(), poorer / deviations[left], 0.0)
         growth = (without.solution.cost / whole.solution.cost).sqrt() - 1
-        other = same & (off.amax(-1) > FAR)
+        moved = off.amax(-1) > FAR
+        other = same & (moved | (pinned.amax(-1) > PINNED))
         for i in other.nonzero().flatten().tolist():
-            k = int(off[i].argmax())
+            k = int((off if bool(moved[i]) else pinned)[i].argmax())
             here, there = (float(fitted.solution.shared[i, k]) for fitted in (whole, without))
-            told[numbers[int(left[i])]] = Simpler(held, INTRINSICS[k], here, there, float(growth[i]), step[i])
+            both = float(deviations[left][i, k]), float(poorer[i, k])
+            told[numbers[int(left[i])]] = Simpler(held, INTRINSICS[k], here, there, both, float(growth[i]), doubt[i])
         left = left[~(other if every else same)]
         if len(left) == 0:
             break
     return told
+
+
+def _deviations(covariance: Tensor) -> Tensor:
+    """The deviations of the intrinsic parameters `(n, 4)`."""
+    return covariance.diagonal(dim1=-2, dim2=-1)[:, : len(INTRINSICS)].sqrt()
+
+
+def _excess(poorer: Tensor, richer: Tensor) -> Tensor:
+    """What a covariance `(n, s, s)` has to grow by to hold another's intrinsics too, and what goes with them there.
+
+    The others follow by their regression on the intrinsics; pixels are a common measure of these four.
+    """
+    count = len(INTRINSICS)
+    poorer, richer = (part.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0) for part in (poorer, richer))
+    own = poorer[:, :count, :count]
+    more, axes = torch.linalg.eigh(own - richer[:, :count, :count])
+    growth = (axes * more.clamp(min=0).unsqueeze(-2)) @ axes.mT
+    follow = poorer[:, :, :count] @ torch.linalg.pinv(own, hermitian=True)
+    return follow @ growth @ follow.mT
 
 
 def _adrift(found: Fit) -> Tensor:

@@ -163,9 +163,14 @@ def _two_cameras(names: Sequence[str], group: TwoGroups) -> Remark:
 def _not_told(other: Simpler) -> str:
     it = "them" if len(other.held) > 1 else "it"
     grown = f"{100 * other.growth:.1f} % larger" if other.growth > 0 else "no larger"
+    if other.elsewhere:
+        what, hold = f"is {other.there:.1f} px, not {other.here:.1f}", "both"
+    else:
+        here, there = other.deviations
+        what, hold = f"is known to {there:.1f} px, not {here:.1f}", "that"
     return (
-        f"these views hardly tell {', '.join(other.held)} from {other.name}: without {it} it is {other.there:.1f} px, "
-        f"not {other.here:.1f}, at residuals {grown}; the error bars hold both; fix {it}, or take a simpler lens"
+        f"these views hardly tell {', '.join(other.held)} from {other.name}: without {it} it {what}, "
+        f"at residuals {grown}; the error bars hold {hold}; fix {it}, or take a simpler lens"
     )
 
 
