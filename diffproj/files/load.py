@@ -13,7 +13,7 @@ from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.files import own_json
 from diffproj.files.document import Document
 from diffproj.files.formats import FormatName, PathLike, format_of
-from diffproj.files.found import Found
+from diffproj.files.found import Found, NotOneCameraError
 from diffproj.files.image_sizes import exchanged_sides, other_image
 from diffproj.geometry.camera import Camera
 
@@ -61,7 +61,7 @@ def _chosen(document: Document, format: FormatName | None = None, camera: str | 
     try:
         return found.chosen(camera)
     except ValueError as error:
-        raise ValueError(_message(document, error)) from error
+        raise _refusal(document, error) from error
 
 
 def found_in(document: Document, format: FormatName | None = None) -> Found:  # noqa: A002
@@ -76,7 +76,7 @@ def found_in(document: Document, format: FormatName | None = None) -> Found:  # 
         for one in found.cameras.values():
             _check_size(one, own=own_json.recognises(document))
     except DAMAGE as error:
-        raise ValueError(_message(document, error)) from error
+        raise _refusal(document, error) from error
     return found
 
 
@@ -88,7 +88,7 @@ def _check_size(camera: Camera, own: bool) -> None:
     """
     exchanged = exchanged_sides(camera)
     if exchanged and not own:
-        raise ValueError(f"size: want width and height, got {camera.size}, {exchanged}")
+        raise ValueError(f"size: want width and height, got {camera.size}, {exchanged}; exchange them in the file")
     doubt = f"size: {camera.size}, {exchanged}" if exchanged else other_image(camera)
     if doubt:
         warn_caller(doubt)
@@ -158,17 +158,18 @@ def _own(document: Document, read: Callable[[Document], T | None]) -> T | None:
     try:
         found = read(document) if own_json.recognises(document) else None
     except DAMAGE as error:
-        raise ValueError(_message(document, error)) from error
+        raise _refusal(document, error) from error
     if isinstance(found, Calibration):
         _check_size(found.camera, own=True)
     return found
 
 
-def _message(document: Document, error: Exception) -> str:
+def _refusal(document: Document, error: Exception) -> ValueError:
     """One line that names the file and what is wrong with it."""
     said = " ".join(str(error).split())
     if isinstance(error, KeyError):
         said = f"want the key {said.strip(chr(39))}, got a file without it"
     elif not isinstance(error, ValueError):
         said = f"the file is damaged ({error!r})"
-    return f"{document.path}: {said}"
+    kind = NotOneCameraError if isinstance(error, NotOneCameraError) else ValueError
+    return kind(f"{document.path}: {said}")

@@ -89,8 +89,8 @@ def test_info_tells_what_is_in_a_file(folder: Path, capsys: pytest.CaptureFixtur
 def test_info_doubts_what_looks_wrong(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for text, said in (
         (
-            KALIBR.replace("[752, 480]", "[480, 752]"),
-            "the principal point (367.2, 248.4) is far from the middle of 480 x 752 px",
+            KALIBR.replace("367.215, 248.375", "367.215, 448.375"),
+            "the principal point (367.2, 448.4) is far from the middle of 752 x 480 px",
         ),
         (
             OPENCV_YAML.replace("6.8415526980092864e+02, 0., 6.41", "3.8415526980092864e+02, 0., 6.41"),
@@ -105,6 +105,14 @@ def test_info_doubts_what_looks_wrong(folder: Path, capsys: pytest.CaptureFixtur
         (folder / "doubtful.yaml").write_text(text)
         assert main(["info", str(folder / "doubtful.yaml")]) == 0
         assert said in capsys.readouterr().err
+
+
+def test_info_refuses_height_and_width(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "doubtful.yaml").write_text(KALIBR.replace("[752, 480]", "[480, 752]"))
+    assert main(["info", str(folder / "doubtful.yaml")]) == 1
+    said = capsys.readouterr().err
+    assert "(480, 752), which looks like height and width" in said
+    assert "exchange them in the file" in said
 
 
 def test_info_of_a_calibration_and_of_damage(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -222,7 +222,7 @@ def test_what_the_camera_leaves_open_is_carried(capsys: pytest.CaptureFixture[st
     dp.save_camera(tmp_path / "camera.json", calibration)
     dp.save_camera(tmp_path / "camera.yaml", calibration)
     rows = zip(views.pixels[0].tolist(), board.points.tolist(), strict=True)
-    lines = [",".join(map(str, (*pixel, *point))) for pixel, point in rows]
+    lines = [",".join(map(str, (*pixel, x, -y, -z))) for pixel, (x, y, z) in rows]  # a board's z leads away from it
     (tmp_path / "corners.csv").write_text("\n".join(["u,v,x,y,z", *lines]))
     options = ["--landmarks", str(tmp_path / "corners.csv"), "--pixel-sigma", "0.2"]
     known, exact = (parsed(capsys, "--camera", str(tmp_path / f"camera.{end}"), *options) for end in ("json", "yaml"))
