@@ -213,7 +213,7 @@ def test_one_wrong_corner_does_not_cost_its_view() -> None:
     assert found.camera.K[0, 0].item() == pytest.approx(1750, abs=1e-6)
 
 
-@pytest.mark.parametrize("share", [0.01, 0.05])
+@pytest.mark.parametrize("share", [pytest.param(0.01, marks=pytest.mark.slow), 0.05])
 @pytest.mark.parametrize("options", [{"loss": dp.Huber(0.5)}, {"reject_outliers": True}], ids=["huber", "rejection"])
 def test_wrong_corners_turn_no_view(options: dict[str, Any], share: float) -> None:
     """One start left a view turned by more than 10 degrees in 12 and 43 (Huber), 19 and 133 (rejection) of 300."""

@@ -177,10 +177,10 @@ DRIFT = torch.linspace(-1.5, 1.5, 20, dtype=D)[:, None, None] * torch.tensor([1.
     "pixels",
     [
         VIEWS.pixels[[3]],
-        VIEWS.pixels[[3] * 20],
+        pytest.param(VIEWS.pixels[[3] * 20], marks=pytest.mark.slow),
         noisy(VIEWS[[3] * 20], 0.3).pixels,
         noisy(VIEWS[[8] * 5], 1.0).pixels,
-        VIEWS.pixels[[3] * 20] + DRIFT,
+        pytest.param(VIEWS.pixels[[3] * 20] + DRIFT, marks=pytest.mark.slow),
         VIEWS.pixels[[12] * 20] + 2 * DRIFT,
     ],
     ids=["one", "copies", "noise", "more noise", "drift", "more drift"],

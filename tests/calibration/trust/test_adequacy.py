@@ -132,7 +132,7 @@ def test_skew_is_advised_where_it_is_missing() -> None:
     assert "skew" not in dp.calibrate(skewed, BOARD, skew=True).message
 
 
-@pytest.mark.parametrize("skew", [-30.0, 30.0])
+@pytest.mark.parametrize("skew", [pytest.param(-30.0, marks=pytest.mark.slow), 30.0])
 @pytest.mark.parametrize(("lens", "model"), [(None, "brown5"), (BROWN, "brown4"), (BROWN, "brown5")])
 def test_much_skew_is_advised_too(lens: dp.BrownConrady | None, model: str, skew: float) -> None:
     """It leaves 0.6 to 1 px, part of which any lens would explain."""
