@@ -46,9 +46,11 @@ FINAL_TOLERANCE = 4
 
 
 def squared_domain(domain: Values) -> Values:
-    """The squared radius of the domain as a column; negative for an empty domain."""
-    domain = domain[..., None]
-    return library_of(domain).where(domain > 0, domain * domain, -1)
+    """The squared radius of the domain as a column; negative for an empty domain.
+
+    (Here and below an axis is added to what was computed: of a constant alone Inductor cannot make a column.)
+    """
+    return library_of(domain).where(domain > 0, domain * domain, -1)[..., None]
 
 
 def untilted(terms: Terms, points: Tensor) -> Pair:
@@ -114,8 +116,7 @@ def _tried(coefficients: Values, points: Values, plan: Plan, dtype: torch.dtype)
     rho_squared = plus_product(x * x, y, y)
     start_x, start_y = _start(terms, target, rho_squared, InverseTable(plan.rho_max, plan.ratio))
     x, y = newton(terms, target, start_x, start_y, steps=NEWTON_STEPS[dtype])
-    reach = plan.reach[..., None]
-    possible = rho_squared <= (reach * reach).clip(None, torch.finfo(dtype).max)
+    possible = rho_squared <= (plan.reach * plan.reach).clip(None, torch.finfo(dtype).max)[..., None]
     possible = possible if ahead is None else possible & ahead
     solved = _solves(terms, target, rho_squared, plan.domain, plan.noise, x, y, dtype) & possible
     return x, y, start_x, start_y, possible, solved
@@ -148,7 +149,7 @@ def _solves(
 ) -> Any:
     """Whether `(x, y)` lies in the domain and is distorted to the target, whose squared radius is `rho_squared`."""
     share = 1 if terms.tilt is None else TILT_FACTOR
-    tolerance = share * TOLERANCE[dtype] * torch.finfo(dtype).eps * noise[..., None]
+    tolerance = (share * TOLERANCE[dtype] * torch.finfo(dtype).eps * noise)[..., None]
     off_x, off_y, s = residual(terms, target, x, y)
     off_squared = plus_product(off_x * off_x, off_y, off_y)
     return (off_squared <= tolerance * tolerance * rho_squared) & (s <= squared_domain(domain))

@@ -35,8 +35,7 @@ class InverseTable(NamedTuple):
 
     def ratio_at(self, rho_squared: Any) -> Any:
         """`r / rho` for distorted points of squared radius `rho_squared (*B, N)`; beyond the table, that at its end."""
-        rho_max = self.rho_max[..., None]
-        farthest = rho_max * rho_max
+        farthest = (self.rho_max * self.rho_max)[..., None]
         near = farthest.clip(None, 1)
         end = (NODES - 1) ** 2 * near / farthest  # position^2 is A / (c^2 + rho^2) - this
         squared = near * ((NODES - 1) ** 2 + end) / (near + rho_squared) - end

@@ -91,11 +91,11 @@ def adjust(
     throw = flag("throw", throw)
     if 0 in start.batch_shape:
         raise ValueError(f"camera: want at least one, got batch shape {tuple(start.batch_shape)}")
-    if {"mounting", "position", *PLACE} & {*fixed, *(priors or ())} and looks_at_rounding(start.t):
-        center = start.detach().center
-        warn_of_rounding(center.norm(dim=-1), center[..., 2].abs())
-    start = start.to(torch.float64)
+    given, start = start, start.to(torch.float64)
     known_of = knowledge(start, priors, fixed, free, tied)
+    if {"mounting", "position", *PLACE} & {*fixed, *(priors or ())} and looks_at_rounding(given.t):
+        center = given.detach().center
+        warn_of_rounding(center.norm(dim=-1), center[..., 2].abs())
     batch = _batch(start, pieces, known_of)
     task = Task(pieces, start.expand(*batch), batch, known_of)
     with torch.no_grad():
