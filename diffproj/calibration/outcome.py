@@ -152,8 +152,7 @@ def _remarks(found: Fit, status: Tensor, doubt: Entangled, data: Data) -> tuple[
     said = remarks(found, status, doubt, [names] * len(status), of_landmarks)
     if not of_landmarks or found.task.solid:
         return said
-    R, t = data.frame.world_pose(*_state(found)[1])
-    below = upside_down(data.given_points.detach(), R, t) & found.task.used.any(-1)
+    below = upside_down(data.frame, *_state(found)[1]) & found.task.used.any(-1)
     below &= (status == Status.CONVERGED).unsqueeze(-1)
     return tuple(
         (*one, Remark(BELOW.format(", ".join(names[v] for v in where)), Kind.BELOW)) if where else one

@@ -10,6 +10,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from diffproj.calibration.fitting.own_frame import OwnFrame
 from diffproj.calibration.fitting.space_poses import space_poses
 from diffproj.calibration.fitting.task import Task, solved
 from diffproj.calibration.fitting.two_poses import posed
@@ -53,19 +54,18 @@ def left_handed(task: Task, solution: Solution, error: Tensor) -> Tensor:
     return found.index_put((which,), lowest < BETTER * solution.cost[which])
 
 
-def upside_down(points: Tensor, R: Tensor, t: Tensor) -> Tensor:
-    """Which poses `(...)` see points `(N, 3)` of a level plane from below, and do not stand upright there.
+def upside_down(frame: OwnFrame, R: Tensor, t: Tensor) -> Tensor:
+    """Which poses `(...)` see a target on a level plane from below, and do not stand upright there.
 
     Args:
-        points: in the world.
-        R: of the poses, world to camera `(..., 3, 3)`.
+        frame: the target's own, on whose plane z = 0 its points lie.
+        R: of the poses, from that frame to the camera `(..., 3, 3)`.
         t: too `(..., 3)`.
     """
-    middle = points.mean(0)
-    normal = torch.linalg.svd(points - middle).Vh[2]
-    normal = normal * torch.where(normal[2] < 0, -1.0, 1.0).to(normal)
-    depth = (R @ normal * (t + R @ middle)).sum(-1)  # of the plane, along its normal, seen from the camera
-    return (normal[2] > LEVEL) & (depth > 0) & (-(R @ normal)[..., 1] < UPRIGHT)
+    up = 1.0 if frame.axes is None else float(frame.axes[2, 2])
+    normal = R[..., 2] * (-1.0 if up < 0 else 1.0)  # the one that leads up in the world, seen from the camera
+    below = (normal * t).sum(-1) > 0
+    return below & (-normal[..., 1] < UPRIGHT) & (abs(up) > LEVEL)
 
 
 def _cost(task: Task, shared: Tensor) -> Tensor:
