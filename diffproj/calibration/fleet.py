@@ -152,7 +152,9 @@ def _with_remarks(results: Sequence[Outcome], found: Fit, cameras: Sequence[View
     """The same with the remarks on each, from the fit of all."""
     ends = [int(one.status) if isinstance(one, Calibration) else int(Status.DIVERGED) for one in results]
     status = torch.tensor(ends, device=found.solution.status.device)
-    texts = remarks(found, status, Entangled(found, status), [views.names for views in cameras])
+    texts = remarks(
+        found, status, Entangled(found, status), [views.names for views in cameras], [views.size for views in cameras]
+    )
     return [
         replace(one, _remarks=partial(_same, (text,))) if isinstance(one, Calibration) else one
         for one, text in zip(results, texts, strict=True)

@@ -149,7 +149,8 @@ def outcome(
 def _remarks(found: Fit, status: Tensor, doubt: Entangled, data: Data) -> tuple[Remarks, ...]:
     """The remarks on each camera, and on how it stands to the landmarks, where the target is that."""
     names, of_landmarks = data.views.names, isinstance(data.target, Landmarks)
-    said = remarks(found, status, doubt, [names] * len(status), of_landmarks)
+    P = len(status)
+    said = remarks(found, status, doubt, [names] * P, [data.views.size] * P, of_landmarks)
     if not of_landmarks or found.task.solid:
         return said
     below = upside_down(data.frame, *_state(found)[1]) & found.task.used.any(-1)

@@ -143,6 +143,8 @@ def judged(seen: Evidence) -> Judgement:
             0,
             "first another look at the views that the remark names, for one camera with one zoom must have taken all",
         )
+    if Kind.TURNED in seen.kinds:
+        remedies.insert(0, "no other photograph yet, but those that the remark names turned as the others are")
     if Kind.UNEVEN_PRINT in seen.kinds:
         remedies.insert(0, "no other photograph yet, but shape='free', or a board whose sides were measured both ways")
     if Kind.WRONG_PRIOR in seen.kinds:
@@ -207,7 +209,10 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
         faults.append(
             f"the corners scatter by {seen.sigma:.2g} px in each coordinate, in sharp photographs by 0.05 to 0.3"
         )
-    return [*faults, *_reasons(seen.remarks, Kind.TWO_CAMERAS, Kind.UNEVEN_PRINT, Kind.BENT, *OF_THE_CAMERA)]
+    return [
+        *faults,
+        *_reasons(seen.remarks, Kind.TURNED, Kind.TWO_CAMERAS, Kind.UNEVEN_PRINT, Kind.BENT, *OF_THE_CAMERA),
+    ]
 
 
 def _reasons(remarks: Remarks, *kinds: Kind) -> list[str]:

@@ -29,6 +29,7 @@ from diffproj.calibration.trust.entangled import Entangled, Simpler
 from diffproj.calibration.trust.leftover import Leftover, leftover
 from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
 from diffproj.calibration.trust.prior_weight import Elsewhere, weighed_anew
+from diffproj.calibration.trust.turned_photographs import Turned, turned_photographs
 from diffproj.calibration.trust.two_groups import TwoGroups, two_groups
 
 UNSURE = 0.1
@@ -46,7 +47,12 @@ NO_DENOMINATOR = {"brown8": "'brown5'"} | dict.fromkeys(("brown12", "brown14"), 
 
 
 def remarks(
-    found: Fit, status: Tensor, doubt: Entangled, names: Sequence[Sequence[str]], of_landmarks: bool = False
+    found: Fit,
+    status: Tensor,
+    doubt: Entangled,
+    names: Sequence[Sequence[str]],
+    sizes: Sequence[tuple[int, int] | None],
+    of_landmarks: bool = False,
 ) -> tuple[Remarks, ...]:
     """The remarks on each of P cameras; none on one that did not converge.
 
@@ -55,6 +61,7 @@ def remarks(
         status: of each camera `(P,)`.
         doubt: what the views hardly tell apart.
         names: of the views of each camera.
+        sizes: of the photographs of each camera.
         of_landmarks: whether the corners are landmarks, which people click and survey.
     """
     task = found.task
@@ -95,9 +102,12 @@ def remarks(
     which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
     if len(which):
         left, groups = leftover(found, which, SIGNIFICANT), two_groups(found, which)
-        wrong = prior_contradictions(found, which)
+        wrong, turned = prior_contradictions(found, which), turned_photographs(found, which, sizes)
         for i, p in enumerate(map(int, which.tolist())):
             saved = groups[p].saved if p in groups else 0.0
+            if p in turned:  # all else may come from that
+                said[p].append(_turned(names[p], turned[p]))
+                continue
             if p in wrong:
                 said[p].append(_of_the_prior(wrong[p]))
                 if wrong[p].saved > BETTER * max(saved, float(left.smooth.share[i])):
@@ -150,14 +160,28 @@ def _contradicts_noise(found: Fit) -> Tensor:
 
 
 def _two_cameras(names: Sequence[str], group: TwoGroups) -> Remark:
-    named = [names[view] for view in group.smaller]
-    named = named if len(named) <= MOST_NAMED else [*named[:MOST_NAMED], f"{len(named) - MOST_NAMED} more"]
     sentence = (
-        f"{', '.join(named[:-1])} and {named[-1]} want another camera than the other views (with one for each group "
+        f"{_named(names, group.smaller)} want another camera than the other views (with one for each group "
         f"the residuals' sum of squares is {100 * group.saved:.0f} % smaller): was it one camera with one zoom and "
         "focus, no photograph turned, cropped or resized, and one flat board? Else calibrate the groups by themselves"
     )
     return Remark(sentence, Kind.TWO_CAMERAS, "its views fall into two groups that want different cameras")
+
+
+def _turned(names: Sequence[str], turned: Turned) -> Remark:
+    several = len(turned.views) > 1
+    sentence = (
+        f"{_named(names, turned.views)} {'are' if several else 'is'} turned by 180 degrees against the other views "
+        f"(turned back, the residuals' sum of squares is {100 * turned.saved:.0f} % smaller): turn "
+        f"{'these photographs' if several else 'this photograph'} as the others are"
+    )
+    return Remark(sentence, Kind.TURNED, "some of its photographs are turned by 180 degrees")
+
+
+def _named(names: Sequence[str], views: Sequence[int]) -> str:
+    named = [names[view] for view in views]
+    named = named if len(named) <= MOST_NAMED else [*named[:MOST_NAMED], f"{len(named) - MOST_NAMED} more"]
+    return f"{', '.join(named[:-1])} and {named[-1]}" if len(named) > 1 else named[0]
 
 
 def _not_told(other: Simpler) -> str:

@@ -1,0 +1,182 @@
+"""Whether the photographs of some views are turned by 180 degrees against the others'.
+
+A file that says how the camera was held, or a camera that hangs upside down for a while, turns some photographs. Their
+boards then seem to be seen through a camera whose principal point lies on the other side of the image's middle, and
+whose one-sided terms (decentring, prism, tilt) have the other sign. All else stays, so that a view whose photograph is
+turned back has the same cost at these other parameters: its bowl, mirrored. Which views to turn back is found as by
+k-means, from the bowls alone: each view is taken as it is or turned, whichever is lower, and the parameters go to where
+the sum of all is lowest.
+
+Unlike two cameras of any kind, this costs no parameter, so that it may be judged by what is saved: over the variance
+of the residuals and the dispersion, both of the better choice, it is the square of a normal variable's deviations if
+the photographs are not turned. The shape of a target stays as it was found.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffproj.calibration.fitting.bowls import Bowls, bowls, of_prior
+from diffproj.calibration.fitting.fit import Fit
+from diffproj.calibration.trust.dispersion import contradiction
+
+ONE_SIDED = ("p1", "p2", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
+"""Parameters that have the other sign in a turned image."""
+BEYOND, ROUNDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0), 8
+"""Where the search begins, as parts of the way from the turned camera to the one found, beyond this; and its rounds.
+Where some views are turned, the fit lies between, and the true one beyond it."""
+ASIDE = 0.03
+"""And how far aside of the one found, as a part of the image: where half are turned, it is the same turned."""
+CERTAIN, OF_A_VIEW = 5.0, 3.0
+"""Deviations of a normal variable beyond which photographs are turned, and each of them is."""
+
+
+class Turned(NamedTuple):
+    """The views of one camera that are turned against the others, and the part of the sum of squares they cost."""
+
+    views: list[int]
+    saved: float
+
+
+def turned_photographs(found: Fit, which: Tensor, sizes: Sequence[tuple[int, int] | None]) -> dict[int, Turned]:
+    """Those of cameras `(n,)` of which some views are turned, by their number; none whose size is not known.
+
+    Args:
+        found: the fit of P cameras.
+        which: of them.
+        sizes: width and height of the photographs of each of all P.
+    """
+    which = which[torch.tensor([sizes[p] is not None for p in which.tolist()], dtype=torch.bool, device=which.device)]
+    if len(which) == 0:
+        return {}
+    with torch.no_grad():
+        part = found.part(which)
+        task, few = part.task, part.task.parameters.few
+        shared = part.solution.shared.detach()
+        local = tuple(z.detach() for z in part.solution.local)
+        held = replace(task, basis=None)  # where points are free, the bowls are by the camera alone
+        seen = bowls(held, shared, local)
+        T = torch.eye(few, dtype=shared.dtype, device=shared.device).expand(len(shared), -1, -1)
+        if task.basis is not None:
+            T = task.basis[:, :few, (task.basis[:, :few] != 0).any(1).any(0)]
+        if T.shape[-1] == 0:
+            return {}
+        size = shared.new_tensor([sizes[p] for p in which.tolist()])
+        Q, pull = of_prior(held, shared)
+        choice = _Choice(seen, T, Q[:, :few, :few], pull[:, :few], size, *_turn(task.names[:few], shared, size))
+        turned = choice.best(task.used.any(-1))
+        saved, of_each, level, spare = choice.judged(turned, part.degrees_of_freedom())
+        told = (saved > _as_rare(CERTAIN, spare) * level).unsqueeze(-1) & turned
+        told &= of_each > (_as_rare(OF_A_VIEW, spare) * level).unsqueeze(-1)
+        total = 2 * seen.c.sum(-1)
+    groups = {}
+    for i in told.any(-1).nonzero().flatten().tolist():
+        groups[int(which[i])] = Turned(told[i].nonzero().flatten().tolist(), float(saved[i] / total[i]))
+    return groups
+
+
+def _turn(names: tuple[str, ...], shared: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+    """Signs `(s,)` and shift `(P, s)` of the parameters, from where they are, that see the same in the turned image."""
+    few = len(names)
+    sign, origin = shared.new_ones(few), torch.zeros_like(shared[:, :few])
+    for place, name in enumerate(names):
+        if name in ("c_x", "c_y"):
+            sign[place], origin[:, place] = -1.0, size[:, "xy".index(name[-1])] - 1
+        elif name in ONE_SIDED:
+            sign[place] = -1.0
+    return sign, sign * shared[:, :few] + origin - shared[:, :few]
+
+
+class _Choice(NamedTuple):
+    """The bowls of V views of P cameras by s parameters, and those of the views turned: at `M x + d` in place of x."""
+
+    seen: Bowls
+    T: Tensor
+    Q: Tensor
+    pull: Tensor
+    size: Tensor
+    sign: Tensor
+    d: Tensor
+
+    def best(self, used: Tensor) -> Tensor:
+        """Which views are to be turned back `(P, V)`, at most half of them."""
+        T, best, lowest = self.T, torch.zeros_like(used), torch.zeros_like(self.d[:, 0])
+        for x in self._starts():
+            turned = best
+            for _ in range(ROUNDS):
+                costs = self._costs(x)
+                turned = used & (costs[1] < costs[0])
+                A, b, fixed = self._sum(turned)
+                y = _lowest(A, b)
+                x = (T @ y.unsqueeze(-1)).squeeze(-1)
+            lower = fixed + (b * y).sum(-1) / 2
+            better = lower < lowest
+            best, lowest = torch.where(better.unsqueeze(-1), turned, best), torch.where(better, lower, lowest)
+        more = 2 * best.sum(-1) > used.sum(-1)
+        return torch.where(more.unsqueeze(-1), used & ~best, best)
+
+    def _starts(self) -> list[Tensor]:
+        starts = [-far * self.d for far in BEYOND]
+        for u, v in ((1, 0), (0, 1), (1, 1), (1, -1)):
+            aside = torch.zeros_like(self.d)
+            aside[:, 2:4] = ASIDE * self.size * self.size.new_tensor([u, v])
+            starts.append(aside)
+        return starts
+
+    def judged(self, turned: Tensor, redundant: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What it is worth to turn these views back `(P, V)`.
+
+        Returns:
+            What is saved of the sum of squares `(P,)`, and by each of them `(P, V)`; phi s^2 then, and the degrees of
+            freedom that phi is from `(P,)`.
+        """
+        A, b, fixed = self._sum(turned)
+        y = _lowest(A, b)
+        saved = -2 * (fixed + (b * y).sum(-1) / 2)
+        x = (self.T @ y.unsqueeze(-1)).squeeze(-1)
+        costs = self._costs(x)
+        left = (2 * self.seen.c.sum(-1) - saved) / redundant.clamp(min=1)
+        H, g, _ = self._placed(turned)
+        H, g = self.T.mT.unsqueeze(1) @ H @ self.T.unsqueeze(1), (g.unsqueeze(-2) @ self.T.unsqueeze(1)).squeeze(-2)
+        u = g + (H @ y[:, None, :, None]).squeeze(-1)
+        pull = u.sum(1) + b - g.sum(1) + ((A - H.sum(1)) @ y.unsqueeze(-1)).squeeze(-1)
+        phi, spare, _ = contradiction(u, H, left[:, None, None, None] * H, torch.ones_like(u[..., 0]), A, pull)
+        return saved, 2 * (costs[0] - costs[1]), phi.clamp(min=1) * left, spare
+
+    def _costs(self, x: Tensor) -> Tensor:
+        """What each view costs at x `(P, s)`, as it is and turned `(2, P, V)`."""
+        H, g, _ = self.seen
+        both = torch.stack([x, self.sign * x + self.d])
+        return (g * both.unsqueeze(2)).sum(-1) + torch.einsum("cpi,pvij,cpj->cpv", both, H, both) / 2
+
+    def _placed(self, turned: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Bowls and what they cost at their place, where those views are turned."""
+        H, g, _ = self.seen
+        shifted = (H @ self.d[:, None, :, None]).squeeze(-1)
+        fixed = (self.d.unsqueeze(1) * (g + shifted / 2)).sum(-1)
+        one = turned.unsqueeze(-1)
+        g = torch.where(one, self.sign * (g + shifted), g)
+        H = torch.where(one.unsqueeze(-1), self.sign.unsqueeze(-1) * H * self.sign, H)
+        return H, g, torch.where(turned, fixed, 0.0)
+
+    def _sum(self, turned: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The sum of the bowls by the free parameters: `A (P, q, q)`, `b (P, q)` and what it costs at y = 0."""
+        H, g, fixed = self._placed(turned)
+        A = self.T.mT @ (H.sum(1) + self.Q) @ self.T
+        b = ((g.sum(1) + self.pull).unsqueeze(-2) @ self.T).squeeze(-2)
+        return A, b, fixed.sum(-1)
+
+
+def _as_rare(deviations: float, freedom: Tensor) -> Tensor:
+    """The square of Student's t as rare as that of a normal variable (Wallace 1959)."""
+    n = freedom.clamp(min=1e-3)
+    return n * ((deviations * (8 * n + 3) / (8 * n + 1)) ** 2 / n).clamp(max=600).expm1()
+
+
+def _lowest(A: Tensor, b: Tensor) -> Tensor:
+    scale = A.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+    A = (A * scale.unsqueeze(-1) * scale.unsqueeze(-2)).nan_to_num()
+    return -scale * (torch.linalg.pinv(A, rtol=1e-10, hermitian=True) @ (b * scale).unsqueeze(-1)).squeeze(-1)
