@@ -25,11 +25,13 @@ from diffproj.calibration.trust.dispersion import contradiction
 
 ONE_SIDED = ("p1", "p2", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 """Parameters that have the other sign in a turned image."""
-BEYOND, ROUNDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0), 8
+BEYOND, ROUNDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0), 5
 """Where the search begins, as parts of the way from the turned camera to the one found, beyond this; and its rounds.
 Where some views are turned, the fit lies between, and the true one beyond it."""
 ASIDE = 0.03
 """And how far aside of the one found, as a part of the image: where half are turned, it is the same turned."""
+TINY = 1e-10
+"""Added to the sum of the bowls, relative to it, for directions of which it tells nothing."""
 CERTAIN, OF_A_VIEW = 5.0, 3.0
 """Deviations of a normal variable beyond which photographs are turned, and each of them is."""
 
@@ -103,20 +105,43 @@ class _Choice(NamedTuple):
 
     def best(self, used: Tensor) -> Tensor:
         """Which views are to be turned back `(P, V)`, at most half of them."""
-        T, best, lowest = self.T, torch.zeros_like(used), torch.zeros_like(self.d[:, 0])
-        for x in self._starts():
-            turned = best
-            for _ in range(ROUNDS):
-                costs = self._costs(x)
-                turned = used & (costs[1] < costs[0])
-                A, b, fixed = self._sum(turned)
-                y = _lowest(A, b)
-                x = (T @ y.unsqueeze(-1)).squeeze(-1)
-            lower = fixed + (b * y).sum(-1) / 2
-            better = lower < lowest
-            best, lowest = torch.where(better.unsqueeze(-1), turned, best), torch.where(better, lower, lowest)
+        starts = self._starts()
+        every, P = self._repeated(len(starts)), len(used)
+        used_by_each = used.repeat(len(starts), 1)
+        turned, cost = every._following(torch.cat(starts), used_by_each)
+        for _ in range(ROUNDS - 1):
+            turned, cost = every._following(every._lowest_place(turned)[0], used_by_each)
+        first = cost.unflatten(0, (-1, P)).argmin(0) * P + torch.arange(P, device=used.device)
+        best = turned[first]
         more = 2 * best.sum(-1) > used.sum(-1)
         return torch.where(more.unsqueeze(-1), used & ~best, best)
+
+    def _following(self, x: Tensor, used: Tensor) -> tuple[Tensor, Tensor]:
+        """Which views cost less turned at x `(P, V)`, and what all cost where the sum is lowest then `(P,)`."""
+        costs = self._costs(x)
+        turned = used & (costs[1] < costs[0])
+        return turned, self._lowest_place(turned)[1]
+
+    def _lowest_place(self, turned: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the sum is lowest with these views turned `(P, s)`, and what it costs there `(P,)`."""
+        A, b, fixed = self._sum(turned)
+        y = _lowest(A, b)
+        return (self.T @ y.unsqueeze(-1)).squeeze(-1), fixed + (b * y).sum(-1) / 2
+
+    def _repeated(self, times: int) -> "_Choice":
+        """The same for so many times the cameras."""
+
+        def again(whole: Tensor) -> Tensor:
+            return whole.repeat(times, *[1] * (whole.ndim - 1))
+
+        return self._replace(
+            seen=Bowls(*map(again, self.seen)),
+            T=again(self.T),
+            Q=again(self.Q),
+            pull=again(self.pull),
+            size=again(self.size),
+            d=again(self.d),
+        )
 
     def _starts(self) -> list[Tensor]:
         starts = [-far * self.d for far in BEYOND]
@@ -178,5 +203,7 @@ def _as_rare(deviations: float, freedom: Tensor) -> Tensor:
 
 def _lowest(A: Tensor, b: Tensor) -> Tensor:
     scale = A.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
-    A = (A * scale.unsqueeze(-1) * scale.unsqueeze(-2)).nan_to_num()
-    return -scale * (torch.linalg.pinv(A, rtol=1e-10, hermitian=True) @ (b * scale).unsqueeze(-1)).squeeze(-1)
+    A = (A * scale.unsqueeze(-1) * scale.unsqueeze(-2)).nan_to_num() + TINY * torch.eye(
+        A.shape[-1], dtype=A.dtype, device=A.device
+    )
+    return -scale * torch.linalg.solve_ex(A, (b * scale).unsqueeze(-1))[0].squeeze(-1)
