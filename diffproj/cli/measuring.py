@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,9 @@ def run(options: argparse.Namespace) -> int:
                 result(f"Written to {page}: open it in a browser")
             return 0
     pixels = torch.tensor([[pixel.u, pixel.v] for pixel in given], dtype=torch.float64, device="cpu")
-    measured = measure(pixels, scene.calibration, plane, scene.view, sigma)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "measure: pixel .* outside of the photograph")  # remarks tell it by name
+        measured = measure(pixels, scene.calibration, plane, scene.view, sigma)
     found = document(scene, plane, noise, given, measured)
     found["warnings"] = options.warned
     if options.draw is not None:

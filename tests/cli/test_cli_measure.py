@@ -103,6 +103,7 @@ def test_corners_of_the_board_come_out_where_they_are(capsys: pytest.CaptureFixt
         assert abs(found["value"] - true) < 4 * found["deviation"] < 0.01 * true
 
 
+@pytest.mark.filterwarnings("ignore:measure. pixel")
 def test_view_of_the_calibration(capsys: pytest.CaptureFixture[str]) -> None:
     options = ("--camera", "camera.json", "--view", "4.png", "--plane", "-0.1,0,1,-12", "--pixel-sigma", "0.7")
     document = parsed(capsys, *options, "--points", "-5,3", "100,120")
