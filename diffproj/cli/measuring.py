@@ -15,6 +15,7 @@ from diffproj.cli.measure_document import PixelNoise, document
 from diffproj.cli.measure_page import check_page, write_page
 from diffproj.cli.measure_plane import plane_of
 from diffproj.cli.measure_tables import say, shown
+from diffproj.cli.photographs import warn_if_shown_turned
 from diffproj.cli.points_file import Pixel, read_points
 from diffproj.cli.scene import Scene, scene_of
 from diffproj.cli.terminal import as_json, result
@@ -31,6 +32,9 @@ def run(options: argparse.Namespace) -> int:
     check_page(options.page)
     given = _given_pixels(options)
     scene = scene_of(options)
+    if given and options.photograph is not None:
+        option = "--points" if options.points_file is None else "--points-file"
+        warn_if_shown_turned(options.photograph, options.orientation, option)
     noise = _noise(options, scene)
     plane = plane_of(scene, options)
     sigma = DETECTOR if noise.source == DETECTOR else noise.sigma
