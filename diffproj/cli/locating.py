@@ -22,7 +22,7 @@ from diffproj.cli.known_beforehand import FOCAL, POSE
 from diffproj.cli.known_camera import check_together, one_focal_length, posed, standing_near
 from diffproj.cli.landmarks_file import Surveyed, read_landmarks
 from diffproj.cli.locate_document import document, say
-from diffproj.cli.photographs import one_photograph
+from diffproj.cli.photographs import one_photograph, warn_if_shown_turned
 from diffproj.cli.scene import check_size, loaded
 from diffproj.cli.terminal import as_json, failure, result
 from diffproj.files.save import save_camera
@@ -52,6 +52,7 @@ def run(options: argparse.Namespace) -> int:
         picture = grey(one_photograph(options.photograph, options.orientation))
         size = picture.shape[1], picture.shape[0]
         check_size(camera, size, options.camera, options.photograph)
+        warn_if_shown_turned(options.photograph, options.orientation, f"the pixels in {options.landmarks}")
     if size is None and options.draw is not None:
         raise ValueError(f"--draw: want PHOTO, or the image's size in {options.camera}, got neither")
     view = options.photograph.name if options.photograph is not None else options.landmarks.stem

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from diffproj.cli.measure_document import PixelNoise, document
 from diffproj.cli.measure_page import check_page, write_page
 from diffproj.cli.measure_plane import plane_of
 from diffproj.cli.measure_tables import say, shown
+from diffproj.cli.photographs import warn_if_shown_turned
 from diffproj.cli.points_file import Pixel, read_points
 from diffproj.cli.scene import Scene, scene_of
 from diffproj.cli.terminal import as_json, result
@@ -30,6 +32,9 @@ def run(options: argparse.Namespace) -> int:
     check_page(options.page)
     given = _given_pixels(options)
     scene = scene_of(options)
+    if given and options.photograph is not None:
+        option = "--points" if options.points_file is None else "--points-file"
+        warn_if_shown_turned(options.photograph, options.orientation, option)
     noise = _noise(options, scene)
     plane = plane_of(scene, options)
     sigma = DETECTOR if noise.source == DETECTOR else noise.sigma
@@ -43,7 +48,9 @@ def run(options: argparse.Namespace) -> int:
                 result(f"Written to {page}: open it in a browser")
             return 0
     pixels = torch.tensor([[pixel.u, pixel.v] for pixel in given], dtype=torch.float64, device="cpu")
-    measured = measure(pixels, scene.calibration, plane, scene.view, sigma)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "measure: pixel .* outside of the photograph")  # remarks tell it by name
+        measured = measure(pixels, scene.calibration, plane, scene.view, sigma)
     found = document(scene, plane, noise, given, measured)
     found["warnings"] = options.warned
     if options.draw is not None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 from rich.progress import Progress
 
 from diffproj.cli.terminal import counted, detail, note, working
@@ -69,6 +71,33 @@ def one_photograph(path: Path, orientation: Orientation, colour: bool = False) -
         raise ValueError(f"PHOTO: want a photograph, got the video {path}; save one of its frames as a .png")
     with _silent_opencv():
         return Photograph(files[0].name, str(files[0]), decoded(files[0], orientation, colour))
+
+
+def warn_if_shown_turned(path: Path, orientation: Orientation, pixels: str) -> None:
+    """Warn where programs that follow a photograph's EXIF data show its pixels elsewhere than they are counted.
+
+    Args:
+        path: the photograph.
+        orientation: how its pixels are counted.
+        pixels: what holds pixels that somebody read off it, for the message.
+    """
+    if orientation == "upright":
+        return
+    data = np.frombuffer(_named(path)[0].read_bytes(), dtype=np.uint8)
+    small = cv2.IMREAD_REDUCED_GRAYSCALE_8  # a copy is enough to see a turn, and decodes fast
+    with _silent_opencv():
+        recorded, shown = (cv2.imdecode(data, flags) for flags in (small | cv2.IMREAD_IGNORE_ORIENTATION, small))
+        if recorded is None or shown is None or np.array_equal(recorded, shown):
+            return
+        rows, columns = decoded(path, orientation).shape
+    places = {1: f"({columns - 1} - y, x)", 2: f"({columns - 1} - x, {rows - 1} - y)", 3: f"(y, {rows - 1} - x)"}
+    turns = [turn for turn in places if np.array_equal(np.rot90(recorded, turn), shown)]
+    where = f": one that they show at (x, y) is {places[turns[0]]}" if len(turns) == 1 else ""
+    warnings.warn(
+        f"{path}: its EXIF data ask programs to show it turned, and {pixels} count as the sensor recorded it, "
+        f"{columns} x {rows} px{where}",
+        stacklevel=2,
+    )
 
 
 def search(

@@ -33,6 +33,7 @@ from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.results.region import in_region
 from diffproj.geometry.back_projection import back_project, warn_if_rounded
 from diffproj.geometry.camera import Camera, as_camera
+from diffproj.geometry.grid import warn_if_off_image
 from diffproj.geometry.intrinsics import pixel_to_normalized
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.lens.coefficients import CoefficientLens
@@ -77,7 +78,8 @@ def measure(
         The measured points, in float64; gradients flow to pixels, plane, sigma and, where they carry one, the camera.
         A calibration's covariance, and how much larger deviations are where the lens is extrapolated, count as given.
         In a photograph that the calibration does not fit, as one of another camera, zoom or focus, deviations are as
-        much larger as it takes to explain its corners; `doubts` and a `CameraMismatchWarning` say so.
+        much larger as it takes to explain its corners; `doubts` and a `CameraMismatchWarning` say so. A warning tells
+        points that are seen beyond the photograph, where the camera knows its size.
 
     Raises:
         TypeError: not pixels, a calibration or a camera, and a plane in this order, or another argument is of the wrong
@@ -122,6 +124,7 @@ def measure(
     if posed is not None:
         valid = valid & posed.unsqueeze(-1)
         points = torch.where(valid.unsqueeze(-1), points, 0.0)
+    warn_if_off_image("measure", pixels, valid, camera.size)
     batch = points.shape[:-2]
     sigma = deviation_matrices(noise, points)
     by_theta, by_point = _projection_derivatives(pixels, points, valid, camera, parameters, known, middle)

@@ -13,6 +13,7 @@ import diffproj as dp
 from diffproj import cli, figures
 from diffproj.cli.landmarks_file import read_landmarks
 from tests.cli.commands import parser, runner
+from tests.targets.test_detection import with_orientation
 
 BEACH = """name,u,v,x,y,z
 mast,2521.9588508,483.68938913,902062.638,274683.639,7.432
@@ -102,6 +103,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "noise.csv").write_bytes(bytes([200, 13, 7, 255, 0, 60]) * 40)
     (folder / "folder.json").mkdir()
     return folder
+
+
+def test_a_photograph_that_programs_show_turned_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Landmarks' pixels are read off in such programs; the pose of pixels of a turned image is one, too."""
+    image = np.full((2160, 3840), 120, np.uint8)
+    image[:1000, :500] = 20
+    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+    (tmp_path / "beach.jpg").write_bytes(with_orientation(jpeg, 6))
+    code, _, err = run(capsys, tmp_path / "beach.jpg", *DRONE, *LANDMARKS)
+    said = " ".join(err.split())
+    assert code == 0
+    assert "the pixels in beach.csv count as the sensor recorded it, 3840 x 2160 px" in said
+    assert "one that they show at (x, y) is (y, 2159 - x)" in said
 
 
 def test_a_drone_over_a_beach(capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,6 +24,7 @@ from diffproj.cli.measure_plane import equation
 from diffproj.cli.measure_tables import coordinate, shown
 from diffproj.measurement.choices import HAND_PX
 from tests.cli.commands import parser, runner
+from tests.targets.test_detection import with_orientation
 
 D = torch.float64
 BOARD = ("--board", "8x5", "--square", "25")
@@ -103,6 +104,7 @@ def test_corners_of_the_board_come_out_where_they_are(capsys: pytest.CaptureFixt
         assert abs(found["value"] - true) < 4 * found["deviation"] < 0.01 * true
 
 
+@pytest.mark.filterwarnings("ignore:measure. pixel")
 def test_view_of_the_calibration(capsys: pytest.CaptureFixture[str]) -> None:
     options = ("--camera", "camera.json", "--view", "4.png", "--plane", "-0.1,0,1,-12", "--pixel-sigma", "0.7")
     document = parsed(capsys, *options, "--points", "-5,3", "100,120")
@@ -523,3 +525,38 @@ def test_the_photograph_of_another_camera_is_told(tmp_path: Path, capsys: pytest
 
 def test_a_hand_picks_as_the_library_says() -> None:
     assert HAND == HAND_PX
+
+
+@pytest.mark.parametrize(
+    ("orientation", "told", "place"),
+    [
+        (1, "", None),
+        (3, "(639 - x, 479 - y)", (602, 378)),
+        (6, "(y, 479 - x)", (101, 442)),
+        (8, "(639 - y, x)", (538, 37)),
+        (2, "", None),
+    ],
+    ids=["as it is", "upside down", "right", "left", "mirrored"],
+)
+def test_a_photograph_that_programs_show_turned_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], orientation: int, told: str, place: tuple[int, int] | None
+) -> None:
+    """Points are read off in programs that turn it; what is said of them leads to the pixels that are measured."""
+    image = cv2.imread("photo.png", cv2.IMREAD_GRAYSCALE)
+    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
+    path = tmp_path / "turned.jpg"
+    path.write_bytes(with_orientation(jpeg, orientation))
+    code, _, err = run(capsys, path, "--camera", "camera.json", *BOARD, "--points", CORNERS[0])
+    assert code == 0
+    assert ("ask programs to show it turned, and --points count as the sensor" in " ".join(err.split())) == (
+        orientation != 1
+    )
+    assert ("one that they show at (x, y) is" in " ".join(err.split())) == bool(told)
+    assert told in " ".join(err.split())
+    if place is not None:  # of (37, 101)
+        recorded, shown = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | flag) for flag in (128, 0))
+        assert abs(int(recorded[place[::-1]]) - int(shown[101, 37])) <= 1
+    code, _, err = run(
+        capsys, path, "--camera", "camera.json", *BOARD, "--points", CORNERS[0], "--orientation", "upright"
+    )
+    assert "EXIF" not in err

@@ -222,6 +222,22 @@ def test_a_located_photograph_knows_the_intrinsics_uncertainty() -> None:
     assert "noise" not in dp.measure(far, known, Z, view=1, pixel_sigma="detector").summary()
 
 
+@pytest.mark.parametrize("known", ["camera", "calibration"])
+def test_pixels_beyond_the_photograph_are_told(calibration: dp.Calibration, known: str) -> None:
+    """As those of a photograph of twice the size; the edge of a detector's box, counted from the corner, is none."""
+    given = calibration if known == "calibration" else calibration.cameras[0]
+    view = 0 if known == "calibration" else None
+    edges = torch.tensor([[640.0, 480.0], [-1.0, -1.0], [320.0, 240.0]], dtype=D)
+    dp.measure(edges, given, dp.Plane.z(0.0), view, 0.5)
+    pixels = torch.cat([edges, torch.tensor([[320.0, 600.0], [660.0, 400.0]], dtype=D)])
+    said = r"measure: pixel \(320, 600\) and 1 more outside of the photograph of 640 x 480 px"
+    with pytest.warns(UserWarning, match=said):
+        dp.measure(pixels, given, dp.Plane.z(0.0), view, 0.5)
+    if known == "camera":  # nothing to compare with
+        dp.measure(pixels, dp.Camera(given.K, given.R, given.t, given.distortion), dp.Plane.z(0.0), None, 0.5)
+
+
+@pytest.mark.filterwarnings("ignore:measure. pixel")
 def test_points_that_are_not_there(calibration: dp.Calibration) -> None:
     away = dp.Plane([0.0, 1.0, 0.05], -400.0)
     pixels = torch.tensor([[320.0, 10.0], [320.0, 470.0], [1e6, 0.0], [torch.nan, 0.0]], dtype=D)
@@ -380,6 +396,7 @@ def test_joint_covariance_of_many_is_that_of_each(calibration: dp.Calibration) -
         torch.testing.assert_close(together.joint()[each], alone.joint(), rtol=1e-9, atol=1e-15)
 
 
+@pytest.mark.filterwarnings("ignore:measure. pixel")  # those without a lens have a point
 @pytest.mark.parametrize("far", [1e100, 1e200, 1e300, 1e308])
 @pytest.mark.parametrize("lens", ["none", "brown5"])
 def test_a_pixel_out_of_all_bounds_leaves_the_others_as_they_are(far: float, lens: str) -> None:

@@ -1,6 +1,7 @@
 """What a rig's fit comes to: how it ended, the cameras at their places, and each camera as a calibration."""
 
 import hashlib
+import itertools
 from collections.abc import Mapping
 from functools import partial
 
@@ -11,6 +12,7 @@ from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.results.ambiguity import OtherPoses
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.results.covariance import Covariance
+from diffproj.calibration.results.distinct import ALIKE_PX
 from diffproj.calibration.rigs.alone import Alone
 from diffproj.calibration.rigs.fit import RigFit
 from diffproj.calibration.rigs.result import RigCalibration
@@ -197,6 +199,7 @@ def _remarks(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone], stat
             )
     for name in found.restrained:
         said.append(f"k4, k5 and k6 of {name} are held as on its own, for without that its lens folds inside the image")
+    said += _same_views(found)
     said += _unlike(found, noise)
     residuals = found.by_camera
     for name in names:
@@ -229,6 +232,22 @@ def _remarks(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone], stat
         if len(common) == 1:
             said.append(f"one moment alone connects {name} with the other cameras: nothing checks its place")
     return tuple(said)
+
+
+def _same_views(found: RigFit) -> list[str]:
+    """A remark on each two cameras that see every corner in one place, as one camera does that was given twice."""
+    views, said = found.views, []
+    for one, other in itertools.combinations(views.names, 2):
+        pairs = list(zip((one, other), views.shared_moments(one, other), strict=True))
+        seen = torch.stack([found.used[name][rows] for name, rows in pairs]).all(0)
+        first, second = (views.data[name].views.pixels[rows].to(torch.float64) for name, rows in pairs)
+        apart = (first - second).norm(dim=-1)[seen]
+        if len(apart) and float(apart.amax()) < ALIKE_PX:
+            said.append(
+                f"{one} and {other} see each corner in one place, to {float(apart.amax()):.2g} px: were photographs of "
+                "one camera given for both?"
+            )
+    return said
 
 
 def _unlike(found: RigFit, noise: CameraNoise) -> list[str]:

@@ -32,6 +32,7 @@ from diffproj.calibration.results.covariance import Covariance
 from diffproj.calibration.results.mismatch import CameraDisagreementWarning
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.cayley import cross_matrix
+from diffproj.geometry.grid import warn_if_off_image
 from diffproj.lens.coefficients import CoefficientLens
 from diffproj.lens.slopes import by_direction
 
@@ -211,6 +212,7 @@ def _checked(rig: Rig, pixels_by_camera: Any, pixel_sigma: Any) -> tuple[dict[st
         if uv.ndim != 2 or uv.is_meta:
             raise ValueError(f"pixels_by_camera[{name!r}]: want shape (N, 2) with values, got {tuple(uv.shape)}")
         pixels[name] = uv.detach().to(rig.cameras[name].t)
+        warn_if_off_image(f"triangulate: {name}", pixels[name], None, rig.cameras[name].size)
     counts = {name: len(uv) for name, uv in pixels.items()}
     if len(set(counts.values())) > 1:
         raise ValueError(f"pixels_by_camera: want the same points in each, NaN where one is not seen, got {counts}")

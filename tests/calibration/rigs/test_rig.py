@@ -260,6 +260,24 @@ def test_cameras_that_nothing_connects_are_named(three: Scene) -> None:
         dp.calibrate_rig(apart, three.board)
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_one_camera_given_twice_is_told(three: Scene, noise: float) -> None:
+    """They fit, and the baseline is 0 with a small deviation."""
+    views = three.views["cam0"]
+    draw = torch.Generator().manual_seed(1)
+    again = dp.Views(
+        views.pixels + noise * torch.randn(views.pixels.shape, generator=draw, dtype=views.dtype),
+        views.visible,
+        views.names,
+        views.size,
+    )
+    found = dp.calibrate_rig({"left": views, "right": again, "other": three.views["cam1"]}, three.board)
+    said = [remark for remark in found.remarks if "of one camera given for both" in remark]
+    assert len(said) == 1
+    assert said[0].startswith("left and right see each corner in one place")
+    assert said[0] in found.summary()
+
+
 def test_moments_that_do_not_fit_are_no_rig(three: Scene) -> None:
     views = three.views["cam2"]
     shifted = three.views | {"cam2": renamed(views, [*views.names[1:], "moment 99"])}

@@ -76,3 +76,12 @@ def test_a_point_that_one_camera_alone_sees_is_not_doubtful(rig):
     found = rig.triangulate(pixels, pixel_sigma=0.2)
     assert found.valid.tolist() == [True, False, True, True]
     assert not found.disagrees.any()
+
+
+def test_pixels_beyond_the_photograph_are_told(rig):
+    pixels = _seen(rig, 0.1, torch.Generator().manual_seed(3))
+    pixels["right"][3] = torch.nan
+    pixels["right"][:2] += torch.tensor([2000.0, 0])
+    said = r"triangulate: right: pixel \(2.* and 1 more outside of the photograph of 640"
+    with pytest.warns(UserWarning, match=said):
+        rig.triangulate(pixels, pixel_sigma=0.1)
