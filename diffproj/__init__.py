@@ -52,7 +52,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from diffproj import figures as figures
     from diffproj._public import *
+    from diffproj.targets import synthetic as synthetic
 
 __version__ = "0.1.0"
 
@@ -156,24 +158,28 @@ __all__ = [
     "write_measuring_page",
     "write_report",
 ]
+if TYPE_CHECKING:  # public, too, but not of `from diffproj import *`, which would wait for matplotlib
+    __all__ += ["figures", "synthetic"]
 
 
 _RENAMED = {"image_map": "AccuracyMap.over_image", "plane_map": "AccuracyMap.over_plane"}
 
 
-def __getattr__(name: str) -> Any:
-    """All public names when the first is asked for; `diffproj.figures` at its own first use, for it needs matplotlib.
+if not TYPE_CHECKING:  # or type checkers would take any name
 
-    And the new names of those that changed.
-    """
-    if name in __all__ or name == "synthetic":
-        public = import_module("diffproj._public")
-        globals().update({each: getattr(public, each) for each in (*__all__, "synthetic")})
-        return globals()[name]
-    if name == "figures":
-        return import_module("diffproj.figures")
-    remedy = f"; it is diffproj.{_RENAMED[name]} now" if name in _RENAMED else ""
-    raise AttributeError(f"module 'diffproj' has no attribute {name!r}{remedy}")
+    def __getattr__(name: str) -> Any:
+        """All public names when the first is asked for, and the new names of those that changed.
+
+        `diffproj.figures` comes at its own first use, for it needs matplotlib.
+        """
+        if name in __all__ or name == "synthetic":
+            public = import_module("diffproj._public")
+            globals().update({each: getattr(public, each) for each in (*__all__, "synthetic")})
+            return globals()[name]
+        if name == "figures":
+            return import_module("diffproj.figures")
+        remedy = f"; it is diffproj.{_RENAMED[name]} now" if name in _RENAMED else ""
+        raise AttributeError(f"module 'diffproj' has no attribute {name!r}{remedy}")
 
 
 def __dir__() -> list[str]:

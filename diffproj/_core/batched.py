@@ -9,7 +9,7 @@ once a public name of the package was used.
 """
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -216,6 +216,14 @@ class Batched(Copied, Shown):
         if not self.batch_shape:
             raise TypeError(f"len() of a single {type(self).__name__}, which has no batch axes")
         return self.batch_shape[0]
+
+    def __iter__(self: B) -> Iterator[B]:
+        """Those of the first batch axis, one after the other.
+
+        Raises:
+            TypeError: there is no batch axis.
+        """
+        return (self[number] for number in range(len(self)))
 
     def __bool__(self) -> bool:
         """True, as of any object: what has a length is not false for being short."""

@@ -39,6 +39,14 @@ class Errors(NamedTuple):
         return (px / number).sqrt(), (world / number).sqrt(), lost
 
 
+def table_of_folds(*columns: Tensor) -> str:
+    """Errors `(k,)` of fitted and of held-out corners, in pixels and in world units: each fold, and all together."""
+    rows = [*torch.stack(columns, dim=-1).tolist(), [float(c.square().mean().sqrt()) for c in columns]]
+    names = [*map(str, range(1, len(rows))), "all"]
+    lines = [f"{n:<4} {a:11.4f} {b:13.4f} {c:14.4f} {d:16.4f}" for n, (a, b, c, d) in zip(names, rows, strict=True)]
+    return "\n".join(["fold   fitted px   held out px   fitted world   held out world", *lines])
+
+
 def repeated(views: Views, count: int) -> Views:
     """The same views for a batch of cameras."""
     pixels = views.pixels.expand(count, *views.pixels.shape)

@@ -17,7 +17,7 @@ from diffproj._core.shown import Shown
 from diffproj.calibration.circle_centres import with_true_centres
 from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.options import CalibrationOptions, Options, calibration_options
-from diffproj.calibration.held_out import errors_of, folds_of, repeated, without_views
+from diffproj.calibration.held_out import errors_of, folds_of, repeated, table_of_folds, without_views
 from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
@@ -65,13 +65,7 @@ class CrossValidation(Shown):
 
     def summary(self) -> str:
         """A table of text: each fold, and the root mean square over the folds."""
-        columns = [self.in_sample_px, self.held_out_px, self.in_sample_world, self.held_out_world]
-        lines = ["fold   fitted px   held out px   fitted world   held out world"]
-        rows = [*torch.stack(columns, dim=-1).tolist(), [float(c.square().mean().sqrt()) for c in columns]]
-        names = [*map(str, range(1, len(rows))), "all"]
-        lines += [
-            f"{n:<4} {a:11.4f} {b:13.4f} {c:14.4f} {d:16.4f}" for n, (a, b, c, d) in zip(names, rows, strict=True)
-        ]
+        lines = [table_of_folds(self.in_sample_px, self.held_out_px, self.in_sample_world, self.held_out_world)]
         if bool(self.lost.any()):
             which = ", ".join(str(i + 1) for i in self.lost.nonzero().flatten().tolist())
             lines.append(

@@ -77,9 +77,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def shielded(arguments: Sequence[str]) -> list[str]:
     """Put a space before lists of numbers such as `-5,3`, so that argparse does not take them for options.
 
-    A single negative number needs no shield.
+    A single negative number needs no shield. `--points=-5,3` comes apart: argparse would take nothing behind it along.
     """
-    return [f" {text}" if re.match(r"-[.\d][^,]*,", text) else text for text in arguments]
+    apart = (re.fullmatch(r"(--[a-z-]+)=([-.\d][^,]*,.*)", text) for text in arguments)
+    parts = [
+        part for text, found in zip(arguments, apart, strict=True) for part in (found.groups() if found else [text])
+    ]
+    return [f" {text}" if re.match(r"-[.\d][^,]*,", text) else text for text in parts]
 
 
 def _complete() -> int:

@@ -1,6 +1,7 @@
 """What else a `PlaneMap` tells: by how much rays miss the plane, its homography, and some of a batch of maps."""
 
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -176,6 +177,18 @@ class MapViews:
         matrix, camera = self.matrix.expand(*batch, *self.matrix.shape[-2:]), self.camera
         camera = camera if camera.batch_shape == batch else camera.expand(*batch)
         return type(self).unchecked(index_batch(matrix, index, 2), camera[index], False)
+
+    def __iter__(self) -> Iterator[Any]:
+        """The maps of the first batch axis, one after the other.
+
+        Raises:
+            TypeError: there is no batch axis.
+            IndexError: there is one plane for each point.
+        """
+        batch = broadcast_batches(map=self.matrix.shape[:-2], camera=self.camera.batch_shape)
+        if not batch:
+            raise TypeError("map: want a batch of maps to go through, got a single one")
+        return (self[number] for number in range(batch[0]))
 
 
 def _angle(ray: Tensor, normal: Tensor) -> Tensor:

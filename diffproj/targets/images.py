@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 from torch import Tensor
 
+from diffproj._core.arguments import listing
 from diffproj.targets import videos
 from diffproj.targets.videos import Frame
 
@@ -89,9 +90,7 @@ def _entries(photographs: Any) -> list[Any]:
             hidden = path.name.startswith(".")
             return sorted((file for file in path.parent.glob(path.name) if hidden or not _hidden(file)), key=_natural)
         return [path]
-    if isinstance(photographs, Iterable) and not isinstance(photographs, bytes):
-        return list(photographs)
-    raise TypeError(f"photographs: want file names, arrays or tensors, got {type(photographs).__name__}")
+    return listing("photographs", photographs, "file names, arrays or tensors")
 
 
 def _is_photograph(file: Path) -> bool:

@@ -160,8 +160,9 @@ def test_length_and_iteration(make: Callable[..., Batched]) -> None:
     assert len(item) == 3
     assert [part.batch_shape for part in item] == [(2,)] * 3
     assert all(same(part, item[i]) for i, part in enumerate(item))
-    with pytest.raises(TypeError, match="no batch axes"):
-        len(make())
+    for go_through in (len, list):
+        with pytest.raises(TypeError, match="no batch axes"):
+            go_through(make())
     assert bool(make())
     assert bool(make(0))
 

@@ -119,9 +119,10 @@ def test_view_of_the_calibration(capsys: pytest.CaptureFixture[str]) -> None:
         "Point 2 lies outside of the region that the calibration's corners covered."
     )
     assert [point["extrapolated"] for point in document["points"]] == [True, True]
-    code, out, _ = run(capsys, *options, "--points=-5,3", "--points", "100,120")
-    assert code == 0
-    assert "│ 1, 2 " in out
+    for points in (("--points=-5,3", "--points", "100,120"), ("--points=-5,3", "100,120")):
+        code, out, _ = run(capsys, *options, *points)
+        assert code == 0
+        assert "│ 1, 2 " in out
     assert "camera.json: view 4.png\n" in out
     assert "Points on the plane -0.1 x + z = -12, in the calibration's unit" in out
 
@@ -341,9 +342,11 @@ def test_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_lists_of_numbers_are_no_options() -> None:
-    assert shielded(["-o", "--x=-5,3", "-5,3", "-.5,3", "-1", "5,-3"]) == [
+    assert shielded(["-o", "--x=-5,3", "--x=5,3", "--x=-5", "-5,3", "-.5,3", "-1", "5,-3"]) == [
         "-o",
-        "--x=-5,3",
+        *("--x", " -5,3"),
+        *("--x", "5,3"),
+        "--x=-5",
         " -5,3",
         " -.5,3",
         "-1",

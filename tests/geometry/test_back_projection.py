@@ -379,6 +379,18 @@ def test_bad_input_is_refused_by_name(camera: dp.Camera, pixels: Tensor) -> None
             call()
 
 
+def test_maps_one_after_the_other(camera: dp.Camera, pixels: Tensor) -> None:
+    planes = dp.Plane([0.0, 0.0, 1.0], torch.tensor([0.0, 20.0, 50.0], dtype=D))
+    maps = dp.PlaneMap(camera, planes)
+    for one, plane in zip(maps, planes, strict=True):
+        assert torch.equal(one(pixels)[0], dp.PlaneMap(camera, plane)(pixels)[0])
+    with pytest.raises(TypeError, match="map: want a batch of maps to go through, got a single one"):
+        list(dp.PlaneMap(camera, planes[0]))
+    per_point = dp.Plane.per_point([0.0, 0.0, 1.0], torch.zeros(len(pixels), dtype=D))
+    with pytest.raises(IndexError, match="map: want a batch of maps to index, got planes per point"):
+        list(dp.PlaneMap(camera, per_point))
+
+
 def test_a_camera_without_a_pose_is_warned_of(camera: dp.Camera, pixels: Tensor) -> None:
     for lost in (camera.without_pose(), dp.Camera.stack([camera.without_pose()] * 2)):
         with pytest.warns(UserWarning, match=r"camera: want one with a pose.*calibration.cameras\[view\]"):

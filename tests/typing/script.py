@@ -3,6 +3,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -31,6 +33,35 @@ def measured(photograph: str, calibration: dp.Calibration, clicks: Tensor) -> fl
     return float(found.lengths().value[0])
 
 
+def fleet(views: Sequence[dp.Views], shared: dp.Views) -> list[Tensor]:
+    board = dp.Chessboard()
+    found = dp.calibrate(views, board, priors={"f_x": (500.0, 5)}, fixed=["k3"], loss=dp.Huber(1))
+    many = dp.calibrate(shared, board)
+    return [one.rms for one in [*found, *many] if not isinstance(one, dp.CalibrationError)]
+
+
+def arrays(K: npt.NDArray[np.float64]) -> tuple[Tensor, Tensor]:
+    camera = dp.Camera(K.tolist(), R=np.eye(3), t=[0.0, 0.0, 5.0], distortion=dp.BrownConrady([-0.1, 0.01, 0.0, 0.0]))
+    camera = dp.stack([camera, dp.Camera.from_opencv(K, np.zeros(4), np.zeros(3), np.zeros(3), size=(640, 480))])
+    pixels, seen = camera.project(np.zeros((3, 3)))
+    resolution, _ = dp.ground_resolution([[1.0, 2.0], [3, 4]], camera, dp.Plane.z(0))
+    dp.figures.accuracy(dp.AccuracyMap.over_image(camera, pixel_sigma=1.0))
+    print(seen, resolution, dp.synthetic.photograph(camera[0], dp.Chessboard()), dp.__version__)
+    return dp.back_project(pixels, camera, dp.Plane([0.0, 0.0, 1.0], 0.0))
+
+
+class Above:
+    """An observation of the user's own."""
+
+    def residuals(self, camera: dp.Camera) -> Tensor:
+        return camera.center[..., 2:] - 6.0
+
+
+def adjusted(mast: dp.Camera, seen: Sequence[tuple[float, float]]) -> dp.Adjustment:
+    horizon = dp.Horizon([[1.0, 2.0], [3.0, 4.0]], 3.0)
+    return dp.adjust(mast, [horizon, dp.Seen([(0.0, 0.0, 0.0)], seen), Above()], priors={"height": 0.05})
+
+
 def straightened(camera: dp.Camera, pixels: Tensor) -> Tensor:
     lens = camera.distortion
     xy = (pixels - camera.K[:2, 2]) / camera.K.diagonal()[:2]
@@ -45,6 +76,9 @@ def straightened(camera: dp.Camera, pixels: Tensor) -> Tensor:
 def rigs(pair: dict[str, dp.Views]) -> list[float]:
     board = dp.Chessboard()
     one = dp.calibrate_rig(pair, board, shape="free", priors={"points": 0.1})
+    for name in one:
+        print(name, one[name].rms, [camera.center for camera in one[name].cameras])
+    print(dp.cross_validate_rig(pair, board).summary(), [len(view) for view in pair["left"]])
     many = dp.calibrate_rig([pair, pair], board, shape="bow")
     print(one.summary(), one.points_deviation.amax())
     return [float(rig.baseline("left", "right").length) for rig in many if isinstance(rig, dp.RigCalibration)]
@@ -84,3 +118,7 @@ def mapped(camera: dp.Camera, calibration: dp.Calibration, image: Tensor) -> Ten
     accuracy = dp.AccuracyMap.over_image(calibration, view="left01.jpg", step=16)
     print(points[valid].shape, accuracy.extrapolated.sum(), accuracy.deviation.amax())
     return dp.rectify(image, camera, dp.Plane.z(0.0), (0.0, 0.0, 200.0, 125.0), 0.5)[0]
+
+
+def misspelt() -> None:
+    print(dp.calibrat)  # type: ignore[attr-defined]

@@ -1,8 +1,9 @@
 """`Indexed`: some of many calibrations that were made side by side, chosen as elements of a tensor."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -50,13 +51,8 @@ class Indexed:
             (torch.Size([]), 'Good')
         """
         many: Any = self
-        shape = many.views.batch_shape
         check_index(index)
-        if not shape:
-            raise TypeError(
-                "index: want many calibrations to choose from, got one; calibration.cameras[view] is its camera in a "
-                "view, calibration.views[view] are its corners there"
-            )
+        shape = self._shape_of_many("index")
         causes = [many.causes[i] for i in _numbers(shape, index)] if many.causes else ()
         some = {name: _some(getattr(many, name), shape, index, behind) for name, behind in BEHIND.items()}
         late = {
@@ -77,6 +73,23 @@ class Indexed:
             **some,
             **{name: partial(LATE[name], many, index) if known else None for name, known in late.items()},
         )
+
+    def __iter__(self: C) -> Iterator[C]:
+        """Those of the first batch axis, one after the other.
+
+        Raises:
+            TypeError: it is a single calibration.
+        """
+        return (self[number] for number in range(self._shape_of_many("calibration")[0]))
+
+    def _shape_of_many(self, name: str) -> torch.Size:
+        shape: torch.Size = cast(Any, self).views.batch_shape
+        if not shape:
+            raise TypeError(
+                f"{name}: want many calibrations to choose from, got one; calibration.cameras[view] is its camera in a "
+                "view, calibration.views[view] are its corners there"
+            )
+        return shape
 
 
 def _numbers(shape: torch.Size, index: Any) -> list[int]:

@@ -1,6 +1,6 @@
 """`RigCalibration`: cameras at their places to each other, what is left over, how it ended, and how sure it is."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -75,6 +75,14 @@ class RigCalibration(RigAccount, Copied, RigRecorded):
             ValueError: there is no such camera.
         """
         return self.calibrations[self._named("name", name)]
+
+    def __len__(self) -> int:
+        """The number of cameras."""
+        return len(self.cameras)
+
+    def __iter__(self) -> Iterator[str]:
+        """The names of the cameras, as of a dictionary."""
+        return iter(self.cameras)
 
     @property
     def names(self) -> tuple[str, ...]:

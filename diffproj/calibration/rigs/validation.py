@@ -10,6 +10,7 @@ from torch import Tensor
 
 from diffproj._core.arguments import whole_number
 from diffproj._core.shown import Shown
+from diffproj.calibration.held_out import table_of_folds
 from diffproj.calibration.locate import located
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.rigs.one import rig_calibrated, rig_task
@@ -64,6 +65,10 @@ class RigCrossValidation(Shown):
         columns: dict[str, list[Any]] = {"fold": list(range(1, len(self.fits) + 1))}
         columns["status"] = [fit.status.name for fit in self.fits]
         return columns | {name: getattr(self, name).tolist() for name in names}
+
+    def summary(self) -> str:
+        """A table of text: each fold, and the root mean square over the folds."""
+        return table_of_folds(self.in_sample_px, self.held_out_px, self.in_sample_world, self.held_out_world)
 
     def _facts(self) -> list[str]:
         held_out, fitted = (float(part.square().mean().sqrt()) for part in (self.held_out_px, self.in_sample_px))

@@ -134,3 +134,9 @@ def test_wrong_choices(both: dp.Calibration, alone: dp.Calibration) -> None:
         both["left"]
     with pytest.raises(TypeError, match=r"index: want many calibrations to choose from, got one"):
         alone[0]
+    with pytest.raises(TypeError, match=r"calibration: want many calibrations to choose from, got one"):
+        list(alone)
+
+
+def test_one_after_the_other(both: dp.Calibration) -> None:
+    assert [one.rms.item() for one in both] == both.rms.tolist()

@@ -244,6 +244,7 @@ def test_it_shows_and_copies_itself(pair: dict[str, dp.Views]) -> None:
         assert other.to_dict() == rig.to_dict()
     with pytest.raises(ValueError, match="left"):
         rig["middle"]
+    assert (list(rig), len(rig), "middle" in rig) == (list(rig.names), len(rig.names), False)
 
 
 # ----------------------------------------------------------------------------------------------------- refusals
@@ -348,6 +349,9 @@ def test_landmarks_in_space_are_a_target() -> None:
         assert rig.rms == pytest.approx(noise * 2**0.5, rel=0.15)
         errors = dp.cross_validate_rig(views, dp.Landmarks(cage), "none", folds=2)
         assert errors.held_out_px.amax() < 0.7
+        lines = errors.summary().splitlines()
+        assert [line.split()[0] for line in lines] == ["fold", "1", "2", "all"]
+        assert lines[1].split()[1:3] == [f"{part[0]:.4f}" for part in (errors.in_sample_px, errors.held_out_px)]
         assert errors.held_out_world.amax() < 0.7 * 8 / 900
     with pytest.raises(ValueError, match="shape: want 'flat' for points that are not all on z = 0, got 'free'"):
         dp.calibrate_rig(views, dp.Landmarks(cage), "none", shape="free")
