@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from diffproj.lens.brown_domain import DEGREE, SAMPLES, _Circles
+from diffproj.lens.brown_domain import DEGREE, _Circles
 
 D = torch.float64
 
