@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffproj._core.arguments import called, number, numbers
+from diffproj._core.arguments import called, first_of, number, numbers
 
 
 @pytest.mark.parametrize(
@@ -55,3 +55,17 @@ def test_a_number_comes_in_many_forms(value: object) -> None:
 def test_what_is_no_number_is_named(value: object) -> None:
     with pytest.raises(TypeError, match="^step: want a number, got"):
         number("step", value, "a number")
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        (-0.1, "-0.1"),
+        ([-0.1], "-0.1"),
+        ([1.0, -2.0, -3.0], "-2 at 1"),
+        ([[1.0, 2.0], [-0.1, -5.0]], "-0.1 at (1, 0)"),
+    ],
+)
+def test_the_first_wrong_value_of_several_is_told_with_its_place(values: object, text: str) -> None:
+    given = torch.tensor(values, dtype=torch.float64)
+    assert first_of(given, given < 0) == text

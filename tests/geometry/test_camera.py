@@ -364,3 +364,22 @@ def test_a_rotation_matrix_is_no_rotation_vector() -> None:
             dp.Camera.from_opencv(K, None, rotation, [0, 0, 1])
     assert dp.Camera.from_opencv(K, None, np.eye(3), np.zeros((3, 3))).batch_shape == (3,)
     assert dp.Camera.from_opencv(K, None, 2 * np.eye(3)).batch_shape == (3,)
+
+
+@pytest.mark.plain
+def test_what_is_no_camera_is_told_what_to_give() -> None:
+    """The way from a calibration to its camera is told of calibrations only."""
+    pixel = torch.zeros(1, 2, dtype=torch.float64)
+    calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+    with pytest.raises(TypeError, match=r"camera: .*give its \.camera"):
+        dp.back_project(pixel, calibration, dp.Plane.z(0.0))  # type: ignore[arg-type]
+    for other in (5, dp.Camera):
+        with pytest.raises(TypeError, match="camera: want") as told:
+            dp.back_project(pixel, other, dp.Plane.z(0.0))  # type: ignore[arg-type]
+        assert "give its" not in str(told.value)
+
+
+@pytest.mark.plain
+def test_what_is_no_plane_is_refused_by_name(camera: dp.Camera) -> None:
+    with pytest.raises(TypeError, match=r"plane: want a dp\.Plane, got 'z'"):
+        dp.back_project(torch.zeros(1, 2, dtype=torch.float64), camera, "z")  # type: ignore[arg-type]

@@ -100,3 +100,15 @@ def test_a_projector_warns_once(learn: tuple[str, ...] | str) -> None:
         for _ in range(3):
             projector(torch.tensor([[300.0, 200]]))
     assert len(seen) == 1
+
+
+@pytest.mark.parametrize(("offset", "below"), [(1e5, 1.0), (-1e5, 1.0)])
+def test_a_camera_close_to_a_plane_far_off_is_warned_of(offset: float, below: float) -> None:
+    """What counts is how far the camera is from the plane, on whichever side of the origin both are."""
+    flipped = torch.diag(torch.tensor([1.0, -1, -1]))  # looks down
+    height = offset + below
+    camera = dp.Camera(
+        torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), flipped, torch.tensor([0.0, 0, height])
+    )
+    with pytest.warns(UserWarning, match="so far from the world's origin"):
+        dp.back_project(torch.tensor([[320.0, 240.0]]), camera, dp.Plane.z(offset))

@@ -123,3 +123,11 @@ def test_cv2_and_kornia_warp_by_it_as_rectify_does(camera: dp.Camera) -> None:
 def test_a_lens_has_no_homography(lens_camera: dp.Camera) -> None:
     with pytest.raises(ValueError, match="homography: want a pinhole"):
         dp.PlaneMap(lens_camera, dp.Plane.z(0.0)).homography()
+
+
+@pytest.mark.parametrize("wrong", ["position", "target", "up"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_looking_at_refuses_what_is_not_finite_by_that_name(wrong: str, value: float) -> None:
+    given = {"position": [0.0, 0, 5], "target": [1.0, 2, 0], "up": [0.0, 0, 1], wrong: [0.0, 1, value]}
+    with pytest.raises(ValueError, match="position, target, up: want finite numbers"):
+        dp.Camera.looking_at(**given, size=(640, 480), focal=500.0)

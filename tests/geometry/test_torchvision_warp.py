@@ -167,3 +167,9 @@ def test_bad_input_is_refused_by_name() -> None:
     ):
         with pytest.raises(kind, match=message):
             dp.torchvision_warp(size, dtype)  # type: ignore[arg-type]
+
+
+def test_a_batch_of_one_sample() -> None:
+    batch = dp.collate([{"camera": dp.Camera(torch.eye(3)), "number": 3}])
+    assert batch["camera"].batch_shape == (1,)
+    assert batch["number"].tolist() == [3]

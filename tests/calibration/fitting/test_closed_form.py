@@ -159,3 +159,16 @@ def test_a_board_that_would_reach_behind_the_camera_is_moved_before_it() -> None
     placed = BOARD.points @ R.mT + found_t[0, 0]
     torch.testing.assert_close(placed.mean(0)[:2], t[:2])
     assert float(placed[:, 2].amin()) == pytest.approx(0.2 * float((BOARD.points - middle).abs().amax()))
+
+
+def test_principal_point_of_exact_homographies() -> None:
+    """Whatever the focal length, from three views or more; in units of any size."""
+    K = torch.tensor([[700.0, 0, 900], [0, 700, -150], [0, 0, 1]], dtype=torch.float64)
+    R = dp.rotation_from_euler(
+        *torch.tensor([[0.4, -0.3, 0.2, 0.1], [0.2, 0.35, -0.4, 0.3], [0.1, 0.9, 2.0, 3.0]]).double()
+    )
+    t = torch.tensor([[10.0, 5, 500], [-20, 8, 600], [30, -9, 450], [1, 2, 700]], dtype=torch.float64)
+    H = K @ torch.stack([R[..., 0], R[..., 1], t], dim=-1)
+    middle = torch.tensor([[319.5, 239.5]], dtype=torch.float64)
+    found = closed_form.principal_point(H.unsqueeze(0), middle, 640.0, torch.ones(1, 4, dtype=torch.bool))
+    torch.testing.assert_close(found, K[:2, 2].unsqueeze(0), atol=1e-6, rtol=0)
