@@ -21,6 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffproj._core.dense import dense
+
 Array = np.ndarray | Sequence[Any]
 """What is taken in the place of a tensor: an array, or (nested) lists of numbers."""
 
@@ -107,6 +109,7 @@ def number(
     """
     single = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
     if isinstance(value, Tensor):
+        value = dense(name, value)
         single = value.ndim == 0 and not (value.is_meta or value.is_complex() or value.dtype == torch.bool)
     elif isinstance(value, np.ndarray):
         single = value.ndim == 0 and value.dtype.kind in "fiu"
@@ -130,6 +133,7 @@ def numbers(name: str, value: object, want: str, count: int) -> tuple[float, ...
     """
     if not isinstance(value, Tensor | np.ndarray | list | tuple) or getattr(value, "is_meta", False):
         raise TypeError(f"{name}: want {want}, got {called(value)}")
+    value = dense(name, value) if isinstance(value, Tensor) else value
     given = value.tolist() if isinstance(value, Tensor | np.ndarray) else list(value)
     if not isinstance(given, list) or len(given) != count:
         raise ValueError(f"{name}: want {want}, got {_listed(given)}")
@@ -174,7 +178,7 @@ def whole_numbers(name: str, value: object, want: str, device: torch.device | No
     if isinstance(value, Tensor):
         whole = not (value.is_floating_point() or value.is_complex() or value.dtype == torch.bool)
         whole = whole and (not value.is_meta or (device is not None and device.type == "meta"))
-        found = value
+        found = dense(name, value)
     else:
         taken = isinstance(value, np.ndarray | list | tuple | range)
         try:
@@ -267,7 +271,7 @@ def file_path(name: str, value: object) -> Path:
 
 
 def tensor_of(name: str, value: object, like: Kind | None = None) -> Tensor:
-    """A tensor as it is; an array or numbers as a new tensor.
+    """A dense tensor as it is; an array or numbers as a new tensor.
 
     Args:
         name: the argument's name.
@@ -275,11 +279,11 @@ def tensor_of(name: str, value: object, like: Kind | None = None) -> Tensor:
         like: whose dtype and device an array takes on; if left out, its own, and float64 for what has none.
 
     Raises:
-        TypeError: it is no such thing.
+        TypeError: it is no such thing, or a tensor that is not dense.
         ValueError: an array some of whose entries are masked.
     """
     if isinstance(value, Tensor):
-        return value
+        return dense(name, value)
     if torch.compiler.is_compiling() and type(value) in (
         float,
         int,
@@ -325,7 +329,7 @@ def booleans(name: str, value: object, device: torch.device | None = None) -> Te
         ValueError: an array some of whose entries are masked.
     """
     if isinstance(value, Tensor):
-        found = value
+        found = dense(name, value)
     else:
         _check_unmasked(name, value)
         taken = isinstance(value, np.ndarray | np.bool_ | bool | list | tuple)

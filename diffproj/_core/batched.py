@@ -28,6 +28,10 @@ Rearrange = Callable[[Tensor, int], Tensor]
 """Takes a tensor and how many axes it has behind those of the batch to the same in another arrangement."""
 
 
+MOST_AXES = 60
+"""Of a batch: PyTorch's tensors have 64 at most, and some of them stand behind those of the batch."""
+
+
 class Batched(Copied, Shown):
     """Tensors that share batch axes `*B`, parts with the same batch axes, and constants."""
 
@@ -133,6 +137,8 @@ class Batched(Copied, Shown):
         own = self.batch_shape
         if not all(isinstance(length, int | torch.SymInt) for length in shape):
             raise TypeError(f"batch_shape: want whole numbers, got {tuple(shape)}")
+        if len(shape) > MOST_AXES:
+            raise ValueError(f"batch_shape: want at most {MOST_AXES} axes, got {len(shape)}")
         new = len(shape) - len(own)
         wanted = [own[k - new] if length == -1 and k >= new else length for k, length in enumerate(shape)]
         # That of a graph is a length, and a comparison would limit the graph to it.

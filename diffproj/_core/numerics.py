@@ -58,10 +58,7 @@ def check_tensor(name: str, value: object, *shape: int | str, like: Kind | None 
         TypeError: no tensor, array or numbers, or a tensor that is not dense or not of floating-point type.
         ValueError: the trailing axes do not fit.
     """
-    if not isinstance(value, Tensor):
-        value = tensor_of(name, value, like)
-    if not torch.compiler.is_compiling():
-        value = _dense(name, value)
+    value = tensor_of(name, value, like)
     if not value.is_floating_point():
         remedy = ".real and .imag are" if value.is_complex() else ".double() or .float() makes one"
         raise TypeError(f"{name}: want a floating-point tensor, got {value.dtype}; {remedy}")
@@ -74,23 +71,6 @@ def check_tensor(name: str, value: object, *shape: int | str, like: Kind | None 
             want = ", ".join(["*B", *map(str, shape)])
             raise ValueError(f"{name}: want shape ({want}), got {tuple(value.shape)}")
     return at_least_float32(value)
-
-
-def _dense(name: str, tensor: Tensor) -> Tensor:
-    """A tensor with its values in memory one by one, as all but sparse, nested and quantised ones are.
-
-    One that PyTorch keeps as the negative of another, such as `z.conj().imag`, is worked out.
-
-    Raises:
-        TypeError: it is sparse, nested or quantised.
-    """
-    if tensor.is_nested:
-        raise TypeError(f"{name}: want a dense tensor, got a nested one; torch.stack(...) joins tensors of one shape")
-    if tensor.layout is not torch.strided:
-        raise TypeError(f"{name}: want a dense tensor, got layout {tensor.layout}; .to_dense() makes one")
-    if tensor.is_quantized:
-        raise TypeError(f"{name}: want a dense tensor, got {tensor.dtype}; .dequantize() makes one")
-    return tensor.resolve_neg() if tensor.is_neg() else tensor
 
 
 def check_same_kind(**tensors: Kind | None) -> None:

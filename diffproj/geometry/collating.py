@@ -51,7 +51,7 @@ def collate(samples: Sequence[Any]) -> Any:
 
     Raises:
         TypeError: samples that are not built alike, or that hold what PyTorch cannot join.
-        ValueError: none, or cameras that do not fit together.
+        ValueError: none, or cameras or tensors that do not fit together.
 
     Example:
         >>> import torch, diffproj as dp
@@ -90,3 +90,7 @@ def _joined(samples: list[Any]) -> Any:
         return default_collate(samples)
     except TypeError:
         raise TypeError(f"samples: want what PyTorch's default_collate joins, got {called(first)}") from None
+    except RuntimeError as error:  # shapes that differ, sparse tensors, no more memory to share
+        raise ValueError(
+            f"samples: want what PyTorch's default_collate joins, got {', '.join(map(called, samples[:3]))}: {error}"
+        ) from error

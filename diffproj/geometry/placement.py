@@ -92,6 +92,8 @@ class Placed(Mounted):
         x, y, z = P[..., 3].unbind(-1)
         t_y = (y - c_y * z) / f_y
         t = torch.stack([(x - c_x * z - skew * t_y) / f_x, t_y, z], dim=-1)
+        if has_values(P) and not bool(K.isfinite().all() and t.isfinite().all()):
+            raise ValueError("projection: want K [R | t] of a perspective camera, got one that is infinitely far away")
         return cls(K, R, t, None, size)  # type: ignore[call-arg]
 
     @classmethod

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffproj._core.copying import Copied
 from diffproj._core.shown import Shown, rounded
-from diffproj.measurement.student import normal_reach, student_reach
+from diffproj.measurement.student import check_level, normal_reach, student_reach
 
 SIGNIFICANT = 0.9973
 """The level of the interval that has to leave out 0 for a value to be told from it: three standard deviations'."""
@@ -54,6 +54,7 @@ class Quantity(Copied, Shown):
         Raises:
             ValueError: the level is not between 0 and 1.
         """
+        level = check_level(level)
         value, deviation, reach = self.value.detach(), self.deviation.detach(), self._reach(level)
         if self._bounds is None:
             return value - reach * deviation, value + reach * deviation

@@ -12,6 +12,7 @@ from jaxtyping import Shaped, UInt8
 from torch import Tensor
 
 from diffproj._core.arguments import listing
+from diffproj._core.dense import dense
 from diffproj.targets import videos
 from diffproj.targets.videos import Frame
 
@@ -174,6 +175,7 @@ def decoded(path: Path, orientation: Orientation, colour: bool = False) -> np.nd
 
 def _channels_last(label: str, image: Tensor) -> np.ndarray:
     """An RGB tensor in OpenCV's layout: `(H, W)` or `(H, W, C)` in BGR."""
+    image = dense(label, image)
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[0] not in (1, 3, 4)):
         raise ValueError(f"{label}: want {LAYOUTS}, got a tensor of shape {tuple(image.shape)}")
     if image.is_meta:

@@ -125,8 +125,7 @@ def photograph(
         texture = board_texture(board, _texels(single, board))
         shown, seen = render(texture.image, single, Plane.z(0.0), texture.extent, axes=texture.axes)
         image = torch.where(seen, shown[0], TABLE) * (1 - vignetting * (1 - _falloff(single)))
-        if blur_px > 0:
-            reach = round(4 * blur_px)
+        if reach := round(4 * blur_px):
             border = "reflect" if reach < min(image.shape) else "replicate"  # a reflection is no larger than the image
             kernel, sigma = (2 * reach + 1, 2 * reach + 1), image.new_tensor([[blur_px, blur_px]])
             image = gaussian_blur2d(image[None, None], kernel, sigma, border)[0, 0]

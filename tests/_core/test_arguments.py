@@ -1,12 +1,15 @@
 """Checks of arguments: messages that name the argument and all that was given."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
 
 from diffproj._core.arguments import called, first_of, number, numbers
+import diffproj as dp
+from diffproj._core.arguments import called, number, numbers
 
 
 @pytest.mark.parametrize(
@@ -69,3 +72,30 @@ def test_what_is_no_number_is_named(value: object) -> None:
 def test_the_first_wrong_value_of_several_is_told_with_its_place(values: object, text: str) -> None:
     given = torch.tensor(values, dtype=torch.float64)
     assert first_of(given, given < 0) == text
+THIN = {
+    "sparse": (lambda tensor: tensor.to_sparse(), "layout torch.sparse_coo; .to_dense"),
+    "by rows": (lambda tensor: tensor.to_sparse_csr(), "layout torch.sparse_csr; .to_dense"),
+    "quantised": (lambda tensor: torch.quantize_per_tensor(tensor, 0.1, 0, torch.quint8), "torch.quint8; .dequantize"),
+}
+
+
+@pytest.mark.plain
+@pytest.mark.filterwarnings("ignore")  # PyTorch's own: both are on their way in, or out
+@pytest.mark.parametrize(("made", "got"), THIN.values(), ids=THIN.keys())
+def test_tensors_that_are_not_dense_are_named(made: Callable[[torch.Tensor], torch.Tensor], got: str) -> None:
+    thin = made(torch.ones(2, 2))
+    views, board = dp.example_views("left"), dp.Chessboard()
+    calls: list[tuple[str, Callable[[], object]]] = [
+        ("origin", lambda: dp.geotransform((0, 0, 1, 1), 0.5, thin)),
+        ("sigma", lambda: dp.Landmarks(board.points, sigma=thin)),
+        ("image 1", lambda: dp.detect(thin, board)),
+        ("squared", lambda: dp.Huber(1.0).value(thin)),
+        ("squared", lambda: dp.Cauchy(1.0).weight(thin)),
+        ("visible", lambda: dp.Views(views.pixels, thin)),
+        ("pixels", lambda: dp.Views(thin)),
+        ("normal", lambda: dp.Plane(thin)),
+        ("weights", lambda: dp.calibrate(views, board, weights=thin)),
+    ]
+    for name, call in calls:
+        with pytest.raises(TypeError, match=f"^{name}: want a dense tensor, got {got}"):
+            call()

@@ -288,6 +288,8 @@ def test_a_shape_that_the_batch_does_not_broadcast_to() -> None:
     for shape in ((5,), (), (-3, 6), (-1, 6), (6, 2)):
         with pytest.raises(ValueError, match=r"batch_shape: want one that \(6,\) broadcasts to, got"):
             planes.expand(*shape)
+    with pytest.raises(ValueError, match="batch_shape: want at most 60 axes, got 70"):
+        planes.expand(*[1] * 69, 6)
     with pytest.raises(TypeError, match="batch_shape: want whole numbers, got"):
         planes.expand("a")
     lens = dp.BrownConrady(torch.zeros(6, 4))

@@ -35,6 +35,8 @@ def test_matrices_that_are_no_cameras() -> None:
         dp.Camera.from_matrix(torch.diag(torch.tensor([1.0, 1, 0, 1]))[:3])
     with pytest.raises(ValueError, match="last row"):
         dp.Camera.from_matrix(torch.ones(4, 4))
+    with pytest.raises(ValueError, match="projection: want K .* infinitely far away"):
+        dp.Camera.from_matrix([[1e-5, 0, 0, 1e306], [0, 1e-5, 0, 0], [0, 0, 1.0, 0]])
     moved = dp.Camera(torch.eye(3), t=torch.tensor([0.0, 0, 5])).world_to_cam("pytorch3d")
     with pytest.raises(ValueError, match=r"extrinsics: want the last row .* transposed"):
         dp.Camera.from_extrinsics(moved, torch.eye(3))

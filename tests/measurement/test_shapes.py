@@ -1,7 +1,9 @@
 """Lengths, angles and areas as vectors, and the longest and shortest that noise allows, against plain formulas."""
 
 import math
+from fractions import Fraction
 
+import numpy as np
 import pytest
 import torch
 
@@ -73,6 +75,14 @@ def test_a_quantity_alone_has_the_interval_of_its_deviation() -> None:
     low, high = Quantity(torch.tensor([3.0, -1.0], dtype=D), torch.tensor([1.0, 0.0], dtype=D)).interval(0.95)
     torch.testing.assert_close(low, torch.tensor([3 - 1.959963985, -1.0], dtype=D))
     torch.testing.assert_close(high, torch.tensor([3 + 1.959963985, -1.0], dtype=D))
+
+
+@pytest.mark.plain
+@pytest.mark.parametrize("level", [Fraction(19, 20), np.float32(0.95), np.array(0.95), torch.tensor(0.95, dtype=D)])
+def test_a_level_comes_in_many_forms(level: object) -> None:
+    one = torch.ones(2, dtype=D)
+    few = Quantity(one, one, one * torch.tensor([3.0, 20.0], dtype=D))
+    torch.testing.assert_close(few.interval(level), few.interval(0.95), rtol=1e-6, atol=0)
 
 
 def test_points_that_are_named_twice_count_once() -> None:

@@ -165,3 +165,7 @@ def test_a_loader_joins_cameras(cameras: dp.Camera) -> None:
         dp.stack([cameras[0], dp.Plane.z(0.0)])
     with pytest.raises(ValueError, match="samples: want at least one"):
         dp.collate([])
+    with pytest.raises(
+        ValueError, match=r"samples: want .* got Tensor of shape \(2, 2\), Tensor of shape \(3, 2\): stack"
+    ):
+        dp.collate([(torch.zeros(2, 2), 1), (torch.zeros(3, 2), 2)])

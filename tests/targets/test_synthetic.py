@@ -113,6 +113,13 @@ def test_errors() -> None:
         synthetic.corner_views(camera, setup.board)
 
 
+def test_blur_of_next_to_nothing() -> None:
+    """So little that its square is 0."""
+    setup = dp.paper_setup()
+    sharp, same = (synthetic.photograph(setup.fit[0], setup.board, blur_px=blur) for blur in (0.0, 5e-324))
+    assert torch.equal(sharp, same)
+
+
 @pytest.mark.parametrize("blur_px", [12.0, 50.0])
 def test_blur_wider_than_the_image(blur_px: float) -> None:
     setup = dp.paper_setup()

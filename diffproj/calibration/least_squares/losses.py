@@ -46,7 +46,7 @@ class _Scaled:
 
 def _checked(squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Squared residuals; one look where they are a tensor, for the solver asks often."""
-    if isinstance(squared, Tensor) and squared.is_floating_point():
+    if isinstance(squared, Tensor) and squared.is_floating_point() and squared.layout is torch.strided:
         return squared
     return check_tensor("squared", squared)
 

@@ -65,7 +65,8 @@ def lenses(distortion: LensModel | Mapping[str, LensModel], names: tuple[str, ..
     )
     lacking = [name for name in names if name not in chosen]
     if lacking or set(chosen) - set(names):
-        raise ValueError(f"distortion: want a lens for each of {', '.join(names)}, got one for {', '.join(chosen)}")
+        got = ", ".join(map(str, chosen))
+        raise ValueError(f"distortion: want a lens for each of {', '.join(names)}, got one for {got}")
     for lens in chosen.values():
         model_named(lens)
     return {name: chosen[name] for name in names}

@@ -307,6 +307,7 @@ def test_wrong_arguments_are_named(three: Scene, pair: dict[str, dp.Views]) -> N
         (ValueError, "want 54 corners|want 12 corners", lambda: dp.calibrate_rig(pair, dp.Chessboard(4, 3))),
         (ValueError, "distortion", lambda: dp.calibrate_rig(views, board, "brown6")),  # type: ignore
         (ValueError, "distortion: want a lens for each", lambda: dp.calibrate_rig(views, board, {"cam0": "brown5"})),
+        (ValueError, "distortion: .* got one for None", lambda: dp.calibrate_rig(views, board, {None: "brown5"})),
         (ValueError, "moments: want those of every", lambda: dp.calibrate_rig(pair, BOARD, moments={"left": range(13)})),
         (ValueError, "got none|want 13", lambda: dp.calibrate_rig(pair, BOARD, moments={"left": [1], "right": [1]})),
         (ValueError, "cameras: want names", lambda: dp.calibrate_rig(pair, BOARD, cameras={"x": three.cameras["cam0"]})),
