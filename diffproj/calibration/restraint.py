@@ -6,8 +6,10 @@ fraction of the noise. Then the terms below the line, k4 to k6, are drawn toward
 starts from, 0 if it has none, as little as makes the lens one-to-one over its corners and the image. As the start costs
 nothing by this, a restrained lens does not end above the poorer one either.
 
-Held the valley is short, and its lowest place is found. From there the terms are let go step by step, as long as the
-lens does not fold: of several minima without restraint this leads to one that makes sense, where there is one.
+Of several minima without restraint one may make sense. A factor that stands both above and below the line changes
+nothing, and leads away from the poles: the poorer lens with such factors is where the solver starts again. Only where
+all of that folds are the terms held. Then the valley is short, and its lowest place is found; from there they are let
+go step by step, as long as the lens does not fold.
 """
 
 import math
@@ -25,6 +27,9 @@ from diffproj.calibration.problem.parametrisation import Pose
 from diffproj.calibration.trust.entangled import DENOMINATOR
 from diffproj.calibration.trust.reach import folds_at_corners, reaches_image
 
+FACTORS = ((3.0, 2.25), (30.0, 225.0))
+"""Terms in r^2 and r^4, with r in half diagonals of the image, of factors above and below the line: squares of positive
+ones, so that they have no pole."""
 FIRST = 1.0
 """Deviation to which the terms below the line are held at first: what each adds to the denominator half an image's
 diagonal from the axis, where 1 is as much as there is without it."""
@@ -32,8 +37,11 @@ TIGHTER = (0.3, 0.1, 0.03, 0.01)
 """Then these, one after the other until the lens does not fold."""
 LOOSER = (3.0, 10.0, 30.0, math.inf)
 """Or these, as long as it does not."""
+RADIAL = ("k1", "k2", "k3", *DENOMINATOR)
+"""The terms above and below the line."""
 RUNG_STEPS = 100
-"""Steps of the solver at one of these; with the terms held most take ten to twenty."""
+"""Steps of the solver at one of these, where with the terms held most take ten to twenty; and steps after which only
+the lower of the starts with factors goes on."""
 HAIR = 1.1
 """Factor of the cost that is paid to make a lens that reaches all of its corners reach the whole image, too."""
 LOWER = 1e-9
@@ -76,9 +84,18 @@ def restrained(
     lost = reached < 0
     dearest = torch.where(lost, torch.inf, HAIR * _data_cost(found))
 
+    def weighed(which: Tensor, other: Fit) -> Tensor:
+        """Which of the others `(n,)` do not fold; they are kept where they are better."""
+        nonlocal best, reached
+        cost = _data_cost(other)
+        reach = torch.where(cost <= dearest[which], _reached(other, size), -1.0)
+        better = (reach > reached[which]) | ((reach == reached[which]) & (cost < _data_cost(best)[which] * (1 - LOWER)))
+        best = _put(best, which[better], other, better)
+        reached[which] = reach.maximum(reached[which])
+        return reach >= 1
+
     def tried(which: Tensor, strength: float, near: Fit) -> tuple[Fit, Tensor]:
         """Those of the cameras `(n,)` at that strength, from `near` `(n, ...)`; and which of them do not fold."""
-        nonlocal best, reached
         part = given.part(which)
         if strength < math.inf:
             part = replace(part, prior=_drawn_to(shared[which], precision[which] / strength**2, part))
@@ -86,13 +103,22 @@ def restrained(
             steps if strength == math.inf else steps | {"max_iterations": min(max_iterations, RUNG_STEPS)}
         )
         other = fit(part, near.solution.shared, near.solution.local, reject=reject, **limits)
-        cost = _data_cost(other)
-        reach = torch.where(cost <= dearest[which], _reached(other, size), -1.0)
-        better = (reach > reached[which]) | ((reach == reached[which]) & (cost < _data_cost(best)[which] * (1 - LOWER)))
-        best = _put(best, which[better], other, better)
-        reached[which] = reach.maximum(reached[which])
-        return other, reach >= 1
+        return other, weighed(which, other)
 
+    with_factors = _with_factors(start, size)
+    if with_factors is not None:
+        count = len(FACTORS)
+        local = tuple(z[which].repeat(count, *[1] * (z.ndim - 1)) for z in start.solution.local)
+        begin = torch.cat([shared[which] for shared in with_factors])
+        short = steps | {"max_iterations": min(max_iterations, RUNG_STEPS)}
+        near = fit(given.part(which.repeat(count)), begin, local, reject=reject, **short)
+        folds = folds_at_corners(near.task, near.solution.shared, near.solution.local)
+        costs = torch.where(folds, torch.inf, _data_cost(near)).reshape(count, -1)
+        near = near.part(costs.argmin(0) * len(which) + torch.arange(len(which), device=which.device)).solution
+        weighed(which, fit(given.part(which), near.shared, near.local, reject=reject, **steps))
+        which = which[reached[which] < 1]
+        if len(which) == 0:
+            return best
     first, sound = tried(which, FIRST, start.part(which))
     up, near = which[sound], first.part(sound.nonzero().flatten())
     for strength in LOOSER:
@@ -134,6 +160,24 @@ def _reached(found: Fit, size: tuple[int, int]) -> Tensor:
     task, solution = found.task, found.solution
     lost = folds_at_corners(task, solution.shared, solution.local) | (solution.status != Status.CONVERGED)
     return torch.where(lost, -1.0, reaches_image(task, solution.shared, size))
+
+
+def _with_factors(start: Fit, size: tuple[int, int]) -> list[Tensor] | None:
+    """The shared parameters `(P, s)` with each of the factors; `None` where not all terms of both sides are free."""
+    names, shared, basis = start.task.names, start.solution.shared, start.task.basis
+    terms = [names.index(name) for name in RADIAL]
+    if basis is not None and not bool((basis[:, terms] != 0).any(-1).all()):
+        return None
+    squared = (shared[:, :2].mean(-1) / (0.5 * math.hypot(*size))).square()
+    found = []
+    for first, second in FACTORS:
+        a, b = first * squared, second * squared.square()
+        multiplied = shared.clone()
+        for side in (terms[:3], terms[3:]):
+            one, two, three = shared[:, side].unbind(-1)
+            multiplied[:, side] = torch.stack([one + a, two + a * one + b, three + a * two + b * one], dim=-1)
+        found.append(multiplied)
+    return found
 
 
 def _unit_precision(start: Fit, below: list[int], size: tuple[int, int]) -> Tensor:
