@@ -331,12 +331,12 @@ def _solve_remaining_in_place(
     """`_solve_remaining` where the state is -1; it becomes 1 of those solved, as that of others, and 0 of the rest."""
     if state.numel() == 0 or bool(state.amin() >= 0):  # the usual case
         return
-    left = state < 0
-    points = torch.stack((x_distorted, y_distorted), dim=-1)
-    x_found, y_found, found = _solve_remaining(coefficients, domain, noise, points, x, y, left)
-    x.copy_(x_found)
-    y.copy_(y_found)
-    state.masked_fill_(left, 0.0).masked_fill_(found, 1.0)
+    index = (state < 0).nonzero(as_tuple=True)
+    lens = _lens_of_each(index, coefficients, domain, noise)
+    u, v, *start = (part[index].unsqueeze(-1) for part in (x_distorted, y_distorted, x, y))
+    found = _solve_remaining(*lens, torch.stack((u, v), dim=-1), *start, torch.ones_like(u, dtype=torch.bool))
+    for whole, part in zip((x, y, state), found, strict=True):
+        whole.index_put_(index, part.squeeze(-1).to(whole.dtype))
 
 
 @_solve_remaining_in_place.register_fake
