@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from diffproj._core.arguments import called, first_of, number, numbers
 import diffproj as dp
-from diffproj._core.arguments import called, number, numbers
+from diffproj._core.arguments import called, first_of, number, numbers
 
 
 @pytest.mark.parametrize(
@@ -72,6 +71,8 @@ def test_what_is_no_number_is_named(value: object) -> None:
 def test_the_first_wrong_value_of_several_is_told_with_its_place(values: object, text: str) -> None:
     given = torch.tensor(values, dtype=torch.float64)
     assert first_of(given, given < 0) == text
+
+
 THIN = {
     "sparse": (lambda tensor: tensor.to_sparse(), "layout torch.sparse_coo; .to_dense"),
     "by rows": (lambda tensor: tensor.to_sparse_csr(), "layout torch.sparse_csr; .to_dense"),
