@@ -110,7 +110,7 @@ def restrained(
         count = len(FACTORS)
         local = tuple(z[which].repeat(count, *[1] * (z.ndim - 1)) for z in start.solution.local)
         begin = torch.cat([shared[which] for shared in with_factors])
-        short = steps | {"max_iterations": min(max_iterations, RUNG_STEPS)}
+        short: dict[str, Any] = steps | {"max_iterations": min(max_iterations, RUNG_STEPS)}
         near = fit(given.part(which.repeat(count)), begin, local, reject=reject, **short)
         folds = folds_at_corners(near.task, near.solution.shared, near.solution.local)
         costs = torch.where(folds, torch.inf, _data_cost(near)).reshape(count, -1)

@@ -333,14 +333,24 @@ def _solve_remaining_in_place(
         return
     index = (state < 0).nonzero(as_tuple=True)
     lens = _lens_of_each(index, coefficients, domain, noise)
-    u, v, *start = (part[index].unsqueeze(-1) for part in (x_distorted, y_distorted, x, y))
-    found = _solve_remaining(*lens, torch.stack((u, v), dim=-1), *start, torch.ones_like(u, dtype=torch.bool))
+    u, v, start_x, start_y = (part[index].unsqueeze(-1) for part in (x_distorted, y_distorted, x, y))
+    everywhere = torch.ones_like(u, dtype=torch.bool)
+    found = _solve_remaining(*lens, torch.stack((u, v), dim=-1), start_x, start_y, everywhere)
     for whole, part in zip((x, y, state), found, strict=True):
         whole.index_put_(index, part.squeeze(-1).to(whole.dtype))
 
 
 @_solve_remaining_in_place.register_fake
-def _solve_remaining_nowhere(*_: Tensor) -> None:
+def _solve_remaining_nowhere(
+    coefficients: Tensor,  # noqa: ARG001
+    domain: Tensor,  # noqa: ARG001
+    noise: Tensor,  # noqa: ARG001
+    x_distorted: Tensor,  # noqa: ARG001
+    y_distorted: Tensor,  # noqa: ARG001
+    x: Tensor,  # noqa: ARG001
+    y: Tensor,  # noqa: ARG001
+    state: Tensor,  # noqa: ARG001
+) -> None:
     return None
 
 
