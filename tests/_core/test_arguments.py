@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffproj._core.arguments import called, first_of, number, numbers
+from diffproj._core.arguments import called, first_of, number, numbers, whole_number
 
 
 @pytest.mark.parametrize(
@@ -69,3 +69,9 @@ def test_what_is_no_number_is_named(value: object) -> None:
 def test_the_first_wrong_value_of_several_is_told_with_its_place(values: object, text: str) -> None:
     given = torch.tensor(values, dtype=torch.float64)
     assert first_of(given, given < 0) == text
+
+
+@pytest.mark.parametrize("value", ["x", 2.0, None, torch.zeros(2), torch.zeros(2, dtype=torch.int64), np.zeros(2, int)])
+def test_what_is_no_whole_number_is_refused_by_name(value: object) -> None:
+    with pytest.raises(TypeError, match="^count: want a whole number, got"):
+        whole_number("count", value)
