@@ -1,12 +1,15 @@
 """`distortion="auto"` takes the simplest lens that is no worse than the best on corners held out."""
 
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
 
 import diffproj as dp
 from diffproj import synthetic
+from diffproj.calibration.lens_choice import _Candidate, _simplest
+from diffproj.calibration.trust.verdict import LacksViews
 
 D = torch.float64
 BOARD = dp.Chessboard()
@@ -123,3 +126,12 @@ def test_what_cannot_be_chosen_is_refused() -> None:
         dp.calibrate(views, BOARD, "best")  # type: ignore[arg-type]
     with pytest.raises(dp.CalibrationError, match="calibrate: "):
         dp.calibrate(views[:1], BOARD, "auto")
+
+
+def test_no_fisheye_is_taken_where_views_do_not_determine_an_ordinary_camera() -> None:
+    def candidate(model: Any, error: float, cause: str = "") -> _Candidate:
+        fit = Mock(spec=dp.Calibration)
+        return _Candidate(model, fit, cause, torch.full((3,), error, dtype=torch.float64))
+
+    lacking = candidate("brown5", float("inf"), LacksViews("not determined"))
+    assert _simplest([lacking, candidate("fisheye", 0.01)]) is None

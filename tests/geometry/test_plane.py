@@ -144,3 +144,19 @@ def test_an_array_is_copied() -> None:
     plane = dp.Plane(normal, 0.0)
     normal[:] = 7
     assert plane.normal.tolist() == [0, 0, 1]
+
+
+def test_tangents_of_many_planes_are_those_of_each() -> None:
+    normals = torch.tensor([[0.0, 0, 1], [1, 2, 3], [-3, 1, 0.5], [0, 1, 0]], dtype=torch.float64)
+    tangents = dp.Plane(normals, torch.zeros(4, dtype=torch.float64)).tangents()
+    for normal, found in zip(normals, tangents, strict=True):
+        torch.testing.assert_close(found, dp.Plane(normal, 0.0).tangents())
+        torch.testing.assert_close(found.mT @ found, torch.eye(2, dtype=torch.float64))
+        torch.testing.assert_close(normal @ found, torch.zeros(2, dtype=torch.float64))
+
+
+def test_three_points_make_a_plane() -> None:
+    corners = torch.tensor([[0.0, 0, 1], [4, 0, 1], [0, 4, 5]], dtype=torch.float64)
+    assert float(dp.Plane.from_points(corners).rms(corners)) < 1e-12
+    with pytest.raises(ValueError, match="points: want at least 3, got 2"):
+        dp.Plane.from_points(corners[:2])

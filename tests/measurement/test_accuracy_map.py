@@ -115,3 +115,11 @@ def test_former_names_lead_to_the_new_ones() -> None:
         dp.plane_map  # noqa: B018
     with pytest.raises(AttributeError, match="no attribute 'nothing'$"):
         dp.nothing  # noqa: B018
+
+
+def test_a_step_that_is_too_fine_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("diffproj.measurement.accuracy_map.MOST_PLACES", 200)  # 16 x 12 of 40 px each, not 22 x 16
+    calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+    assert dp.AccuracyMap.over_image(calibration, view=0, step=40).deviation.shape == (13, 17)
+    with pytest.raises(ValueError, match="step: want a positive distance"):
+        dp.AccuracyMap.over_image(calibration, view=0, step=36)

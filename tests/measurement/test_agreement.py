@@ -27,3 +27,13 @@ def test_many_points_are_judged_as_each_alone() -> None:
     assert found[1].tolist() == [False, False, True]
     assert found[2].tolist() == [True] * 3
     assert found[3].tolist() == [False, True, False]
+
+
+def test_of_two_that_disagree_nothing_tells_which_is_wrong() -> None:
+    """Whatever their covariances, and however rounding makes the chances of the two differ."""
+    root = torch.randn(200, 2, 2, 2, dtype=D)
+    C = root @ root.mT + 0.1 * torch.eye(2, dtype=D)
+    y = torch.stack([torch.randn(200, 2, dtype=D), 100 + torch.randn(200, 2, dtype=D)], dim=1)
+    both = torch.ones(200, 2, 2, dtype=torch.bool)
+    freedom = torch.full((200, 2), torch.inf, dtype=D)
+    assert bool(disagreeing(torch.linalg.inv(C), y, C, both, freedom).all())

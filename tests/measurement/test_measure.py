@@ -7,6 +7,7 @@ import torch
 
 import diffproj as dp
 from diffproj import synthetic
+from diffproj.measurement.propagation import Propagated
 
 D = torch.float64
 BOARD = dp.Chessboard()
@@ -412,3 +413,32 @@ def test_a_pixel_out_of_all_bounds_leaves_the_others_as_they_are(far: float, len
     assert bool((told[[0, 2], :2].amax(-1) > 1e60)[found.valid[[0, 2]]].all())
     (gradient,) = torch.autograd.grad(found.deviations[1].sum(), leaf)
     assert bool(gradient.isfinite().all())
+
+
+def test_lengths_of_a_batch_are_those_of_each() -> None:
+    found = simulated("brown5")
+    pixels = torch.stack([found.views.pixels[3, :8], found.views.pixels[3, 8:16]])
+    pairs = [(0, 5), (1, 2)]
+    many = dp.measure(pixels, found, Z, view=3, pixel_sigma=1.0).lengths(pairs)
+    for number, one in enumerate(pixels):
+        alone = dp.measure(one, found, Z, view=3, pixel_sigma=1.0).lengths(pairs)
+        torch.testing.assert_close(many.value[number], alone.value)
+        torch.testing.assert_close(many.deviation[number], alone.deviation)
+        for bound, other in zip(many.interval(), alone.interval(), strict=True):
+            torch.testing.assert_close(bound[number], other)
+
+
+def test_errors_of_points_move_them_as_their_first_derivatives_say() -> None:
+    """Of vectors of three points, one of them named twice: what a small step of each independent error does."""
+    found = simulated("brown5")
+    measured = dp.measure(found.views.pixels[3, :6], found, Z, view=3, pixel_sigma=1.0)
+    index = torch.tensor([[0, 1, 2], [3, 4, 3]])
+    spread = Propagated.of(measured._noise, index, torch.zeros(2, 1, 3, 3, dtype=D))
+    steps, h = spread.steps(), 1e-4
+    E = steps.shape[-3]
+    for number in range(E):
+        error = torch.zeros(2, E, dtype=D)
+        error[:, number] = h
+        (after, valid), (before, _) = spread.points(error), spread.points(-error)
+        assert bool(valid.all())
+        torch.testing.assert_close((after - before) / (2 * h), steps[:, number], rtol=1e-4, atol=1e-7)

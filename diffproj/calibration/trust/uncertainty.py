@@ -38,7 +38,7 @@ def covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = N
     task = found.task
     if phi is None:  # a noise that was given is the whole error
         phi = torch.ones_like(found.solution.cost) if found.knows_noise else dispersion(found)
-    precision = None if task.prior is None else task.prior.precision
+    precision = found.measured_precision()
     common = {
         "names": task.names,
         "basis": task.basis,

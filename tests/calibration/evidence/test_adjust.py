@@ -534,3 +534,22 @@ def test_a_lens_can_be_held_where_there_is_one(K: torch.Tensor, lens: dp.BrownCo
             with pytest.raises(ValueError, match="fixed: want names from .*, got 'distortion'"):
                 parameters.positions("fixed", "distortion")
         assert [parameters.names[i] for i in parameters.positions("fixed", "principal_point")] == ["c_x", "c_y"]
+
+
+def test_verdict_and_text_of_one_camera_and_of_many() -> None:
+    pieces = dp.Seen(LANDMARKS, seen(), pixel_sigma=1.0)
+    one = dp.adjust(START, pieces)
+    assert one.verdict.startswith("Usable: ")
+    assert len(repr(one)) < 400  # a line, not all of its tensors
+    two = dp.adjust(START, dp.Seen(LANDMARKS, torch.stack([seen(), seen() + 0.1]), pixel_sigma=1.0))
+    assert two.verdict == "2 of 2 cameras converged."
+
+
+def test_lines_have_a_deviation_each() -> None:
+    """The deviations of segments are one for all, or one for each line."""
+    segments = torch.rand(3, 2, 2, dtype=D) * 500
+    directions = torch.eye(3, dtype=D)
+    given = dp.VanishingPoints(directions, segments=segments, pixel_sigma=torch.tensor([0.5, 1.0, 2.0], dtype=D))
+    assert len(given) == 3
+    with pytest.raises(ValueError, match="pixel_sigma"):
+        dp.VanishingPoints(directions, segments=segments, pixel_sigma=torch.tensor([0.5, 1.0], dtype=D))

@@ -172,3 +172,29 @@ def test_principal_point_of_exact_homographies() -> None:
     middle = torch.tensor([[319.5, 239.5]], dtype=torch.float64)
     found = closed_form.principal_point(H.unsqueeze(0), middle, 640.0, torch.ones(1, 4, dtype=torch.bool))
     torch.testing.assert_close(found, K[:2, 2].unsqueeze(0), atol=1e-6, rtol=0)
+
+
+def test_rays_of_an_equidistant_image() -> None:
+    """A pixel at r focal lengths is seen at the angle r from the axis: at tan r on a plane ahead."""
+    focal, middle = torch.tensor([300.0], dtype=torch.float64), torch.tensor([[320.0, 240.0]], dtype=torch.float64)
+    angle = torch.tensor([0.0, 1e-12, 0.3, 0.9, 1.2], dtype=torch.float64)
+    direction = torch.tensor([0.6, -0.8], dtype=torch.float64)
+    pixels = (middle + focal * angle.unsqueeze(-1) * direction)[None, None]
+    rays, inside = closed_form.equidistant_rays(pixels, middle, focal)
+    assert bool(inside.all())
+    torch.testing.assert_close(rays[0, 0], angle.tan().unsqueeze(-1) * direction, atol=1e-12, rtol=1e-9)
+
+
+@pytest.mark.parametrize("tied", [False, True])
+def test_views_without_enough_corners_say_nothing_of_the_focal_length(tied: bool) -> None:
+    K = torch.tensor([[700.0, 0, 320], [0, 650, 240], [0, 0, 1]], dtype=torch.float64)
+    angles = torch.tensor([[0.4, -0.3, 0.2, 0.1], [0.2, 0.35, -0.4, 0.3], [0.1, 0.9, 2.0, 3.0]], dtype=torch.float64)
+    R = dp.rotation_from_euler(*angles)
+    t = torch.tensor([[10.0, 5, 500], [-20, 8, 600], [30, -9, 450], [1, 2, 700]], dtype=torch.float64)
+    H = (K @ torch.stack([R[..., 0], R[..., 1], t], dim=-1)).unsqueeze(0)
+    enough, middle = torch.tensor([[True, True, False, True]]), K[:2, 2].unsqueeze(0)
+    whole = closed_form.focal_lengths(H, middle, 640.0, enough, tied)
+    without = closed_form.focal_lengths(H[:, [0, 1, 3]], middle, 640.0, enough[:, [0, 1, 3]], tied)
+    torch.testing.assert_close(whole, without)
+    if not tied:
+        torch.testing.assert_close(whole, torch.tensor([[700.0, 650.0]], dtype=torch.float64))

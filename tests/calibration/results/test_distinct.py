@@ -8,7 +8,7 @@ from torch import Tensor
 
 import diffproj as dp
 from diffproj import synthetic
-from diffproj.calibration.results.distinct import ALIKE_PX, alike, one_view, shares
+from diffproj.calibration.results.distinct import ALIKE_PX, SENTENCES, alike, described, one_view, shares
 
 D = torch.float64
 VIEWS = dp.example_views("left")
@@ -259,3 +259,16 @@ def test_wrong_corners_and_patterns_do_not_hide_them() -> None:
     corners = torch.zeros(1, 40, 54, dtype=torch.bool)
     corners[..., [0, 8, 45, 53]] = True  # a turn of a marker moves its corners in four directions
     assert bool((alike(POINTS, frames.pixels[None], corners)[0].sum(-1) == 10).all())
+
+
+def test_as_many_groups_as_are_told_leave_none_to_count() -> None:
+    """Pairs of views alike: those beyond the first few are counted, where there are any."""
+    for pairs in range(1, SENTENCES + 3):
+        same = torch.block_diag(*[torch.ones(2, 2)] * pairs).bool()
+        told = described(same, tuple(f"v{number}" for number in range(2 * pairs)))
+        assert told.count("the board as") == min(pairs, SENTENCES)
+        beyond = pairs - SENTENCES
+        words = {1: "; 1 more group of views alike", 2: "; 2 more groups of views alike"}.get(beyond, "")
+        assert ("more group" in told) == (beyond > 0)
+        assert words in told
+        assert f"{2 * pairs} views count as {pairs}" in told
