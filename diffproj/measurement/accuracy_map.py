@@ -189,7 +189,8 @@ def _one_camera(calibration: Calibration | Camera, view: int | str | None) -> Ca
     else:
         known = as_calibration(calibration)
         if known.views.batch_shape:
-            raise ValueError(f"calibration: want one camera, got batch shape {tuple(known.views.batch_shape)}")
+            got = tuple(known.views.batch_shape)
+            raise ValueError(f"calibration: want one camera, got batch shape {got}; index it")
         camera = known.cameras[view_number(chosen_view(known, view), known.views.names)]
     if camera.batch_shape:
         raise ValueError(f"calibration: want one camera, got batch shape {tuple(camera.batch_shape)}; index it")

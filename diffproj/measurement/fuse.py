@@ -62,6 +62,8 @@ class FusedMeasurement(Measurement):
     disagrees: Bool[Tensor, "*batch c"] | None = None
     scale: Float[Tensor, "*batch"] | None = None
 
+    _lie = "measured"
+
     def to_dict(self) -> dict[str, list[Any]]:
         """The points as columns of Python's own numbers; `cameras` counts those that measured a point."""
         counts = torch.zeros_like(self.valid, dtype=torch.long) if self.seen is None else self.seen.sum(-2)

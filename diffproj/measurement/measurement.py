@@ -52,6 +52,7 @@ class Measurement(Copied, Shown):
     includes_intrinsics: bool
     _noise: Noise = field(repr=False)
     _region: Tensor | None = field(default=None, repr=False)
+    _lie = "on the plane"  # what points that are not valid do not
     doubts: str = ""
 
     @property
@@ -237,22 +238,20 @@ class Measurement(Copied, Shown):
             ValueError: there are many cameras.
         """
         if self.points.ndim > 2:
-            raise ValueError(f"summary: want one camera, got batch shape {tuple(self.points.shape[:-2])}")
+            raise ValueError(f"summary: want one camera, got batch shape {tuple(self.points.shape[:-2])}; see to_dict")
         valid, bent = self.valid.tolist(), self.nonlinear.tolist()
         beyond = [False] * len(valid) if self.extrapolated is None else self.extrapolated.tolist()
         lines = []
         for n, (point, deviation) in enumerate(zip(self.points.tolist(), self.deviations.tolist(), strict=True)):
             texts = (f"{x:10.3f} ± {s:.3f}" for x, s in zip(point, deviation, strict=True))
             notes = "  nonlinear" * bent[n] + "  extrapolated" * beyond[n]
-            lines.append(f"point {n:<3} {'  '.join(texts) + notes if valid[n] else 'not on the plane'}")
+            lines.append(f"point {n:<3} {'  '.join(texts) + notes if valid[n] else f'not {self._lie}'}")
         if len(lines) > 1:
             found = self.lengths()
-            lines += [f"{n} to {n + 1:<4} {text}" for n, text in enumerate(described(found))]
+            lines += [f"{n} to {n + 1:<4} {text}" for n, text in enumerate(described(found, self._lie))]
             bent = [*bent, *found.nonlinear.tolist()]
-        if any(beyond[n] for n in range(len(valid)) if valid[n]):
-            lines.append(EXTRAPOLATED)
-        if any(bent):
-            lines.append(NONLINEAR)
+        lines += [EXTRAPOLATED] * any(out and there for out, there in zip(beyond, valid, strict=True))
+        lines += [NONLINEAR] * any(bent)
         if self.doubts:
             lines.append(f"Doubtful: {self.doubts}.".replace("?.", "?"))
         if not self.includes_intrinsics:
@@ -295,7 +294,7 @@ class Measurement(Copied, Shown):
         return [
             counted(self.valid.shape[:-1], "camera"),
             f"{count} point{'s' * (count != 1)}",
-            f"{lost} not on the plane" if lost else "",
+            f"{lost} not {self._lie}" if lost else "",
             "doubtful" if self.doubts else "",
         ]
 

@@ -108,13 +108,16 @@ class Quantity(Copied, Shown):
         return student_reach(level, self.degrees_of_freedom)
 
 
-def described(found: Quantity) -> list[str]:
-    """Lengths with their deviations, and with their intervals where the deviations mislead."""
+def described(found: Quantity, lie: str) -> list[str]:
+    """Lengths with their deviations, and with their intervals where the deviations mislead.
+
+    `lie` is what the points of one that is NaN do not do both, as "on the plane".
+    """
     columns = (found.value, found.deviation, *found.interval(), found.nonlinear, found.significant)
     lines = []
     for value, deviation, low, high, bent, significant in zip(*(column.tolist() for column in columns), strict=True):
         if math.isnan(value):
-            lines.append("not both points are on the plane")
+            lines.append(f"not both points are {lie}")
             continue
         note = f"  nonlinear, 95 %: {low:.3f} to {high:.3f}" * bent
         note += "" if significant else "  less than three deviations from 0"

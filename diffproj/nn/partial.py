@@ -202,7 +202,7 @@ def add_parameter(module: GeometryModule, name: str, like: Tensor, where: Any, b
         ValueError: `where` does not broadcast to the batch shape, or differs along an axis with one shared value.
     """
     zero = torch.zeros_like(like, memory_format=torch.contiguous_format)
-    mask = where if isinstance(where, np.ndarray) else _mask(where)
+    mask = where if isinstance(where, np.ndarray) and where.dtype == np.bool_ else _mask(where)
     try:
         mask = np.broadcast_to(mask, tuple(batch))
     except ValueError:

@@ -62,7 +62,10 @@ class CalibrationPrior(GeometryModule):
     def __init__(self, calibration: Calibration, view: int | str | None = None) -> None:
         super().__init__()
         if as_calibration(calibration).views.batch_shape or not calibration.has_covariance:
-            raise ValueError("calibration: want one camera with its covariance, as calibrate gives it")
+            got = f"{tuple(calibration.views.batch_shape)} of them; index it" * bool(calibration.views.batch_shape)
+            raise ValueError(
+                f"calibration: want one camera with its covariance, as calibrate gives it, got {got or 'one without'}"
+            )
         view = None if view is None else view_number(view, calibration.views.names)
         camera = (calibration.camera if view is None else calibration.cameras[view]).detach()
         known, parameters = calibration.covariance.about_middle, calibration.parameters.of_camera

@@ -38,7 +38,7 @@ def as_one(
     if isinstance(calibration, Calibration):
         if calibration.views.batch_shape:
             shape = tuple(calibration.views.batch_shape)
-            raise ValueError(f"calibration: want one camera, got batch shape {shape}")
+            raise ValueError(f"calibration: want one camera, got batch shape {shape}; index it")
         if not bool(calibration.converged):
             raise ValueError(f"calibration: want one that converged, got one that did not: {calibration.message}")
         return calibration, view_number(chosen_view(calibration, view), calibration.views.names)

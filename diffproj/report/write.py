@@ -122,7 +122,7 @@ def _one_camera(calibration: Any) -> Calibration:
         )
     if calibration.views.batch_shape:
         shape = tuple(calibration.views.batch_shape)
-        raise ValueError(f"calibration: want one camera, got batch shape {shape}; calibrate the views of one alone")
+        raise ValueError(f"calibration: want one camera, got batch shape {shape}; index it")
     if calibration.judgement.word == POSES_ONLY:
         raise ValueError(
             "calibration: want one that found the camera, got poses of a known camera, as dp.locate finds them; write "

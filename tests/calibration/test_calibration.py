@@ -694,7 +694,7 @@ def test_summary_says_what_was_found() -> None:
         assert part in text
     assert "k1" not in dp.calibrate(dp.example_views("left"), BOARD, "none").summary()
     _, views = simulate(6, cameras=(2,))
-    with pytest.raises(ValueError, match="summary: want one camera, got batch shape"):
+    with pytest.raises(ValueError, match=r"summary: want one camera, got batch shape \(2,\); index it"):
         dp.calibrate(views, BOARD).summary()
 
 

@@ -104,7 +104,7 @@ def test_bad_input_is_refused_by_name(calibration: dp.Calibration) -> None:
     both = dp.calibrate(dp.Views(torch.stack([calibration.views.pixels] * 2), size=(640, 480)), BOARD)
     with pytest.raises(ValueError, match="calibration: want one camera"):
         dp.AccuracyMap.over_image(both)
-    with pytest.raises(ValueError, match="calibration: want one camera, got batch shape"):
+    with pytest.raises(ValueError, match=r"calibration: want one camera, got batch shape \(2,\); index it"):
         dp.AccuracyMap.over_plane(both, (0, 0, 1, 1))
 
 

@@ -122,7 +122,9 @@ def test_what_a_camera_does_not_see_others_tell() -> None:
     columns = neither.to_dict()
     assert columns["cameras"] == [2, 0, 2, 2]
     assert columns["reason"] == ["VALID", "NOT_MEASURED", "VALID", "VALID"]
-    assert "not on the plane" in neither.summary()
+    assert "point 1   not measured" in neither.summary()
+    assert "0 to 1    not both points are measured" in neither.summary()
+    assert repr(neither) == "FusedMeasurement(2 cameras, 4 points, 1 not measured)"
 
 
 def test_batches_heights_and_gradients() -> None:

@@ -1,5 +1,6 @@
 """`LearnablePlane`: how it moves, and which planes of a batch do."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -38,3 +39,12 @@ def test_planes_of_a_batch_learn_one_by_one(camera: dp.Camera, pixels: torch.Ten
             parameter -= 1e-9 * parameter.grad
     moved = (projector(pixels)[0] != points).flatten(1).any(-1)
     assert moved.tolist() == [False, True, False]
+
+
+@pytest.mark.plain
+@pytest.mark.parametrize("learn", [np.array([0.5, 0.0]), np.array([2, 0]), np.array([None, 1]), [1, 0], torch.ones(2)])
+def test_what_is_learned_is_told_by_booleans(learn: object) -> None:
+    planes = dp.Plane(torch.tensor([[0.0, 0, 1], [0, 1, 1]]), torch.zeros(2))
+    with pytest.raises(TypeError, match="^learn: want booleans, got"):
+        dp.LearnablePlane(planes, learn=learn)
+    assert dp.LearnablePlane(planes, learn=np.array([True, False])).tilt_learned.tolist() == [[True], [False]]

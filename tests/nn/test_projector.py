@@ -201,5 +201,8 @@ def test_bad_input_is_refused_by_name(camera: dp.Camera) -> None:
         dp.LearnablePlane(dp.Plane.per_point([0.0, 0, 1], torch.zeros(3)))
     views = dp.example_views("left")
     both = dp.calibrate(dp.Views(torch.stack([views.pixels] * 2), size=views.size), dp.Chessboard())
-    with pytest.raises(ValueError, match="calibration: want one camera with its covariance"):
+    with pytest.raises(
+        ValueError, match=r"calibration: want one camera with its covariance.* got \(2,\) of them; index"
+    ):
         dp.CalibrationPrior(both)
+    dp.CalibrationPrior(both[0])

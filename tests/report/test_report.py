@@ -411,7 +411,7 @@ def test_what_has_no_report_is_refused_with_a_remedy(calibration: dp.Calibration
     camera = dp.Camera(camera.K, camera.R, camera.t, camera.distortion)
     sizeless = replace(calibration, views=dp.Views(views.pixels), camera=camera)
     for given, message in (
-        (many, r"calibration: want one camera, got batch shape \(2,\); calibrate the views of one alone"),
+        (many, r"calibration: want one camera, got batch shape \(2,\); index it"),
         (located, "got poses of a known camera, as dp.locate finds them; write the report of the calibration that"),
         (alone, "got poses of a known camera"),
         (sizeless, "calibration: want one whose image size is known, got none; give views a size"),

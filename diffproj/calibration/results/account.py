@@ -153,7 +153,7 @@ class Account(Shown):
             ValueError: there are many cameras.
         """
         if self.views.batch_shape:
-            raise ValueError(f"verdict: want one camera, got batch shape {tuple(self.views.batch_shape)}; see message")
+            raise ValueError(f"verdict: want one camera, got batch shape {tuple(self.views.batch_shape)}; index it")
         if self.status:
             return advice.Judgement("Not usable", (self._ends()[0],))
         if self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics):
@@ -199,7 +199,7 @@ class Account(Shown):
             ValueError: there are many cameras.
         """
         if self.views.batch_shape:
-            raise ValueError(f"summary: want one camera, got batch shape {tuple(self.views.batch_shape)}; see message")
+            raise ValueError(f"summary: want one camera, got batch shape {tuple(self.views.batch_shape)}; index it")
         deviations = self.covariance.deviations if self.has_covariance else {}
         values = dict(zip(self.parameters.names, self.shared.tolist(), strict=True))
 
