@@ -48,7 +48,7 @@ def posed(camera: Calibrated, known: Sequence[Known]) -> Calibrated:
         return replace(camera, camera=posed(camera.camera, known))
     camera = camera.upright().to(torch.float64)
     said = {one.name: camera.K.new_tensor(one.value) for one in known}
-    own = camera.mounting()
+    own = camera._mounting()
     values = dict(zip(POSE, (own.tilt, own.roll, own.heading, *own.position.unbind(-1), own.height), strict=True))
     values |= {name: value for name, value in said.items() if name in POSE}
     R = rotation_from_mounting(values["tilt"], values["roll"], values["heading"])

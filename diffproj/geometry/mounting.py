@@ -19,7 +19,9 @@ from torch import Tensor
 
 from diffproj._core.arguments import Array, called, meeting
 from diffproj._core.numerics import broadcast_batches, check_same_kind, check_tensor, dot, has_values
+from diffproj._core.warn import warn_caller
 from diffproj.geometry.camera_parts import CameraParts
+from diffproj.geometry.description import without_pose
 from diffproj.geometry.grid import checked_size
 from diffproj.geometry.intrinsics import intrinsic_matrix
 from diffproj.lens.protocol import Lens
@@ -167,6 +169,16 @@ class Mounted(CameraParts):
             >>> print(f"{found.height:.1f} m up, tilt {found.tilt:.1f}, heading {found.heading:.1f} degrees")
             60.0 m up, tilt 90.0, heading 30.0 degrees
         """
+        own: Any = self
+        if has_values(own.R, own.t) and without_pose(own.R, own.t):
+            warn_caller(
+                "mounting: the camera has no pose, and counts as looking straight up from the origin; the camera of a "
+                "calibration has none, its cameras have one for each view"
+            )
+        return self._mounting()
+
+    def _mounting(self) -> Mounting:
+        """The same without a warning, as for a camera from which a pose is sought."""
         camera: Any = self.upright()  # type: ignore[attr-defined]
         tilt, roll, heading = mounting_from_rotation(camera.R)
         x, y, height = camera.center.unbind(-1)

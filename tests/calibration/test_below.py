@@ -89,3 +89,19 @@ def test_the_command_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
         assert cli.main([*given, "--pixel-sigma", "0.5"]) == 0
         told = re.sub(r"\s+", " ", capsys.readouterr().err)
         assert ("below the landmarks' plane" in told) == (name == "exchanged.csv")
+
+
+def test_adjust_tells_it_too():
+    """Whose world has z up: six level landmarks with x and y exchanged leave small residuals, 6 below the ground."""
+    pixels = ABOVE.project(GROUND)[0]
+    right = dp.adjust(ABOVE, dp.Seen(GROUND, pixels, 0.5))
+    assert "below all landmarks" not in right.message
+    wrong = dp.adjust(ABOVE, dp.Seen(GROUND[:, [1, 0, 2]], pixels, 0.5))
+    assert float(wrong.mounting.height) < -5
+    assert "the camera is below all landmarks and not upright: are x and y exchanged" in wrong.message
+    assert "below all landmarks" in wrong.summary()
+    both = dp.adjust(dp.stack([ABOVE, ABOVE]), dp.Seen(GROUND, torch.stack([pixels, pixels.flip(0)]), 0.5), throw=False)
+    assert "below" not in both.remarks[0]
+    ceiling = GROUND + torch.tensor([0.0, 0, 9]).double()
+    looks_up = dp.Camera.looking_at([0.0, -9.0, 1.5], [0.0, 6.0, 9.0], fov_deg=77.0, size=SIZE).to(torch.float64)
+    assert not any(dp.adjust(looks_up, dp.Seen(ceiling, looks_up.project(ceiling)[0], 0.5)).remarks)

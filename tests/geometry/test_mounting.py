@@ -143,3 +143,13 @@ def test_a_turned_image_counts_as_a_turned_camera() -> None:
 def test_what_cannot_be_is_refused_in_one_sentence(wrong: dict[str, object], text: str) -> None:
     with pytest.raises((TypeError, ValueError), match=text):
         view(**wrong)
+
+
+def test_a_camera_without_a_pose_is_told() -> None:
+    """As that of a calibration, whose height is not 0."""
+    with pytest.warns(UserWarning, match="mounting: the camera has no pose"):
+        view().without_pose().mounting()
+    found = dp.adjust(view(), priors={"height": 0.02, "tilt": 0.5}, fixed=("roll", "heading", "position"))
+    with pytest.warns(UserWarning, match="mounting: the camera has no pose"):
+        found.camera.mounting()
+    assert float(found.mounting.height) == pytest.approx(2.0)

@@ -13,6 +13,7 @@ from diffproj.calibration.evidence.adjustment import Adjustment
 from diffproj.calibration.evidence.descent import Found, Task, best, differentiated, spare
 from diffproj.calibration.evidence.knowledge import Knowledge, knowledge, prior_shapes
 from diffproj.calibration.evidence.observation import Observation
+from diffproj.calibration.evidence.observations import Seen
 from diffproj.calibration.evidence.pose_parameters import PLACE
 from diffproj.calibration.evidence.undetermined import described
 from diffproj.calibration.least_squares.losses import check_loss
@@ -20,9 +21,18 @@ from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.problem.constraints import Priors
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
 from diffproj.calibration.results.covariance import Covariance
+from diffproj.calibration.results.remark import Kind, Remark, Remarks
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.targets.views import Views
+
+UPRIGHT = 0.2
+"""Cosine between z and up in the photograph from which on a camera below landmarks may look at a ceiling."""
+BELOW = (
+    "the camera is below all landmarks and not upright: are x and y exchanged, has one of them the wrong sign, or do "
+    "pixels count from another corner? z is up, as with x east and y north"
+)
+"""What is said of a camera that sees level ground from below."""
 
 
 def adjust(
@@ -177,10 +187,23 @@ def _outcome(
         spare=shaped(left),
         cost=shaped(found.cost),
         unknown=tuple(each.names for each in names),
+        _remarks=partial(_from_below, posed, task.pieces, shaped(status)),
     )
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"adjust: {adjusted.message}", adjusted)
     return adjusted
+
+
+def _from_below(posed: Camera, pieces: Sequence[Observation], status: Tensor) -> tuple[Remarks, ...]:
+    """For each camera a remark where it stands below all landmarks, and not upright, as where x and y are exchanged."""
+    heights = [piece.points[:, 2].detach() for piece in pieces if isinstance(piece, Seen)]
+    center, R = posed.center.detach().reshape(-1, 3), posed.R.detach().reshape(-1, 3, 3)
+    if not heights:
+        return ((),) * len(center)
+    below = center[:, 2] < torch.cat(heights).amin().to(center)
+    wrong = below & (-R[:, 1, 2] < UPRIGHT) & (status.flatten() == Status.CONVERGED)
+    said = Remark(BELOW, Kind.BELOW)
+    return tuple((said,) if each else () for each in wrong.tolist())
 
 
 def _same(covariance: Covariance) -> Covariance:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from diffproj.calibration.evidence.adjustment import Adjustment
 from diffproj.calibration.results.calibration import Calibration
+from diffproj.calibration.results.remark import Remarks
 from diffproj.targets.landmarks import Landmarks
 from diffproj.targets.views import Views
 
@@ -40,5 +41,10 @@ def of_view(
         skew=adjusted.skew,
         landmarks=landmarks.names,
         _covariance=partial(getattr, adjusted, "covariance"),
-        _remarks=partial(getattr, adjusted, "contradictions"),
+        _remarks=partial(_remarks, adjusted),
     )
+
+
+def _remarks(adjusted: Adjustment) -> tuple[Remarks, ...]:
+    """What residuals speak against, and how the camera stands to the landmarks."""
+    return tuple((*one, *other) for one, other in zip(adjusted.contradictions, adjusted.findings, strict=True))

@@ -135,11 +135,6 @@ class Adjustment(Calibration):
         """Not known: no corners covered the image."""
         return
 
-    @cached_property
-    def remarks(self) -> tuple[str, ...]:
-        """None: see `contradicted`."""
-        return ("",) * max(1, self.status.numel())
-
     @property
     def verdict(self) -> str:  # type: ignore[override]
         """Whether the pose is known, and why, in plain words; of many cameras how many are."""
@@ -174,7 +169,7 @@ class Adjustment(Calibration):
         for one, part in zip(self.observations, self.parts, strict=True):
             rms = float(part.detach().square().mean().sqrt())
             lines.append(f"{type(one).__name__:<16}{part.shape[-2]:5d} seen, residuals {rms:.2f} deviations")
-        return "\n".join([*lines, self._ends()[0], self.verdict])
+        return "\n".join([*lines, self._ends()[0], *filter(None, self.remarks), self.verdict])
 
     def to_dict(self) -> dict[str, Any]:
         """The numbers of the summary by name, as Python's own; of many cameras a list each, `*B` flattened."""

@@ -203,7 +203,7 @@ def _check_steep(camera: Camera, known: Knowledge) -> None:
     if not known.angles or "roll" not in said:
         return
     tilt = said["tilt"].mean if "tilt" in said else None
-    steep = camera.mounting().tilt if tilt is None else tilt
+    steep = camera._mounting().tilt if tilt is None else tilt
     if bool((steep.detach().abs() > STEEPEST).any()):
         raise ValueError(
             "priors: want turn_x, turn_y and turn_z, degrees about the camera's own axes, for a camera that looks "

@@ -68,7 +68,7 @@ def starts(
 
 def _directions(known: Knowledge, camera: Camera, begin: Tensor, rolls: bool, turns: bool) -> Tensor:
     """Tilt, roll and heading `(K, P, 3)`: all around where nothing is known of them."""
-    own = torch.stack(camera.mounting()[1:4], dim=-1)
+    own = torch.stack(camera._mounting()[1:4], dim=-1)
     if known.angles:
         own = begin[:, -POSE:-3]
     given = [known.angles and known.given(name) for name in ("tilt", "roll", "heading")]

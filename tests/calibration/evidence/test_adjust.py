@@ -84,6 +84,7 @@ def test_vanishing_points_of_a_traffic_camera() -> None:
     assert float((found.mounting.heading - 180).abs()) > 90
 
 
+@pytest.mark.filterwarnings("ignore:measure. pixel")  # 5 m aside is beyond the picture
 def test_mounted_camera_alone_has_a_covariance() -> None:
     """No observations: height to 2 cm, tilt to half a degree, pixels to 1 px; against 200000 samples, within 5 %."""
     mast = dp.Camera.mounted(2.18, 14.0, focal=800.0, size=(640, 480))
