@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import diffproj as dp
-from diffproj._core.arguments import called, first_of, number, numbers
 from diffproj._core.arguments import called, first_of, number, numbers, whole_number
 
 
@@ -101,6 +100,8 @@ def test_tensors_that_are_not_dense_are_named(made: Callable[[torch.Tensor], tor
     for name, call in calls:
         with pytest.raises(TypeError, match=f"^{name}: want a dense tensor, got {got}"):
             call()
+
+
 @pytest.mark.parametrize("value", ["x", 2.0, None, torch.zeros(2), torch.zeros(2, dtype=torch.int64), np.zeros(2, int)])
 def test_what_is_no_whole_number_is_refused_by_name(value: object) -> None:
     with pytest.raises(TypeError, match="^count: want a whole number, got"):
