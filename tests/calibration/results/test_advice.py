@@ -140,3 +140,13 @@ def test_a_board_seen_from_behind_leans_as_from_the_front() -> None:
     assert _second_spread(turned) == pytest.approx(_second_spread(normals))
     along = torch.nn.functional.normalize(torch.tensor([[0.3, 0.0, 1], [-0.1, 0.0, 1]], dtype=D), dim=-1)
     assert _second_spread(along) == pytest.approx(0, abs=1e-9)  # leaning to the left and right alone
+
+
+def test_a_normal_may_point_either_way() -> None:
+    """Boards seen from behind have the normals of boards seen from in front, reversed: the spread is the same."""
+    normals = torch.nn.functional.normalize(torch.randn(9, 3, dtype=torch.float64) + torch.tensor([0.0, 0, 3]), dim=-1)
+    turned = normals * torch.tensor([1, -1, 1, 1, -1, -1, 1, -1, 1]).unsqueeze(-1)
+    own = normals[:, :2] - normals[:, :2].mean(0)
+    least = float(torch.linalg.svdvals(own)[-1]) / 3
+    assert _second_spread(normals) == pytest.approx(least)
+    assert _second_spread(turned) == pytest.approx(least)
