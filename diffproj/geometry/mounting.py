@@ -170,7 +170,7 @@ class Mounted(CameraParts):
             60.0 m up, tilt 90.0, heading 30.0 degrees
         """
         own: Any = self
-        if has_values(own.R, own.t) and without_pose(own.R, own.t):
+        if own.t.numel() and has_values(own.R, own.t) and without_pose(own.R, own.t):
             warn_caller(
                 "mounting: the camera has no pose, and counts as looking straight up from the origin; the camera of a "
                 "calibration has none, its cameras have one for each view"
