@@ -223,6 +223,33 @@ def calibrations(shared: Shared) -> list[Any]:
     return fitted(dp.calibrate(twice, shared.board, "brown4")[1])
 
 
+def evidence(shared: Shared) -> list[Any]:
+    mast = dp.Camera.mounted(6.0, 20.0, fov_deg=70.0, size=(640, 480))
+    places = [[1.0, 12.0, 0.0], [-3.0, 15.0, 0.0], [4.0, 20.0, 1.0], [-2.0, 9.0, 0.5]]
+    seen = mast.project(places)[0] + 0.3
+    found = dp.adjust(
+        mast, [dp.Seen(places, seen), dp.Horizon([[0.0, 10.0], [600.0, 12.0]], 3.0)], priors={"height": 0.05}
+    )
+    near = [dp.measure(seen[:2], one, shared.plane, pixel_sigma=1.0) for one in (found, mast)]
+    fused = dp.fuse(near)
+    return [found.camera, found.summary(), fused.points, fused.deviations, fused.summary(), fused.to_dict()]
+
+
+def batches(shared: Shared) -> list[Any]:
+    two = dp.stack([shared.camera, shared.calibration.cameras[1]])
+    bank = dp.ProjectorBank([shared.camera, shared.pinhole], shared.plane)
+    rig = dp.LearnableRig({"one": shared.camera, "two": shared.calibration.cameras[1]})
+    return [
+        two,
+        *two,
+        dp.collate([{"camera": shared.camera}, {"camera": two[1]}]),
+        *(one(shared.pixels) for one in dp.PlaneMap(two, shared.slanted)),
+        bank(shared.pixels.expand(2, -1, -1), camera=[1, 0]),
+        rig(),
+        dp.geotransform((0, 0, 200, 125), 0.5, (3.0, 4.0)),
+    ]
+
+
 CALLS: dict[str, Callable[[Shared], Any]] = {
     "calibrate": lambda s: fitted(dp.calibrate(s.views, s.board, "brown4")),
     "calibrate with a prior": lambda s: fitted(
@@ -269,6 +296,8 @@ CALLS: dict[str, Callable[[Shared], Any]] = {
     "losses": lambda s: [loss(0.1).value(s.points) for loss in (dp.Huber, dp.SoftL1, dp.Cauchy)],
     "gradients": gradients,
     "modules": modules,
+    "evidence": evidence,
+    "batches": batches,
     "files": files,
     "pictures": pictures,
 }
@@ -341,6 +370,8 @@ QUICK = [
     "losses",
     "gradients",
     "modules",
+    "evidence",
+    "batches",
     "files",
 ]
 
