@@ -34,7 +34,7 @@ def calibrated(seen: Tensor, **options: object) -> dp.Calibration:
 MIXED = {
     "two cameras": (lambda: torch.cat([pixels("left"), pixels("right")]), range(13)),
     "a few of the other": (lambda: torch.cat([pixels("left")[:9], pixels("right")[:4]]), range(9, 13)),
-    "two of the other": (lambda: torch.cat([pixels("left")[:3], pixels("right")[:2], pixels("left")[5:]]), range(3, 5)),
+    "two of another zoom": (lambda: zoomed(pixels("left"), slice(3, 5), 1.1), range(3, 5)),
     "a zoom that was touched": (lambda: zoomed(pixels("right"), slice(6, None), 1.05), range(6)),
 }
 
