@@ -83,7 +83,7 @@ def opencv(problems: Problems, i: int) -> dp.Camera | None:
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
     try:
         if problems.model == "fisheye":
-            args = [s.reshape(-1, 1, 3) for s in shown], [p.reshape(-1, 1, 2) for p in seen], size
+            args = [s.reshape(1, -1, 3) for s in shown], [p.reshape(1, -1, 2) for p in seen], size
             flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
             _, K, d, r, t = cv2.fisheye.calibrate(*args, np.zeros((3, 3)), np.zeros((4, 1)), flags=flags, criteria=stop)
         else:
