@@ -54,7 +54,7 @@ def inside(pixels: Float[Tensor, "*shape 2"], size: tuple[int, int]) -> Bool[Ten
 def warn_if_off_image(
     caller: str,
     pixels: Float[Tensor, "*batch n 2"],
-    valid: Bool[Tensor, "*#batch n"] | None,
+    valid: Bool[Tensor, "*many n"] | None,
     size: tuple[int, int] | None,
 ) -> None:
     """Warn of pixels that nobody can have seen on an image of that size, where it is known and values can be read.
@@ -62,7 +62,7 @@ def warn_if_off_image(
     Args:
         caller: the function that was called, for the message.
         pixels: `(*B, N, 2)`; those that are not finite count as not seen.
-        valid: which of them have a point; the others are told by it.
+        valid: which of them have a point `(*M, N)`, by broadcasting; the others are told by it.
         size: `(width, height)` of the image.
     """
     if size is None or not has_values(pixels):
