@@ -189,6 +189,8 @@ def test_vmap_over_points_and_over_lenses(name: str) -> None:
         torch.testing.assert_close(batched[0], expected, rtol=1e-13, atol=1e-13)
         assert torch.equal(batched[1], expected_valid)
     torch.testing.assert_close(vmap(lambda one: one.domain)(lens), lens.domain)
+    pairs = many.unflatten(0, (2, 2))  # of which vmap takes a batch of lenses at a time
+    torch.testing.assert_close(vmap(lambda two: kind(two).unproject(points)[0])(pairs).flatten(0, 1), expected)
     one_by_one, _ = vmap(lambda point: kind(coefficients).unproject(point[None]))(points)
     torch.testing.assert_close(one_by_one[:, 0], kind(coefficients).unproject(points)[0], rtol=1e-13, atol=1e-13)
     jacobians = vmap(jacrev(lambda one: kind(one).unproject(points)[0]))(many)

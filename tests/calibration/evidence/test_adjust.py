@@ -281,6 +281,24 @@ def test_a_waterline_of_unknown_level_tells() -> None:
     assert all(0.92 <= part <= 0.98 for part in parts), parts
 
 
+def test_a_robust_minimum_is_one_to_rounding() -> None:
+    """Where reweighting creeps: the gradient of the loss, written down, moves nothing by a part of its deviation."""
+    generator = torch.Generator().manual_seed(3)
+    pixels = seen() + 2.0 * torch.randn(6, 2, dtype=D, generator=generator)
+    found = dp.adjust(START, dp.Seen(LANDMARKS, pixels, loss=dp.Cauchy(0.5)))
+    assert bool(found.converged)
+    values = torch.cat([part.reshape(-1) for part in found.mounting]).requires_grad_()
+
+    def cost(values: torch.Tensor) -> torch.Tensor:
+        camera = dp.Camera.mounted(*values[:4], position=values[4:], focal=900.0, size=(1280, 720))
+        squared = (camera.project(LANDMARKS)[0] - pixels).square().sum(-1)
+        return 0.25 * (squared / 0.25).log1p().sum() / 2
+
+    gradient = torch.autograd.functional.jacobian(cost, values)
+    step = torch.linalg.solve(torch.autograd.functional.hessian(cost, values), gradient)
+    assert float((step.abs() / torch.cat([d.reshape(-1) for d in found.mounting_deviations])).max()) < 1e-7
+
+
 # --------------------------------------------------------------------------------- what evidence does not tell
 
 
