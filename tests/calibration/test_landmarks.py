@@ -446,7 +446,9 @@ def test_scatter_is_no_fault_of_landmarks_but_of_corners() -> None:
     board = dp.Chessboard()
     views = dp.example_views("left")[:6]
     generator = torch.Generator().manual_seed(0)
-    rough = dp.Views(views.pixels + 3 * torch.randn(views.pixels.shape, generator=generator, dtype=T(0).dtype), size=views.size)
+    rough = dp.Views(
+        views.pixels + 3 * torch.randn(views.pixels.shape, generator=generator, dtype=T(0).dtype), size=views.size
+    )
     remarks = [dp.calibrate(rough, target, "brown4").remarks[0] for target in (board, dp.Landmarks(board.points))]
     assert ["in sharp photographs by 0.1 to 0.3" in remark for remark in remarks] == [True, False]
 
