@@ -264,19 +264,24 @@ def test_intrinsics_of_a_calibration_go_along() -> None:
     assert not exact.knows_intrinsics
 
 
+SHORE = torch.tensor([[2.0, 20], [10, 26], [18, 22], [25, 35], [6, 14]], dtype=D)
+WATERLINE = torch.cat([SHORE, torch.full((5, 1), -1.3, dtype=D)], dim=-1)
+
+
+def test_the_level_of_a_waterline_is_found_along() -> None:
+    exact = dp.adjust(START, [dp.Coplanar(SHORE, seen(TRUE, WATERLINE)), dp.Seen(LANDMARKS[:1], seen()[:1])])
+    torch.testing.assert_close(exact.cameras.R[0], TRUE.R, atol=1e-7, rtol=0)
+
+
 @pytest.mark.slow
 def test_a_waterline_of_unknown_level_tells() -> None:
-    """Its level is found along, exactly without noise; and error bars hold with it."""
-    shore = torch.tensor([[2.0, 20], [10, 26], [18, 22], [25, 35], [6, 14]], dtype=D)
-    points = torch.cat([shore, torch.full((5, 1), -1.3, dtype=D)], dim=-1)
-    exact = dp.adjust(START, [dp.Coplanar(shore, seen(TRUE, points)), dp.Seen(LANDMARKS[:1], seen()[:1])])
-    torch.testing.assert_close(exact.cameras.R[0], TRUE.R, atol=1e-7, rtol=0)
+    """Error bars hold with its level found along."""
     random = torch.Generator().manual_seed(4)
     noisy = (
         pixels + torch.randn(600, *pixels.shape, dtype=D, generator=random)
-        for pixels in (seen(TRUE, points), seen()[:2])
+        for pixels in (seen(TRUE, WATERLINE), seen()[:2])
     )
-    found = dp.adjust(START, [dp.Coplanar(shore, next(noisy)), dp.Seen(LANDMARKS[:2], next(noisy))])
+    found = dp.adjust(START, [dp.Coplanar(SHORE, next(noisy)), dp.Seen(LANDMARKS[:2], next(noisy))])
     parts = [within(*each) for each in zip(found.mounting, TRUE.mounting(), found.mounting_deviations, strict=True)]
     assert all(0.92 <= part <= 0.98 for part in parts), parts
 
