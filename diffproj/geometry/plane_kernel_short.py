@@ -57,7 +57,7 @@ def gradient(
         vectors, upstream = (np.where(gone, np.zeros((), part.dtype), part) for part in (vectors, upstream))
     parts = [vectors[..., axis] for axis in range(vectors.shape[-1])]
     with np.errstate(all="ignore"):
-        inverse = 1 / denominator.numpy(force=True)
+        inverse = 1 / denominator.numpy()
         by_numerators = upstream.swapaxes(-1, -2) * inverse[..., None, :]  # (*B, 3, N)
         rows = [by_numerators[..., axis, :] for axis in range(3)]
         # By p through the numerators; along p this is what the denominator takes back.

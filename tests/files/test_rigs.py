@@ -41,6 +41,17 @@ def test_the_own_json_holds_all(rig: dp.RigCalibration, tmp_path: Path) -> None:
         dp.load_calibration(path)
 
 
+def _without_a_view(covariance: dict) -> dict:
+    """What a covariance says of all views but the last."""
+    return {name: covariance[name][:-1] for name in ("follow", "mixed", "alone", "arm", "undetermined_views")}
+
+
+def test_a_rig_may_come_without_a_covariance(rig: dp.RigCalibration) -> None:
+    again = dp.RigCalibration.from_fields(rig.to_fields() | {"covariance": None}, rig.cameras)
+    assert not again.has_covariance
+    assert torch.equal(again.t_target, rig.t_target)
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -51,6 +62,7 @@ def test_the_own_json_holds_all(rig: dp.RigCalibration, tmp_path: Path) -> None:
         (lambda rig: rig["calibrations"]["left"].update(rms=3.0), "rms"),
         (lambda rig: rig.update(remarks=[3]), "remarks"),
         (lambda rig: rig["R_target"].pop(), "R_target"),
+        (lambda rig: rig["covariance"].update(_without_a_view(rig["covariance"])), "covariance: want 9 moments"),
     ],
 )
 def test_damage_is_named(rig: dp.RigCalibration, tmp_path: Path, spoil, message: str) -> None:  # type: ignore

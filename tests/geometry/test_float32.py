@@ -55,6 +55,15 @@ def test_uses_of_a_plane_warn() -> None:
         dp.back_project(PIXELS.float(), camera_at(1e3, 0.01).to(S), GROUND)
 
 
+def test_the_height_is_that_above_the_plane() -> None:
+    """Plane and camera are far from the origin on the same side, and near each other."""
+    camera, plane = camera_at(0.0, 1e6 + 10).to(S), dp.Plane.z(1e6)
+    with warned("0.01"):
+        dp.PlaneMap(camera, plane)
+    with warned("0.01"):
+        dp.measure(PIXELS.float(), camera, plane, pixel_sigma=0.5)
+
+
 def test_scenes_near_the_origin_and_float64_do_not_warn() -> None:
     for camera in (camera_at(0.0), camera_at(3e3), camera_at(0.0, 1e7), camera_at(1e9, 1e8), camera_at(0.0, 1e-7)):
         dp.back_project(PIXELS.float(), camera.to(S), GROUND)

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd import forward_ad, gradcheck, gradgradcheck
 from torch.func import grad, jacfwd, jacrev, jvp, vmap
 
+from diffproj.lens import plan
 from diffproj.lens.brown_conrady import BrownConrady
 from diffproj.lens.kannala_brandt import KannalaBrandt
 
@@ -173,6 +174,18 @@ def test_all_orders_of_modes_agree(name: str) -> None:
     shifted = [grad(loss)(point, coefficients + sign * shift) for sign in (1, -1)]
     mixed = jacfwd(grad(loss), 1)(point, coefficients)[:, 0]
     torch.testing.assert_close(mixed, (shifted[0] - shifted[1]) / (2 * step), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_vmap_over_batches_of_lenses_in_the_operations_of_compiled_graphs(name: str) -> None:
+    kind, coefficients, _ = lens_of(name)
+    scale = torch.linspace(0.2, 1, 6, dtype=torch.float64).reshape(2, 3, 1)
+    lens = kind(coefficients * scale)
+    domain = vmap(lambda three: plan._domain(three, lens._key))(lens.coefficients)
+    torch.testing.assert_close(domain, lens.domain, rtol=0, atol=0)
+    parts = vmap(lambda three, reached: plan._rest(three, reached, lens._key))(lens.coefficients, domain)
+    for found, expected in zip(parts, plan._rest(lens.coefficients, domain, lens._key), strict=True):
+        torch.testing.assert_close(found, expected, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("name", LENSES)

@@ -68,8 +68,7 @@ def _robust(found: Fit) -> tuple[Equations, Tensor, Tensor]:
     rows, residual, weight = _panel(found)
     squared = residual.square().sum(2)
     slope, bend = slope_and_bend(found.task.loss, squared)
-    used = found.task.used.to(squared)
-    used = used if found.task.shares is None else used * found.task.shares.unsqueeze(-1)
+    used = _counted(found, squared)
     n = used.sum((-2, -1)).clamp(min=1)
     spare = found.degrees_of_freedom()
 
@@ -82,6 +81,12 @@ def _robust(found: Fit) -> tuple[Equations, Tensor, Tensor]:
     k = 1 + (1 - spare / (2 * n)) * (a_squared / a.square() - 1).clamp(min=0)
     q = torch.where(spare > 0, (weight * slope.square() * squared * used).sum((-2, -1)) / spare, torch.nan)
     return _equations(found, rows, weight * a[:, None, None]), a, k.square() * q / a.square()
+
+
+def _counted(found: Fit, like: Tensor) -> Tensor:
+    """How much each corner counts `(P, V, N)`: those of views that are alike, as one."""
+    used = found.task.used.to(like)
+    return used if found.task.shares is None else used * found.task.shares.unsqueeze(-1)
 
 
 def _on_the_plane(found: Fit) -> tuple[Equations, Scores]:
@@ -101,7 +106,8 @@ def _on_the_plane(found: Fit) -> tuple[Equations, Scores]:
     squared = residual.square().sum(2)
     slope, bend = slope_and_bend(found.task.loss, squared)
     both = (weight * slope).unsqueeze(2)
-    spread = found.task.used.to(residual).sum((-2, -1)) * 2 / found.degrees_of_freedom().clamp(min=1)
+    n, spare = _counted(found, squared).sum((-2, -1)), found.degrees_of_freedom()
+    spread = torch.where(spare > 0, 2 * n / spare, torch.nan)
     M = (score * both.square()) @ score.mT * spread[:, None, None, None]
     curved = (score * (2 * weight * bend).unsqueeze(2)) @ score.mT
     return _equations(found, rows, weight * slope, curved), _scores(found, M)

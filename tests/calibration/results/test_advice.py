@@ -72,7 +72,9 @@ def test_a_view_that_fits_badly(calibration: dp.Calibration) -> None:
 
 def test_what_is_no_calibration(calibration: dp.Calibration) -> None:
     assert dp.calibrate(LEFT[0], BOARD, throw=False).verdict.startswith("Not usable: one view does not tell")
-    assert dp.locate(LEFT[:2], BOARD, calibration.camera).verdict.startswith("Poses only, the camera was given")
+    located = dp.locate(LEFT[:2], BOARD, calibration.camera)
+    assert located.verdict.startswith("Poses only, the camera was given")
+    assert located.judgement.views == 0  # none is asked for
     both = dp.calibrate(dp.Views(torch.stack([LEFT.pixels, dp.example_views("right").pixels]), size=LEFT.size), BOARD)
     with pytest.raises(ValueError, match=r"verdict: want one camera, got batch shape \(2,\); index it"):
         _ = both.verdict

@@ -19,6 +19,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "weights": {"weights": torch.tensor(25.0)},
     "huber": {"loss": dp.Huber(0.3)},
     "plane": {"objective": "plane"},
+    "robust plane": {"objective": "plane", "loss": dp.Huber(0.3)},
     "bow": {"shape": "bow"},
     "rejecting": {"reject_outliers": 3.0},
     "prior": {"priors": {"k3": 0.02}, "weights": torch.tensor(60.0)},

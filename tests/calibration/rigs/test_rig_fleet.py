@@ -2,11 +2,14 @@
 
 import copy
 import pickle
+from collections.abc import Sequence
+from typing import Any
 
 import pytest
 import torch
 
 import diffproj as dp
+from diffproj.calibration.rigs import alone
 from tests.calibration.rigs.rig_scenes import Scene, scene
 
 D = torch.float64
@@ -40,6 +43,25 @@ def test_each_ends_as_alone(scenes: list[Scene]) -> None:
     alone = dp.calibrate_rig([scenes[0].views], scenes[0].board)
     same(alone[0], dp.calibrate_rig(scenes[0].views, scenes[0].board))
     same(copy.deepcopy(found[1]), dp.calibrate_rig(scenes[1].views, scenes[1].board))
+
+
+def test_cameras_start_in_batches_that_are_bounded_and_well_filled(
+    scenes: list[Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A batch is as large as its number of cameras times the most views that one of them has."""
+    batches: list[list[int]] = []
+    calibrated = alone._calibrated
+
+    def noted(asked: Sequence[alone.Asked], members: Sequence[tuple[int, str]]) -> list[Any]:
+        batches.append([len(asked[number].views.data[name].views) for number, name in members])
+        return calibrated(asked, members)
+
+    monkeypatch.setattr(alone, "_calibrated", noted)
+    monkeypatch.setattr(alone, "MOST", 3)
+    dp.calibrate_rig([one.views for one in scenes], scenes[0].board)
+    assert sum(map(len, batches)) == sum(len(one.views) for one in scenes)
+    assert max(map(len, batches)) == alone.MOST
+    assert all(max(views) <= alone.FILLED * min(views) for views in batches)
 
 
 def test_a_rig_of_many_takes_no_other_along(scenes: list[Scene]) -> None:

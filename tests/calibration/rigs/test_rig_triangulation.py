@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import diffproj as dp
+from diffproj.calibration.rigs import triangulation
 
 PLACES = torch.tensor([[10.0, 20, 400], [50, -20, 500], [-60, 10, 450], [0, 0, 600]], dtype=torch.float64)
 
@@ -21,6 +22,15 @@ def _seen(rig, sigma, generator, places=PLACES):
     return {
         name: uv + sigma * torch.randn(uv.shape, generator=generator, dtype=uv.dtype) for name, uv in pixels.items()
     }
+
+
+def test_derivatives_by_a_point_are_those_of_its_pixels(rig):
+    only_cameras = triangulation.Rig(rig.cameras, {}, None, {})
+    for name, camera in rig.cameras.items():
+        found = triangulation._by_camera_point(only_cameras, name, PLACES) @ camera.R
+        for place, slope in zip(PLACES, found, strict=True):
+            expected = torch.autograd.functional.jacobian(lambda X, seer=camera: seer.project(X[None])[0][0], place)
+            torch.testing.assert_close(slope, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_right_pixels_are_left_alone(rig):

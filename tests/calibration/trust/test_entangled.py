@@ -7,6 +7,9 @@ import torch
 
 import diffproj as dp
 from diffproj import synthetic
+from diffproj.calibration.fitting.options import calibration_options
+from diffproj.calibration.one_lens import fitted
+from diffproj.calibration.trust import entangled
 
 BOARD = dp.Chessboard()
 HARDLY = "these views hardly tell"
@@ -83,6 +86,17 @@ def test_the_later_terms_of_a_fisheye_that_sees_little_of_the_field() -> None:
     assert bool((found.converged & simple.converged).all()), found.message
     assert any(HARDLY in text and "k2, k3, k4 from c_" in text for text in found.remarks)
     assert off(found, simple) < 3
+
+
+def test_each_family_of_terms_is_doubted_by_itself() -> None:
+    """A lens that is decentred may need no more than k1, and one of many radial terms may not be decentred."""
+    _, found = fitted(dp.example_views("left"), BOARD, "brown5", calibration_options("calibrate", {}))
+    lenses = entangled._poorer_lenses(found)
+    assert lenses[0] == ("k1", "k2", "p1", "p2", "k3")  # first no lens at all
+    shifts = {"p1", "p2"}
+    left = [{"k1", "k2", "k3", "p1", "p2"} - set(held) for held in lenses]
+    assert {"k1"} | shifts in left
+    assert {"k1", "k2", "k3"} in left
 
 
 def test_a_long_lens_that_bends_nothing() -> None:

@@ -236,6 +236,21 @@ def test_few_degrees_of_freedom_do_not_blow_error_bars_up() -> None:
     assert float(found.covariance.dispersion.amax()) < 6
 
 
+@pytest.mark.parametrize("objective", ["image", "plane"])
+@pytest.mark.parametrize("loss", [None, dp.Huber(1.0)])
+def test_corners_that_are_met_exactly_by_any_noise_tell_no_deviation(loss: dp.Loss | None, objective: Any) -> None:
+    """Four corners in each of two views are 16 coordinates for two poses and four intrinsics."""
+    bare = scene(2)
+    exact, _ = dp.Camera(bare.K, bare.R, bare.t).project(BOARD.points)
+    noise = SIGMA * torch.randn(exact.shape, generator=torch.Generator().manual_seed(0), dtype=D)
+    four = torch.zeros(2, 54, dtype=torch.bool)
+    four[:, [0, 8, 45, 53]] = True
+    views = dp.Views(exact + noise, four, size=(640, 480))
+    found = dp.calibrate(views, BOARD, "none", loss=loss, objective=objective, throw=False)
+    assert found.degrees_of_freedom == 0
+    assert found.covariance.shared.diagonal().isnan().all()
+
+
 def test_a_file_holds_0_for_a_variance_that_nothing_tells() -> None:
     """JSON has no infinity; which they are, the mask says."""
     known = dp.calibrate(dp.example_views("left"), dp.Chessboard(), "brown4").covariance
