@@ -1,5 +1,8 @@
 """Poses found with a known noise: where residuals contradict it, whatever is measured from them says so."""
 
+from dataclasses import replace
+
+import pytest
 import torch
 
 import diffproj as dp
@@ -35,6 +38,20 @@ def test_nothing_is_said_of_noise_that_is_as_known_or_is_estimated() -> None:
         assert not found.doubts
         assert not dp.measure([[600.0, 800.0]], found, dp.Plane.z(0.0), view=0, pixel_sigma=1.0).doubts
         assert "nothing speaks against" in found.verdict
+
+
+def test_the_verdict_tells_the_scatter_that_residuals_show_and_not_what_was_said_of_it() -> None:
+    landmarks = torch.cat([POINTS, POINTS[:4] + torch.tensor([0.5, 0.5, 1.0], dtype=D)])
+    pixels = CAMERA.project(landmarks)[0]
+    noise = 0.5 * torch.randn(10, 2, generator=torch.Generator().manual_seed(1), dtype=D)
+    views = dp.Views((pixels + noise).unsqueeze(-3), size=(1280, 960))
+    held = {"fixed": ("principal_point",), "tied_focal": True}
+    found = dp.calibrate(views, dp.Landmarks(landmarks), "none", pixel_sigma=30.0, throw=False, **held)  # type: ignore[arg-type]
+    assert float(found.pixel_sigma) == 30  # type: ignore[arg-type]
+    shown = float(found.residuals[found.used].square().mean().sqrt())
+    assert found._scatter == pytest.approx(shown)
+    unsaid = replace(found, pixel_sigma=None, degrees_of_freedom=None)
+    assert unsaid._scatter == pytest.approx(shown)
 
 
 def test_of_many_cameras_those_are_named() -> None:

@@ -151,6 +151,37 @@ def test_a_wrong_landmark_among_six_is_rejected_where_the_noise_is_known(known: 
     assert not found.doubts
 
 
+def test_rejected_is_what_those_that_were_kept_speak_against() -> None:
+    """By the definition: the residual of each over its covariance, of its own noise and of a pose from the kept ones."""
+    limit, generator = 4.0, torch.Generator().manual_seed(6)
+    more = torch.rand(2, 3, dtype=D, generator=generator) * torch.tensor([20.0, 20, 3], dtype=D)
+    points = torch.cat([LANDMARKS, more + torch.tensor([2.0, 10, 0], dtype=D)])
+    pixels = TRUE.project(points)[0] + noise(50, 8, 2, seed=4)
+    pixels[:, :2] += 12 * noise(50, 2, 2, seed=5)
+    found = located(pixels, points=points, pixel_sigma=1.0, reject_outliers=limit)
+
+    def seen(step: torch.Tensor, camera: dp.Camera) -> torch.Tensor:
+        x, y, z = step[:3]
+        o = torch.zeros_like(x)
+        cross = torch.stack([o, -z, y, z, o, -x, -y, x, o]).unflatten(0, (3, 3))
+        return camera.at(torch.matrix_exp(cross) @ camera.R, camera.t + step[3:]).project(points)[0]
+
+    kept = found.used[:, 0]
+    compared = 0
+    for i in range(50):
+        camera = found.cameras[i, 0]
+        J = torch.autograd.functional.jacobian(lambda step, c=camera: seen(step, c), torch.zeros(6, dtype=D))
+        pose = torch.linalg.inv((J[kept[i]].mT @ J[kept[i]]).sum(0))
+        sign = torch.where(kept[i], -1.0, 1.0)[:, None, None]
+        e = (camera.project(points)[0] - pixels[i]).unsqueeze(-1)
+        size = (e.mT @ torch.linalg.solve(torch.eye(2, dtype=D) + sign * (J @ pose @ J.mT), e)).flatten().sqrt()
+        if int(kept[i].sum()) > 4:
+            assert bool((size[kept[i]] < limit + 1e-3).all())
+            assert bool(((size > limit - 1e-3) | (e.flatten(1).norm(dim=-1) > limit))[~kept[i]].all())
+            compared += int((~kept[i]).sum())
+    assert compared > 40
+
+
 def test_none_of_good_landmarks_is_rejected() -> None:
     found = located(PIXELS + noise(200, 6, 2, seed=3), pixel_sigma=1.0, reject_outliers=True)
     assert int(found.rejected.sum()) == 0

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 import diffproj as dp
+from diffproj.lens import kannala_brandt
 from diffproj.lens.brown_conrady import BrownConrady
 from diffproj.lens.kannala_brandt import KannalaBrandt
 from diffproj.lens.protocol import Lens
@@ -337,6 +338,22 @@ def test_fisheye_inverts_beyond_ninety_degrees(name: str) -> None:
     if name != "folding":
         assert (direction[:, 2] < 0).any()
         assert (found - direction).abs().max() < 1e-13
+
+
+def test_the_fisheyes_inverse_of_an_exported_graph_is_the_usual_one() -> None:
+    """Of two lenses at once and of one, whatever the start, and for points that are to be left alone."""
+    angle = torch.linspace(0, 1.2, 40, dtype=torch.float64)
+    for coefficients in (tensor([FISHEYE["wide"], FISHEYE["equidistant"]]), tensor(FISHEYE["wide"])):
+        k1, k2, k3, k4 = coefficients.unsqueeze(-2).unbind(-1)
+        s = angle * angle
+        rho = angle * (1 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
+        left = (torch.arange(40) % 5 > 0).expand(rho.shape)
+        like = rho.new_ones(rho.shape[:-1])
+        given = coefficients, 1.5 * like, like, rho, torch.ones_like(rho), left
+        sigma, solved = kannala_brandt._solved_in_graph(*given)
+        assert torch.equal(solved, left)
+        torch.testing.assert_close((sigma * rho)[left], angle.expand(rho.shape)[left], rtol=1e-12, atol=1e-12)
+        assert bool((sigma[~left] == 1).all())
 
 
 def test_fisheye_domain() -> None:

@@ -10,7 +10,7 @@ D = torch.float64
 
 
 def test_dips_between_nodes_are_found() -> None:
-    """Against values at 20,000 places: of polynomials whose least value is a hair above or below zero."""
+    """Against values at 20,000 places, and at 2,000 more about the least of them: of a least value a hair off zero."""
     circles = _Circles(torch.tensor([[-0.2, 0.05, 0.001, 0.002, 0.0, 0, 0, 0, 0.001, 0, 0, 0]], dtype=D))
     orders = torch.arange(DEGREE + 1, dtype=D)
 
@@ -20,11 +20,13 @@ def test_dips_between_nodes_are_found() -> None:
 
     parts = torch.randn(2000, 2 * (DEGREE + 1), dtype=D)
     many = torch.linspace(0, 2 * math.pi, 20001, dtype=D)[:-1]
-    least = torch.cat([(part @ waves(many).mT).amin(-1) for part in parts.split(100)])
+    lowest = torch.cat([many[(part @ waves(many).mT).argmin(-1)] for part in parts.split(100)])
+    about = torch.linspace(-1, 1, 2001, dtype=D) * (2 * math.pi / 20000)
+    least = torch.stack([(waves(at + about) @ part).amin() for at, part in zip(lowest, parts, strict=True)])
     nodes = torch.arange(circles.synthesis.shape[-1], dtype=D) * (2 * math.pi / circles.synthesis.shape[-1])
     between = (parts @ waves(nodes).mT).amin(-1) - least  # how much deeper it is between the nodes
     at = torch.arange(circles.analysis.shape[0], dtype=D) * (2 * math.pi / circles.analysis.shape[0])
-    for lift, positive in ((1e-4, True), (-1e-4, False)):
+    for lift, positive in ((1e-4, True), (1e-9, True), (-1e-4, False), (-1e-9, False)):
         lifted = parts @ waves(at).mT - least[:, None] + lift
         found = circles._positive(lifted)
         assert bool((found == positive)[between > 1e-3].all())

@@ -12,6 +12,9 @@ import pytest
 import torch
 
 import diffproj as dp
+from diffproj.measurement import folded
+from diffproj.measurement.intervals import _steps_to_zero
+from diffproj.measurement.propagation import Propagated
 
 D = torch.float64
 Z = dp.Plane.z(0.0)
@@ -288,6 +291,32 @@ def test_many_cameras_give_what_each_gives() -> None:
                 torch.testing.assert_close(many[i], one, rtol=1e-7, atol=1e-7)
             for many, one in zip(together.angles().interval(), alone.angles().interval(), strict=True):
                 torch.testing.assert_close(many[i], one, rtol=1e-7, atol=1e-7)
+
+
+def test_steps_to_zero_are_where_a_curve_ends() -> None:
+    """Of curves that cross zero after 0.5 to 11 steps, bent up or down, some of which leave the plane behind that."""
+
+    class Line(Propagated):
+        """The error itself is the point; beyond a place there is none."""
+
+        def __init__(self) -> None:
+            pass
+
+        ends = torch.tensor([12.5, 12.5, 12.5, 12.5, 1.0, 11.5, 12.5], dtype=D)
+
+        def points(self, errors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            return errors, errors.squeeze(-1) <= self.ends
+
+    zeros = torch.tensor([0.5, 4.0, 11.0, 4.0, 0.5, 11.0, 20.0], dtype=D)
+    bends = torch.tensor([0.3, 0.3, 0.3, -0.03, 0.3, -0.03, 0.3], dtype=D)
+
+    def curve(points: torch.Tensor) -> torch.Tensor:
+        steps = points.squeeze(-1)
+        return (zeros - steps) / (1 + bends * steps)
+
+    one = torch.ones(7, dtype=D)
+    found = _steps_to_zero(Line(), curve, zeros, one.unsqueeze(-1), one)
+    torch.testing.assert_close(found, zeros.clamp(max=folded.FAR), rtol=0, atol=0.05)  # 0.032, of the one at 11
 
 
 def test_nothing_measured() -> None:

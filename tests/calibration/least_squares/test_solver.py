@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 import torch
 
+from diffproj.calibration.least_squares.damping import DampingControl
 from diffproj.calibration.least_squares.losses import Cauchy, Huber, SoftL1
 from diffproj.calibration.least_squares.solver import Prior, Status, damped_step, solve
 
@@ -253,3 +255,14 @@ def test_losses(loss: Huber | SoftL1 | Cauchy) -> None:
     assert float(loss.weight(squared)[0].detach()) == 1
     with pytest.raises(ValueError, match="scale: want a positive number"):
         type(loss)(0.0)
+
+
+def test_a_step_that_leaves_nothing_to_gain_is_the_last() -> None:
+    """Each step gains a tenth of the one before: the one after the current may be within the tolerance already."""
+    tolerance, cost = 1e-10, np.ones(2)
+    control = DampingControl(cost, np.zeros(2))
+    first = np.array([9e-9, 9e-8])
+    assert not control.stop(first, tolerance).any()
+    assert control.stop(0.1 * first, tolerance).tolist() == [True, False]  # the next gain 9e-11 and 9e-10
+    assert control.stop(0.01 * first, tolerance).tolist() == [False, True]
+    assert control.status.tolist() == [Status.CONVERGED] * 2

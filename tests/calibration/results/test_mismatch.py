@@ -135,6 +135,20 @@ def test_false_alarms_are_rare(corners: int) -> None:
         assert int(found.mismatch.doubtful.sum()) <= most
 
 
+def test_four_corners_are_no_alarm_by_chance(calibration: dp.Calibration) -> None:
+    """Of 400 views of the camera's own, with noise as in its calibration, at most 1 % are doubtful."""
+    generator = torch.Generator().manual_seed(0)
+    ends = [0, 8, 45, 53]
+    exact, _ = calibration.cameras[3].project(BOARD.points[ends].to(D))
+    noise = float(calibration.pixel_sigma) * torch.randn(400, 4, 2, generator=generator, dtype=D)  # type: ignore[arg-type]
+    pixels = torch.zeros(400, 54, 2, dtype=D)
+    pixels[:, ends] = exact + noise
+    visible = torch.zeros(400, 54, dtype=torch.bool)
+    visible[:, ends] = True
+    found, _ = located(dp.Views(pixels, visible, size=LEFT.size), BOARD, calibration)
+    assert int(found.mismatch.doubtful.sum()) <= 4
+
+
 def test_error_bars_hold_the_other_camera(calibration: dp.Calibration) -> None:
     """Points 60 mm above the board. Measured: 98 % within 1.96 deviations; without the scale, 81 %."""
     truth = dp.calibrate(RIGHT, BOARD)

@@ -182,6 +182,15 @@ def test_the_bundled_pair() -> None:
     assert (placed - there).norm(dim=-1).mean() < 0.8 * (flat.triangulate(seen).points - flat_there).norm(dim=-1).mean()
 
 
+def test_held_out_moments_are_met_by_the_board_as_it_was_printed() -> None:
+    """Exact corners leave nothing over, at moments that were held out too; as a flat board they leave pixels."""
+    views, _ = scene(noise=0.0)
+    errors = dp.cross_validate_rig(views, BOARD, "none", folds=2, shape="free")
+    assert float(errors.held_out_px.amax()) < 1e-6
+    flat = dp.cross_validate_rig(views, BOARD, "none", folds=2)
+    assert float(flat.held_out_px.amin()) > 1
+
+
 @pytest.mark.slow
 def test_held_out_moments_of_the_bundled_pair() -> None:
     errors = dp.cross_validate_rig(BUNDLED, dp.Chessboard(), shape="free")

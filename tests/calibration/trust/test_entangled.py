@@ -61,6 +61,22 @@ def test_skew_alone_is_told(lens: Any) -> None:
     assert off(found, dp.calibrate(dp.example_views("left"), BOARD, lens)) < 1
 
 
+@pytest.mark.parametrize("poorer", [False, True], ids=["simplest", "poorer"])
+def test_of_what_may_be_held_the_first_that_tells(poorer: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without s2 and s4 the camera is the same, without all four another one.
+
+    Where the simplest camera is sought that corners hardly tell from this one, it is the first, and nothing is in doubt;
+    where the lens is doubted, whichever moves the principal point.
+    """
+    some, every = ("s2", "s4"), ("s1", "s2", "s3", "s4")
+    for choices in ([some, every], [every, some]):
+        monkeypatch.setattr(entangled, "_together", lambda _, choices=choices: [] if poorer else choices)
+        monkeypatch.setattr(entangled, "_poorer_lenses", lambda _, choices=choices: choices if poorer else [])
+        monkeypatch.setattr(entangled, "_adrift", lambda found: torch.ones_like(found.pixel_sigma(), dtype=torch.bool))
+        found = dp.calibrate(dp.example_views("right"), BOARD, "brown12")
+        assert (f"{HARDLY} s1, s2, s3, s4 from c_x" in found.message) == (poorer or choices[0] == every)
+
+
 def test_what_is_held_or_known_is_not_in_doubt() -> None:
     prism = ("s1", "s2", "s3", "s4")
     views = dp.example_views("right")

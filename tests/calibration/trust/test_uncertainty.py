@@ -167,6 +167,21 @@ def test_dispersion_is_one_where_there_is_nothing_to_compare() -> None:
     assert dp.calibrate(dp.Views(exact, size=(640, 480)), BOARD, "brown4").covariance.shared.isfinite().all()
 
 
+def test_dispersion_of_two_views_and_of_one_with_a_prior() -> None:
+    """Two views see the same board bent in two ways; one view contradicts a prior, but no other view."""
+    cameras = scene(2)
+    generator = torch.Generator().manual_seed(4)
+    noise = 0.02 * torch.randn(20, 2, 54, 2, generator=generator, dtype=D) + waves(20, 0.3, generator)[:, :2]
+    exact, _ = cameras.project(BOARD.points)
+    both, first = (dp.Views(pixels, size=(640, 480)) for pixels in (exact + noise, (exact + noise)[:, :1]))
+    start = cameras[0].without_pose()
+    two = dp.refine(both, BOARD, start, fixed=("principal_point", "distortion"))
+    assert float(two.covariance.dispersion.median()) > 2
+    known = {"f_x": (1.1 * start.K[0, 0], 0.001), "f_y": (1.1 * start.K[1, 1], 0.001)}
+    one = dp.refine(first, BOARD, start, fixed=("principal_point", "distortion"), priors=known)
+    assert bool((one.covariance.dispersion == 1).all())
+
+
 def test_dispersion_does_not_depend_on_units_order_or_batch() -> None:
     views = dp.example_views("right")
     found = dp.calibrate(views, BOARD).covariance.dispersion
