@@ -11,7 +11,7 @@ from diffproj.calibration.problem.parametrisation import Parametrisation
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.cli.known_beforehand import FOCAL, PLACE, POSE, Known
 from diffproj.geometry.camera import Camera
-from diffproj.geometry.mounting import rotation_from_mounting
+from diffproj.geometry.mounting import mounting_of, rotation_from_mounting
 
 Calibrated = TypeVar("Calibrated", Camera, Calibration)
 
@@ -48,7 +48,7 @@ def posed(camera: Calibrated, known: Sequence[Known]) -> Calibrated:
         return replace(camera, camera=posed(camera.camera, known))
     camera = camera.upright().to(torch.float64)
     said = {one.name: camera.K.new_tensor(one.value) for one in known}
-    own = camera._mounting()
+    own = mounting_of(camera)
     values = dict(zip(POSE, (own.tilt, own.roll, own.heading, *own.position.unbind(-1), own.height), strict=True))
     values |= {name: value for name, value in said.items() if name in POSE}
     R = rotation_from_mounting(values["tilt"], values["roll"], values["heading"])

@@ -83,7 +83,10 @@ def warn_if_shown_turned(path: Path, orientation: Orientation, pixels: str) -> N
     """
     if orientation == "upright":
         return
-    data = np.frombuffer(_named(path)[0].read_bytes(), dtype=np.uint8)
+    content = _named(path)[0].read_bytes()
+    if b"Exif" not in content and b"eXIf" not in content:
+        return
+    data = np.frombuffer(content, dtype=np.uint8)
     small = cv2.IMREAD_REDUCED_GRAYSCALE_8  # a copy is enough to see a turn, and decodes fast
     with _silent_opencv():
         recorded, shown = (cv2.imdecode(data, flags) for flags in (small | cv2.IMREAD_IGNORE_ORIENTATION, small))

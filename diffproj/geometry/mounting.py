@@ -175,14 +175,15 @@ class Mounted(CameraParts):
                 "mounting: the camera has no pose, and counts as looking straight up from the origin; the camera of a "
                 "calibration has none, its cameras have one for each view"
             )
-        return self._mounting()
+        return mounting_of(own)
 
-    def _mounting(self) -> Mounting:
-        """The same without a warning, as for a camera from which a pose is sought."""
-        camera: Any = self.upright()  # type: ignore[attr-defined]
-        tilt, roll, heading = mounting_from_rotation(camera.R)
-        x, y, height = camera.center.unbind(-1)
-        return Mounting(height, tilt, roll, heading, torch.stack([x, y], dim=-1))
+
+def mounting_of(camera: Any) -> Mounting:
+    """That of a camera that may have no pose yet, without a warning, as where one is sought from there."""
+    camera = camera.upright()
+    tilt, roll, heading = mounting_from_rotation(camera.R)
+    x, y, height = camera.center.unbind(-1)
+    return Mounting(height, tilt, roll, heading, torch.stack([x, y], dim=-1))
 
 
 def rotation_from_mounting(

@@ -183,6 +183,7 @@ def test_prior_of_a_calibration_with_skew() -> None:
     assert float(prior(camera)) > 0.5 / deviation**2
 
 
+@pytest.mark.filterwarnings("ignore:measure. pixel .* outside of the photograph")
 @pytest.mark.parametrize("degrees", [0, 90, 25])
 def test_error_bars_of_a_camera_alone_follow_its_whole_K(degrees: float) -> None:
     """Against the derivative of the back-projection, for K with skew and for a turned image."""

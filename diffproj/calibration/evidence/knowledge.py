@@ -14,6 +14,7 @@ from diffproj.calibration.least_squares.solver import Prior
 from diffproj.calibration.problem.constraints import Priors, check_focal
 from diffproj.calibration.problem.parametrisation import POSE, Parametrisation
 from diffproj.geometry.camera import Camera
+from diffproj.geometry.mounting import mounting_of
 
 MOST_TILT = 180.0
 """Tilt in degrees beyond which it is none; between 90 and this a camera leans over backwards."""
@@ -203,7 +204,7 @@ def _check_steep(camera: Camera, known: Knowledge) -> None:
     if not known.angles or "roll" not in said:
         return
     tilt = said["tilt"].mean if "tilt" in said else None
-    steep = camera._mounting().tilt if tilt is None else tilt
+    steep = mounting_of(camera).tilt if tilt is None else tilt
     if bool((steep.detach().abs() > STEEPEST).any()):
         raise ValueError(
             "priors: want turn_x, turn_y and turn_z, degrees about the camera's own axes, for a camera that looks "

@@ -17,7 +17,7 @@ from diffproj.calibration.evidence.observations import Heights, Horizon, Lengths
 from diffproj.calibration.evidence.pose_parameters import PLACE
 from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.geometry.camera import Camera
-from diffproj.geometry.mounting import rotation_from_mounting
+from diffproj.geometry.mounting import mounting_of, rotation_from_mounting
 
 TILTS = (-10.0, 2.0, 5.0, 10.0, 17.0, 27.0, 40.0, 55.0, 70.0, 85.0)
 STEPS = 12
@@ -68,7 +68,7 @@ def starts(
 
 def _directions(known: Knowledge, camera: Camera, begin: Tensor, rolls: bool, turns: bool) -> Tensor:
     """Tilt, roll and heading `(K, P, 3)`: all around where nothing is known of them."""
-    own = torch.stack(camera._mounting()[1:4], dim=-1)
+    own = torch.stack(mounting_of(camera)[1:4], dim=-1)
     if known.angles:
         own = begin[:, -POSE:-3]
     given = [known.angles and known.given(name) for name in ("tilt", "roll", "heading")]

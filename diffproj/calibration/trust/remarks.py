@@ -102,10 +102,12 @@ def remarks(
     which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
     if len(which):
         left, groups = leftover(found, which, SIGNIFICANT), two_groups(found, which)
-        wrong, turned = prior_contradictions(found, which), turned_photographs(found, which, sizes)
+        wrong = prior_contradictions(found, which)
+        # What is known beforehand and does not fit holds the camera where turned photographs would fit better.
+        turned = turned_photographs(found, which, sizes) if found.measured_precision() is None else {}
         for i, p in enumerate(map(int, which.tolist())):
             saved = groups[p].saved if p in groups else 0.0
-            if p in turned:  # all else may come from that
+            if p in turned and turned[p].saved > _otherwise(left, i, wrong.get(p)):  # all else may come from that
                 said[p].append(_turned(names[p], turned[p]))
                 continue
             if p in wrong:
@@ -121,6 +123,13 @@ def remarks(
                 remark = None if remark is not None and remark.kind in OF_THE_CAMERA else remark
             said[p] += [] if remark is None else [remark]
     return tuple(map(tuple, said))
+
+
+def _otherwise(left: Leftover, i: int, wrong: PriorContradiction | None) -> float:
+    """The part of the sum of squares that another single cause explains, of those that one number or two describe."""
+    effects = (left.skew, left.bow, left.print)
+    shares = (float(effect.share[i]) for effect in effects if counts(effect, i, 0.0))
+    return max(0.0 if wrong is None else wrong.saved, *shares, 0.0)
 
 
 def _of_the_prior(wrong: PriorContradiction) -> Remark:
