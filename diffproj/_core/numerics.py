@@ -183,11 +183,6 @@ def entries(matrix: Tensor) -> list[list[Tensor]]:
     return [list(row.unsqueeze(-1).unbind(-2)) for row in matrix.unbind(-2)]
 
 
-def plus_product(total: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """`total + a b`: in one operation, but for a compiled graph, where Inductor would multiply by 1 as well."""
-    return total + a * b if torch.compiler.is_compiling() else torch.addcmul(total, a, b)
-
-
 def linear(rows: Sequence[Sequence[Tensor]], components: Sequence[Tensor | None]) -> list[Tensor]:
     """Multiply small matrices with many vectors that are given component by component.
 
@@ -206,7 +201,7 @@ def linear(rows: Sequence[Sequence[Tensor]], components: Sequence[Tensor | None]
     for row in rows:
         product = first * row[0]
         for entry, component in zip(row[1:], others, strict=True):
-            product = product + entry if component is None else plus_product(product, component, entry)
+            product = product + entry if component is None else torch.addcmul(product, component, entry)
         products.append(product)
     return products
 

@@ -45,14 +45,13 @@ from diffproj._core.warn import warn_caller
 from diffproj.geometry import description
 from diffproj.geometry.camera import Camera, as_camera, meeting_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
-from diffproj.geometry.intrinsics import normalised, normalised_fused, pixel_to_normalized
+from diffproj.geometry.intrinsics import normalised, pixel_to_normalized
 from diffproj.geometry.map_views import MapViews
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.geometry.plane_kernel import components, denominator_and_threshold, direct, intersection, recorded
 from diffproj.geometry.plane_matrix import plane_matrix
 from diffproj.lens.brown_conrady import BrownConrady
 from diffproj.lens.coefficients import CoefficientLens
-from diffproj.lens.compiling import fused, in_memory
 from diffproj.lens.slopes import by_direction
 
 
@@ -220,16 +219,12 @@ class PlaneMap(MapViews, Copied, Shown):
             reasons = torch.where(seen, reasons, Reason.OUTSIDE_LENS)
         return (torch.where(pixels.isfinite().all(dim=-1), reasons, Reason.NOT_FINITE),)
 
-    def _sight(self, pixels: Tensor) -> tuple[Any, Tensor | None]:
-        """The p of a pinhole or behind a lens, or its components, and where there is one (`None`: everywhere)."""
+    def _sight(self, pixels: Tensor) -> tuple[Tensor, Tensor | None]:
+        """The p of a pinhole or behind a lens, and where the lens has an inverse (`None`: everywhere)."""
         lens = self.camera.distortion
         if lens is None:
-            p = pixels - self.camera.K.select(-1, 2).narrow(-1, 0, 2).unsqueeze(-2)
-            return [*map(in_memory, p.unbind(-1)), None] if fused(p, self.matrix) else p, None
+            return pixels - self.camera.K.select(-1, 2).narrow(-1, 0, 2).unsqueeze(-2), None
         if isinstance(lens, BrownConrady) and type(lens) is BrownConrady:  # one derived from it may go back otherwise
-            if fused(pixels, *self.camera.tensors()):
-                x, y, seen = lens.undistort_fused(*normalised_fused(pixels, self.camera.K))
-                return [x, y, None], seen
             xy, finite = normalised(pixels, self.camera.K)
             xy, seen = lens.undistort_apart(xy)
             return xy, seen & finite

@@ -75,15 +75,6 @@ def normalised(
     return side_by_side(linear(entries(pixel_to_normalized(K)), offset)), finite
 
 
-def normalised_fused(pixels: Tensor, K: Tensor) -> list[Tensor]:
-    """Both components `(*B, N)`, for what is compiled into one loop; NaN where a pixel is not finite."""
-    center = K[..., :2, 2].unsqueeze(-1).unbind(-2)
-    u, v = pixels.unbind(-1)
-    finite = torch.maximum(u.abs(), v.abs()) < torch.finfo(pixels.dtype).max ** SQUARED
-    offset = [torch.where(finite, part - middle, torch.nan) for part, middle in zip((u, v), center, strict=True)]
-    return linear(entries(pixel_to_normalized(K)), offset)
-
-
 def _normalised_short(pixels: np.ndarray, K: np.ndarray, limit: float) -> tuple[Tensor, Tensor]:
     """The same of few pixels, in NumPy."""
     a, b, c, d = (K[..., row, column, None] for row in (0, 1) for column in (0, 1))

@@ -16,35 +16,30 @@ from torch import Tensor
 from diffproj._core.numerics import all_true, entries, interleaved, is_short, linear
 from diffproj._core.torch_private import has_storage
 from diffproj.geometry.plane_kernel_short import divided, gradient
-from diffproj.lens.compiling import in_bytes
-
-Vectors = Tensor | list[Tensor | None]
 
 
-def components(p: Vectors) -> list[Tensor | None]:
+def components(p: Tensor) -> list[Tensor | None]:
     """The three components of vectors `(*B, N, 3)`, or of `(*B, N, 2)` and a constant 1, for which `None` stands."""
-    if isinstance(p, list):
-        return p
     return [*p.unbind(-1), *[None] * (3 - p.shape[-1])]
 
 
 # ---------------------------------------------------------------------------------------------------------- recorded
 
 
-def recorded(p: Vectors, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor]:
+def recorded(p: Tensor, matrix: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor]:
     """Points `(*B, N, 3)`, zero where not valid, and `valid (*B, N)`.
 
     Args:
-        p: centred pixels `(*B, N, 2)`, or directions `(*B, N, 3)`, or their `components`.
+        p: centred pixels `(*B, N, 2)`, or directions `(*B, N, 3)`.
         matrix: `[A; b; s] (*B, 5, 3)`.
         seen: where the lens has an inverse `(*B, N)`; `None`: everywhere.
     """
     _, points, _, valid = intersection(p, matrix, seen)
-    return interleaved(points), in_bytes(valid)
+    return interleaved(points), valid
 
 
 def intersection(
-    p: Vectors, matrix: Tensor, seen: Tensor | None
+    p: Tensor, matrix: Tensor, seen: Tensor | None
 ) -> tuple[list[Tensor | None], list[Tensor], Tensor, Tensor]:
     """The components of `p`, those of the points, `1 / (b . p)`, and which are valid; 0 where they are not."""
     *rows, _ = entries(matrix)

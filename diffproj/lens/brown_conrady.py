@@ -18,9 +18,9 @@ from diffproj._core.numerics import all_true, in_blocks, least_depth, rounding, 
 from diffproj.lens import brown_domain
 from diffproj.lens.brown_equations import COUNTS, Terms, bend, by_coefficients, radial, tilted
 from diffproj.lens.brown_gradient import follows_gradient, recorded, with_gradient
-from diffproj.lens.brown_inverse import search, search_fused, squared_domain
+from diffproj.lens.brown_inverse import search, squared_domain
 from diffproj.lens.coefficients import CoefficientLens
-from diffproj.lens.compiling import coordinates, derivative_wanted, fused, in_bytes
+from diffproj.lens.compiling import derivative_wanted
 from diffproj.lens.table import inverse_table
 
 LARGEST = 0.25
@@ -106,18 +106,8 @@ class BrownConrady(CoefficientLens, tensors={"coefficients": 1}):
             Undistorted points, and `valid`: a solution inside the domain was found. (0, 0) with zero gradient where
             not valid.
         """
-        if torch.compiler.is_compiling():
-            xy_distorted = self._checked("xy_distorted", xy_distorted, 2)
-            if fused(xy_distorted, self.coefficients):
-                x, y, valid = self.undistort_fused(*coordinates(xy_distorted))
-                return torch.stack([torch.where(valid, part, 0) for part in (x, y)], dim=-1), in_bytes(valid)
         xy, valid = self.undistort_apart(xy_distorted)
         return xy.contiguous(), valid
-
-    def undistort_fused(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The same by coordinates `(*B, N)`, for what is compiled into one loop; anything where not valid."""
-        plan = self._plan()
-        return search_fused(self._usable(plan.domain), plan, (x, y))
 
     def undistort_apart(
         self, xy_distorted: Float[Tensor, "*batch n 2"] | Array

@@ -21,7 +21,7 @@ from diffproj.lens.brown_equations import (
     term_growth,
 )
 from diffproj.lens.brown_global import EDGE_MARGIN, Pair, global_newton
-from diffproj.lens.compiling import coordinates, in_bytes, length_of, with_batch_in_front
+from diffproj.lens.compiling import coordinates, length_of, with_batch_in_front
 from diffproj.lens.domain import library_of
 from diffproj.lens.plan import Plan
 from diffproj.lens.polynomial import minus_product, plus_product, plus_quotient, polynomial
@@ -83,15 +83,15 @@ def search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, Te
     if readable and is_short(points) and coefficients.shape[-1] <= UNTILTED:
         _, (numbers, places, *parts) = arrays_of(coefficients, points, *plan)
         with np.errstate(all="ignore"):
-            tried = _tried(numbers, coordinates(places), Plan(*parts), points.dtype)
+            tried = _tried(numbers, places, Plan(*parts), points.dtype)
         x, y, start_x, start_y, possible, solved = map(torch.from_numpy, tried)
     else:
-        x, y, start_x, start_y, possible, solved = _tried(coefficients, coordinates(points), plan, points.dtype)
+        x, y, start_x, start_y, possible, solved = _tried(coefficients, points, plan, points.dtype)
     if all_true(solved):  # the usual case
         return x, y, solved
     batch = points.shape[:-2]
     lens = coefficients.expand(*batch, -1), plan.domain.expand(batch), plan.noise.expand(batch)
-    left = in_bytes(possible & ~solved)
+    left = possible & ~solved
     if torch.compiler.is_exporting():
         x_again, y_again, found = _solved_in_graph(*lens, points, start_x, start_y)
         return torch.where(solved, x, x_again), torch.where(solved, y, y_again), solved | (found & left)
@@ -100,29 +100,14 @@ def search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, Te
     return x, y, solved | found
 
 
-@torch.no_grad()
-def search_fused(coefficients: Tensor, plan: Plan, points: Pair) -> tuple[Tensor, Tensor, Tensor]:
-    """The same for the coordinates `(*B, N)` of points, as a loop of a compiled graph that holds all but the last step.
-
-    What it found is written over by that step, and a number stands for where it is a solution: masks and copies would
-    take as long as all the rest.
-    """
-    dtype, batch = points[0].dtype, points[0].shape[:-1]
-    x, y, _, _, possible, solved = _tried(coefficients, points, plan, dtype)
-    state = solved.to(dtype) - (possible & ~solved).to(dtype)
-    lens = coefficients.expand(*batch, -1), plan.domain.expand(batch), plan.noise.expand(batch)
-    _solve_remaining_in_place(*lens, *points, x, y, state)
-    return x, y, state > 0
-
-
-def _tried(coefficients: Values, points: Any, plan: Plan, dtype: torch.dtype) -> tuple[Values, ...]:
+def _tried(coefficients: Values, points: Values, plan: Plan, dtype: torch.dtype) -> tuple[Values, ...]:
     """From the start by a fixed number of Newton steps: tensors, or arrays of NumPy.
 
     Returns:
         `x` and `y`, those of the start, whether there may be a solution, and whether this is it: each `(*B, N)`.
     """
     terms = Terms.of(coefficients)
-    x, y = points
+    x, y = coordinates(points)
     ahead = None
     if terms.tilt is not None:
         x, y, inverse_depth = terms.tilt.undo(x, y)
@@ -315,43 +300,6 @@ def _rounded_and_checked(
     radius = in_float64(domain).unsqueeze(-1)
     solved = (length_of(off_x, off_y) <= FINAL_TOLERANCE * rounding) & (distance <= radius) & (radius > 0)
     return x_rounded, y_rounded, solved
-
-
-@torch.library.custom_op("diffproj::finish_brown_conrady", mutates_args=("x", "y", "state"))
-def _solve_remaining_in_place(
-    coefficients: Tensor,
-    domain: Tensor,
-    noise: Tensor,
-    x_distorted: Tensor,
-    y_distorted: Tensor,
-    x: Tensor,
-    y: Tensor,
-    state: Tensor,
-) -> None:
-    """`_solve_remaining` where the state is -1; it becomes 1 of those solved, as that of others, and 0 of the rest."""
-    if state.numel() == 0 or bool(state.amin() >= 0):  # the usual case
-        return
-    index = (state < 0).nonzero(as_tuple=True)
-    lens = _lens_of_each(index, coefficients, domain, noise)
-    u, v, start_x, start_y = (part[index].unsqueeze(-1) for part in (x_distorted, y_distorted, x, y))
-    everywhere = torch.ones_like(u, dtype=torch.bool)
-    found = _solve_remaining(*lens, torch.stack((u, v), dim=-1), start_x, start_y, everywhere)
-    for whole, part in zip((x, y, state), found, strict=True):
-        whole.index_put_(index, part.squeeze(-1).to(whole.dtype))
-
-
-@_solve_remaining_in_place.register_fake
-def _solve_remaining_nowhere(
-    coefficients: Tensor,  # noqa: ARG001
-    domain: Tensor,  # noqa: ARG001
-    noise: Tensor,  # noqa: ARG001
-    x_distorted: Tensor,  # noqa: ARG001
-    y_distorted: Tensor,  # noqa: ARG001
-    x: Tensor,  # noqa: ARG001
-    y: Tensor,  # noqa: ARG001
-    state: Tensor,  # noqa: ARG001
-) -> None:
-    return None
 
 
 @torch.library.custom_op("diffproj::solve_remaining_brown_conrady", mutates_args=())

@@ -24,7 +24,7 @@ from torch import Tensor
 from diffproj._core.arguments import Array
 from diffproj._core.numerics import has_values, in_blocks, in_float64, least_depth
 from diffproj.lens.coefficients import CoefficientLens
-from diffproj.lens.compiling import coordinates, derivative_wanted, in_bytes, length_of, with_batch_in_front
+from diffproj.lens.compiling import coordinates, derivative_wanted, length_of, with_batch_in_front
 from diffproj.lens.domain import first_failure
 from diffproj.lens.plan import Plan
 from diffproj.lens.polynomial import polynomial
@@ -249,7 +249,7 @@ def _search(coefficients: Tensor, plan: Plan, points: Tensor) -> tuple[Tensor, T
     settled = _settled(k, plan.noise.unsqueeze(-1), rho_squared, sigma)
     batch = points.shape[:-2]
     lens = coefficients.expand(*batch, -1), plan.domain.expand(batch), plan.noise.expand(batch)
-    left = in_bytes(possible & ~settled)
+    left = possible & ~settled
     if torch.compiler.is_exporting():
         sigma, found = _solved_in_graph(*lens, rho, sigma, left)
     else:

@@ -6,8 +6,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffproj._core.numerics import plus_product as in_one_step
-
 
 def polynomial(x: Any, coefficients: Sequence[Any]) -> Any:
     """`c0 + c1 x + c2 x^2 + ...` for coefficients that broadcast against `x`; `c0` itself if it is the only one."""
@@ -18,7 +16,7 @@ def polynomial(x: Any, coefficients: Sequence[Any]) -> Any:
         return total
     for number, coefficient in enumerate(reversed(coefficients[:-1])):
         # With two columns among its arguments `addcmul` takes twice the time of two operations.
-        total = in_one_step(coefficient, total, x) if number else total * x + coefficient
+        total = torch.addcmul(coefficient, total, x) if number else total * x + coefficient
     return total
 
 
@@ -32,7 +30,7 @@ def series(x: Tensor, coefficients: Sequence[float]) -> Tensor:
 
 def plus_product(total: Any, a: Any, b: Any) -> Any:
     """`total + a b`."""
-    return in_one_step(total, a, b) if isinstance(a, Tensor) else total + a * b
+    return torch.addcmul(total, a, b) if isinstance(a, Tensor) else total + a * b
 
 
 def plus_quotient(total: Any, a: Any, b: Any) -> Any:
