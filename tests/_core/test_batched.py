@@ -316,3 +316,10 @@ def test_deep_copies_of_results_of_a_computation() -> None:
     assert again.points.is_leaf
     length = copy.deepcopy(measured.lengths())
     assert torch.equal(length.interval()[0], measured.lengths().interval()[0])
+
+
+@pytest.mark.plain
+def test_planes_of_points_are_no_list_to_be_stacked() -> None:
+    planes = dp.Plane.per_point(torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
+    with pytest.raises(ValueError, match="^items: want several Camera, got"):
+        dp.Camera.stack(planes)  # type: ignore[arg-type]
