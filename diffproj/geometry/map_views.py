@@ -182,9 +182,10 @@ class MapViews:
         """The maps of the first batch axis, one after the other.
 
         Raises:
-            TypeError: there is no batch axis.
-            IndexError: there is one plane for each point.
+            TypeError: there is no batch axis, or there is one plane for each point.
         """
+        if self.is_per_point:
+            raise TypeError("map: want a batch of maps to go through, got planes per point")
         batch = broadcast_batches(map=self.matrix.shape[:-2], camera=self.camera.batch_shape)
         if not batch:
             raise TypeError("map: want a batch of maps to go through, got a single one")

@@ -7,6 +7,7 @@ A plane made of Python numbers alone, such as `Plane.z(0.0)`, has no dtype of it
 in PyTorch's arithmetic it takes on the dtype and device of the camera or points that it meets.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -193,6 +194,16 @@ class Plane(Batched, tensors={"normal": 1, "offset": 0}, constants=("is_per_poin
         if self.is_per_point:
             raise IndexError("plane: want a batch of planes to index, got planes per point; index normal and offset")
         return super().__getitem__(index)
+
+    def __iter__(self) -> Iterator["Plane"]:
+        """The planes of the first batch axis, one after the other.
+
+        Raises:
+            TypeError: there is no batch axis, or the planes belong to points.
+        """
+        if self.is_per_point:
+            raise TypeError("plane: want a batch of planes to go through, got planes per point; take normal and offset")
+        return super().__iter__()
 
     def _facts(self) -> list[str]:
         if self.batch_shape or not has_values(self.normal):

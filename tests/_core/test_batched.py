@@ -321,5 +321,5 @@ def test_deep_copies_of_results_of_a_computation() -> None:
 @pytest.mark.plain
 def test_planes_of_points_are_no_list_to_be_stacked() -> None:
     planes = dp.Plane.per_point(torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
-    with pytest.raises(ValueError, match="^items: want several Camera, got"):
+    with pytest.raises(TypeError, match="^items: want several Camera, got"):
         dp.Camera.stack(planes)  # type: ignore[arg-type]
