@@ -379,14 +379,11 @@ def listing(name: str, value: Iterable[Any], want: str) -> list[Any]:
 
     Raises:
         TypeError: it has none.
-        ValueError: it has some, but they cannot be taken apart.
     """
     try:
         return list(None if isinstance(value, str | bytes | type) else value)  # type: ignore[arg-type]
     except TypeError:
         raise TypeError(f"{name}: want {want}, got {called(value)}") from None
-    except (IndexError, ValueError) as error:  # of a batch that cannot be taken apart
-        raise ValueError(f"{name}: want {want}, got {called(value)}: {error}") from error
 
 
 def _listed(given: Any) -> str:

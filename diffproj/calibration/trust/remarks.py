@@ -107,7 +107,7 @@ def remarks(
         turned = turned_photographs(found, which, sizes) if found.measured_precision() is None else {}
         for i, p in enumerate(map(int, which.tolist())):
             saved = groups[p].saved if p in groups else 0.0
-            if p in turned and turned[p].saved > _otherwise(left, i, wrong.get(p)):  # all else may come from that
+            if p in turned and turned[p].saved > _otherwise(left, i):  # all else may come from that
                 said[p].append(_turned(names[p], turned[p]))
                 continue
             if p in wrong:
@@ -125,11 +125,10 @@ def remarks(
     return tuple(map(tuple, said))
 
 
-def _otherwise(left: Leftover, i: int, wrong: PriorContradiction | None) -> float:
+def _otherwise(left: Leftover, i: int) -> float:
     """The part of the sum of squares that another single cause explains, of those that one number or two describe."""
     effects = (left.skew, left.bow, left.print)
-    shares = (float(effect.share[i]) for effect in effects if counts(effect, i, 0.0))
-    return max(0.0 if wrong is None else wrong.saved, *shares, 0.0)
+    return max((float(effect.share[i]) for effect in effects if counts(effect, i, 0.0)), default=0.0)
 
 
 def _of_the_prior(wrong: PriorContradiction) -> Remark:
