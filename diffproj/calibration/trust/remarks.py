@@ -107,7 +107,9 @@ def remarks(
         turned = turned_photographs(found, which, sizes) if found.measured_precision() is None else {}
         for i, p in enumerate(map(int, which.tolist())):
             saved = groups[p].saved if p in groups else 0.0
-            if p in turned and turned[p].saved > _otherwise(left, i):  # all else may come from that
+            if p in turned and turned[p].saved > max(
+                BETTER * saved, _otherwise(left, i)
+            ):  # all else may come from that
                 said[p].append(_turned(names[p], turned[p]))
                 continue
             if p in wrong:
@@ -126,8 +128,8 @@ def remarks(
 
 
 def _otherwise(left: Leftover, i: int) -> float:
-    """The part of the sum of squares that another single cause explains, of those that one number or two describe."""
-    effects = (left.skew, left.bow, left.print)
+    """The part of the sum of squares that a lens of another kind, skew, a bent or a stretched board explains alone."""
+    effects = (left.radial, left.skew, left.bow, left.print)
     return max((float(effect.share[i]) for effect in effects if counts(effect, i, 0.0)), default=0.0)
 
 

@@ -11,8 +11,9 @@ Unlike two cameras of any kind, this costs no parameter, so that it may be judge
 of the residuals and the dispersion, both of the better choice, it is the square of a normal variable's deviations if
 the photographs are not turned. The shape of a target stays as it was found.
 
-What is amiss otherwise may look alike: a skew, a bent board or one of a wrong width, and a prior that does not fit. So
-`remarks` asks for more than these explain, and does not ask at all where there is a prior.
+What is amiss otherwise may look alike: a lens that the model lacks, skew, a bent board or one of a wrong width, two
+cameras, and a prior that does not fit. So `remarks` wants more than these explain (of two cameras, nearly as much), and
+does not ask at all where there is a prior.
 """
 
 from collections.abc import Sequence
