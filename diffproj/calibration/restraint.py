@@ -7,9 +7,9 @@ starts from, 0 if it has none, as little as makes the lens one-to-one over its c
 nothing by this, a restrained lens does not end above the poorer one either.
 
 Of several minima without restraint one may make sense. A factor that stands both above and below the line changes
-nothing, and leads away from the poles: the poorer lens with such factors is where the solver starts again. Only where
-all of that folds are the terms held. Then the valley is short, and its lowest place is found; from there they are let
-go step by step, as long as the lens does not fold.
+nothing, and leads away from the poles: the poorer lens with such factors is where the solver starts again. And the
+terms are held: then the valley is short, and its lowest place is found; from there they are let go step by step, as
+long as the lens does not fold. Either may end lower, so that both are done.
 """
 
 import math
@@ -116,9 +116,6 @@ def restrained(
         costs = torch.where(folds, torch.inf, _data_cost(near)).reshape(count, -1)
         near = near.part(costs.argmin(0) * len(which) + torch.arange(len(which), device=which.device)).solution
         weighed(which, fit(given.part(which), near.shared, near.local, reject=reject, **steps))
-        which = which[reached[which] < 1]
-        if len(which) == 0:
-            return best
     first, sound = tried(which, FIRST, start.part(which))
     up, near = which[sound], first.part(sound.nonzero().flatten())
     for strength in LOOSER:
