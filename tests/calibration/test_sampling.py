@@ -152,6 +152,7 @@ def test_with_the_plane_objective() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*another camera, zoom or focus:UserWarning")  # false alarms, of thousands
+@pytest.mark.filterwarnings("ignore:measure. pixel .* outside of the photograph")
 def test_located_photographs() -> None:
     """New photographs, each located with a calibration of its own: both uncertainties are in."""
     cameras = truth()
