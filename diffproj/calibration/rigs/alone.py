@@ -201,7 +201,7 @@ def _located(asked: Asked, name: str) -> Alone:
     if fixed:  # what is held stays as it was given
         shared = held_at(shared.unsqueeze(0), shared.unsqueeze(0), found.parameters, fixed)[0]
     seen = Seen(shared, *data.frame.pose(R, t), found.used)
-    return Alone(found.parameters, seen, float(found.rms), str, partial(_others, found))
+    return Alone(found.parameters, seen, float(found.rms), str, partial(getattr, found, "other_poses"))
 
 
 def _calibrated(
@@ -247,18 +247,13 @@ def _calibrated(
         data, count = own[row], len(own[row].views)
         R, t = found.cameras.R[row, :count].detach(), found.cameras.t[row, :count].detach()
         seen = Seen(shared[row], *data.frame.pose(R, t), found.used[row, :count])
-        late: tuple[Callable[[], str], Callable[[], OtherPoses]]
-        if len(asked) == 1:
-            late = partial(_remark, found, row), partial(_others, found, (row, slice(count)))
-        else:  # a rig carries along what is of its own cameras alone
-            part = _Part(first.who, data, fit.alone(row, count))
-            late = part.remark, part.others
-        results.append(Alone(found.parameters, seen, rms[row], *late))
+        part = _Part(first.who, data, fit.alone(row, count))
+        results.append(Alone(found.parameters, seen, rms[row], part.remark, part.others))
     return results
 
 
 class _Part:
-    """One camera of a batch, as it would be alone."""
+    """One camera of a batch, as it would be alone, with its views by their names; a rig carries it along."""
 
     def __init__(self, who: str, data: Data, fit: Fit) -> None:
         self._given = who, data, fit
@@ -293,12 +288,3 @@ def _refusal(asked: Asked, name: str, options: Options) -> CalibrationError:
         f"with fixed=({name + '.intrinsics'!r},)",
         found,
     )
-
-
-def _others(found: Calibration, which: tuple[int | slice, ...] = ()) -> OtherPoses:
-    others = found.other_poses
-    return OtherPoses(others.R[which], others.t[which], others.ratio[which])
-
-
-def _remark(found: Calibration, number: int) -> str:
-    return found.remarks[number]

@@ -356,3 +356,17 @@ def test_landmarks_in_space_are_a_target() -> None:
         assert errors.held_out_world.amax() < 0.7 * 8 / 900
     with pytest.raises(ValueError, match="shape: want 'flat' for points that are not all on z = 0, got 'free'"):
         dp.calibrate_rig(views, dp.Landmarks(cage), "none", shape="free")
+
+
+def test_what_is_said_of_a_camera_alone_names_its_own_photographs() -> None:
+    """By the moments that they have names of, and not by their place among those that the camera has seen."""
+    views = {side: dp.example_views(side) for side in ("left", "right")}
+    kept = [0, 1, 3, 4, 5, 7, 8, 9, 10, 11, 12]
+    pixels = views["left"].pixels[kept].to(torch.float64)
+    pixels[[2, 7]] = torch.tensor([639.0, 479.0], dtype=torch.float64) - pixels[[2, 7]]  # turned, those of 3 and 9
+    given = {
+        "left": dp.Views(pixels, names=tuple(f"moment {k}" for k in kept), size=(640, 480)),
+        "right": dp.Views(views["right"].pixels, names=tuple(f"moment {k}" for k in range(13)), size=(640, 480)),
+    }
+    remarks = dp.calibrate_rig(given, dp.Chessboard(), throw=False).remarks
+    assert any(one.startswith("left, on its own: moment 3 and moment 9 are turned by 180 degrees") for one in remarks)
