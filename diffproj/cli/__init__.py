@@ -79,7 +79,7 @@ def shielded(arguments: Sequence[str]) -> list[str]:
 
     A single negative number needs no shield. `--points=-5,3` comes apart: argparse would take nothing behind it along.
     """
-    apart = (re.fullmatch(r"(--[a-z-]+)=([-.\d][^,]*,.*)", text) for text in arguments)
+    apart = (re.fullmatch(r"(--[a-z-]+)=(-?[.\d][^,]*,.*)", text) for text in arguments)
     parts = [
         part for text, found in zip(arguments, apart, strict=True) for part in (found.groups() if found else [text])
     ]

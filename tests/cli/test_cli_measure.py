@@ -352,6 +352,7 @@ def test_lists_of_numbers_are_no_options() -> None:
         "-1",
         "5,-3",
     ]
+    assert shielded(["--csv=-a,b.csv"]) == ["--csv=-a,b.csv"]
 
 
 def test_equations_and_quantities_for_people() -> None:
