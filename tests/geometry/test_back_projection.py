@@ -387,7 +387,7 @@ def test_maps_one_after_the_other(camera: dp.Camera, pixels: Tensor) -> None:
     with pytest.raises(TypeError, match="map: want a batch of maps to go through, got a single one"):
         list(dp.PlaneMap(camera, planes[0]))
     per_point = dp.Plane.per_point([0.0, 0.0, 1.0], torch.zeros(len(pixels), dtype=D))
-    with pytest.raises(IndexError, match="map: want a batch of maps to index, got planes per point"):
+    with pytest.raises(TypeError, match="map: want a batch of maps to go through, got planes per point"):
         list(dp.PlaneMap(camera, per_point))
 
 
