@@ -68,6 +68,7 @@ def test_the_paper_experiment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     assert found["off_plane"] < 1e-9
 
 
+@pytest.mark.slow
 def test_refining_a_calibration(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     found = outcome(
         "02_refine_a_calibration",

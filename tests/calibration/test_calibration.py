@@ -176,7 +176,7 @@ def test_rms_of_corners_refined_in_windows_of_five(side: str, rms: float) -> Non
     assert float(dp.calibrate(views, BOARD).rms) == pytest.approx(rms, abs=2e-4)
 
 
-@pytest.mark.parametrize("model", ["brown12", "brown14"])
+@pytest.mark.parametrize("model", ["brown12", pytest.param("brown14", marks=pytest.mark.slow)])
 def test_long_lenses_are_found(model: LensModel) -> None:
     coefficients = [-0.25, 0.05, 0.001, 0.0005, 0.01, 0.02, -0.01, 0.005, 0.002, -0.001, 0.001, 0.0005, 0.02, -0.03]
     lens = dp.BrownConrady(torch.tensor(coefficients[: 12 if model == "brown12" else 14], dtype=D))
@@ -745,7 +745,7 @@ def swapped(views: dp.Views) -> dp.Views:
         (lambda v: parallel_views(0.5), {"distortion": "none"}, "do not determine .*: all views are parallel"),
         (mirrored, {}, "show the board mirrored: number the corners of each row from the other end"),
         (one_mirrored, {}, "left03.jpg shows the board mirrored"),
-        (swapped, {}, "do not match the board: are its columns and rows right"),
+        pytest.param(swapped, {}, "do not match the board: are its columns and rows right", marks=pytest.mark.slow),
         (lambda v: v.hiding(torch.arange(54) >= 3), {}, "no view shows at least 4 corners"),
         (lambda v: v.hiding(torch.arange(54) >= 9), {}, "calibrate: "),
         (lambda v: dp.Views(torch.full((3, 54, 2), 100.0), size=(640, 480)), {}, "calibrate: "),

@@ -54,10 +54,11 @@ def residual(
     return (projected - pixels).mT
 
 
-LONG = [pytest.param(name, marks=pytest.mark.slow) if name in ("brown8", "brown12") else name for name in MODELS]
+LONG = ("brown8", "brown12", "brown14")
+LENSES = [pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in MODELS]
 
 
-@pytest.mark.parametrize("lens", LONG)
+@pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize("skew", [False, True])
 @pytest.mark.parametrize(("kind", "bow"), [(Reprojection, False), (Reprojection, True), (BoardError, False)])
 def test_jacobians_are_autograds(kind: type[Reprojection], lens: LensModel, bow: bool, skew: bool) -> None:

@@ -102,10 +102,10 @@ def test_rigs_of_another_structure_are_solved_by_themselves(
     ("options", "outliers"),
     [
         ({"reject_outliers": True}, 0.02),
-        ({"loss": dp.Huber(0.5)}, 0.02),
-        ({"shape": "bow"}, 0.0),
-        ({"shape": "free", "priors": {"points": 0.1}}, 0.0),
-        ({"fixed": ("k3", "cam1.principal_point")}, 0.0),
+        pytest.param({"loss": dp.Huber(0.5)}, 0.02, marks=pytest.mark.slow),
+        pytest.param({"shape": "bow"}, 0.0, marks=pytest.mark.slow),
+        pytest.param({"shape": "free", "priors": {"points": 0.1}}, 0.0, marks=pytest.mark.slow),
+        pytest.param({"fixed": ("k3", "cam1.principal_point")}, 0.0, marks=pytest.mark.slow),
         (
             {
                 "priors": {
@@ -117,7 +117,11 @@ def test_rigs_of_another_structure_are_solved_by_themselves(
             },
             0.0,
         ),
-        ({"weights": {"cam0": 16.0, "cam1": 30.0}, "priors": {"cam1.baseline": (800.0, 5.0)}}, 0.0),
+        pytest.param(
+            {"weights": {"cam0": 16.0, "cam1": 30.0}, "priors": {"cam1.baseline": (800.0, 5.0)}},
+            0.0,
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["outliers", "loss", "bow", "free", "fixed", "priors", "weights"],
 )

@@ -46,7 +46,9 @@ OPTIONS: dict[str, tuple[dict[str, Any], int]] = {
 }
 
 
-@pytest.mark.parametrize("kind", OPTIONS)
+@pytest.mark.parametrize(
+    "kind", [kind if kind in ("plain", "free") else pytest.param(kind, marks=pytest.mark.slow) for kind in OPTIONS]
+)
 def test_real_photographs_that_are_turned_are_named(kind: str) -> None:
     """Of the left camera, whose principal point is 22 px off the middle. With a free shape, two groups said nothing.
 
@@ -108,7 +110,7 @@ def test_simulated_ones_are_named_too() -> None:
     assert sum(f"{said(views.names, (2, 5))} {TURNED}" in remark for remark in remarks) >= 17
 
 
-@pytest.mark.parametrize("model", ["none", "brown4", "fisheye"])
+@pytest.mark.parametrize("model", [pytest.param("none", marks=pytest.mark.slow), "brown4", "fisheye"])
 def test_noise_and_a_wrong_lens_turn_nothing(model: Any) -> None:
     """Of few real views through no lens at all, 7 of 60 were accused before Student's t was asked."""
     for name in ("left", "right"):

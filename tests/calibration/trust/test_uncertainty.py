@@ -205,7 +205,8 @@ def test_a_file_of_an_earlier_version_has_no_dispersion() -> None:
     assert dp.Covariance.from_fields(fields).dispersion == 1
 
 
-@pytest.mark.parametrize("corners", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (6, 54))])
+@pytest.mark.slow
+@pytest.mark.parametrize("corners", [4, 6, 54])
 def test_few_corners_are_located_with_the_noise_of_the_calibration(corners: int) -> None:
     """Their own residuals hardly tell it: from four corners alone, intervals of 95 % held 86 %, or were far too wide."""
     cameras = scene(11)
