@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"diffproj: standard output: {error.strerror}; send it elsewhere", file=sys.stderr)
         return 1
     if unknown:
-        options.command_line.refuse(unknown)
+        options.command_line.refuse(unknown, given)
     if "check" in options:  # what options mean together
         options.check(options)
     from diffproj.cli.running import run

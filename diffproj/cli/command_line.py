@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import itertools
 import os
 import sys
 from collections.abc import Sequence
@@ -24,13 +25,20 @@ class CommandLine(argparse.ArgumentParser):
         self.print_usage(sys.stderr)
         self.exit(2, f"{self.prog}: {message.removeprefix('argument ')}\n")
 
-    def refuse(self, unknown: Sequence[str]) -> NoReturn:
-        """End with the mistake that these arguments are unknown, and with the options that are spelt alike."""
+    def refuse(self, unknown: Sequence[str], given: Sequence[str]) -> NoReturn:
+        """End with the mistake that these of the given arguments are unknown, and with the options that are meant."""
+        texts = [text.strip() for text in unknown]
+        flags = {
+            option: action.help for action in self._actions if action.nargs == 0 for option in action.option_strings
+        }
+        for option, value in itertools.pairwise(given):
+            if option in flags and value in texts:
+                self.error(f"{option}: takes no value, got {value!r}; it means: {flags[option]}")
         known = [option for action in self._actions for option in action.option_strings if option.startswith("--")]
-        meant = {text: difflib.get_close_matches(text.partition("=")[0], known, 1) for text in unknown}
+        meant = {text: difflib.get_close_matches(text.partition("=")[0], known, 1) for text in texts}
         alike = list(dict.fromkeys(option for options in meant.values() for option in options))
         remedy = f"did you mean {' and '.join(alike)}?" if alike else f"'{self.prog} --help' lists the options"
-        self.error(f"unrecognized arguments: {' '.join(map(str.strip, unknown))}; {remedy}")
+        self.error(f"unrecognized arguments: {' '.join(texts)}; {remedy}")
 
 
 def leave_output() -> None:

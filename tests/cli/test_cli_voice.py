@@ -184,6 +184,11 @@ def test_a_misspelt_option_is_told_from_the_right_one(capsys: pytest.CaptureFixt
     assert err.endswith("diffproj measure: unrecognized arguments: --hieght 3; did you mean --height?\n")
     code, _, err = run(capsys, "info", "camera.json", "another.json")
     assert err.endswith("unrecognized arguments: another.json; 'diffproj info --help' lists the options\n")
+    code, _, err = run(capsys, "measure", *PHOTO, *POINTS, "--csv", "points.csv")
+    assert code == 2
+    assert err.endswith(
+        "diffproj measure: --csv: takes no value, got 'points.csv'; it means: print one table for spreadsheets\n"
+    )
 
 
 @pytest.mark.parametrize(
