@@ -381,9 +381,10 @@ def listing(name: str, value: Iterable[Any], want: str) -> list[Any]:
         TypeError: it has none.
     """
     try:
-        return list(None if isinstance(value, str | bytes | type) else value)  # type: ignore[arg-type]
+        items = iter(None if isinstance(value, str | bytes | type) else value)  # type: ignore[arg-type]
     except TypeError:
         raise TypeError(f"{name}: want {want}, got {called(value)}") from None
+    return list(items)  # what fails while a generator runs is its own
 
 
 def _listed(given: Any) -> str:

@@ -32,7 +32,7 @@ class CommandLine(argparse.ArgumentParser):
             option: action.help for action in self._actions if action.nargs == 0 for option in action.option_strings
         }
         for option, value in itertools.pairwise(given):
-            if option in flags and value in texts:
+            if option in flags and value in texts and not value.startswith("-"):  # that is an option, misspelt
                 self.error(f"{option}: takes no value, got {value!r}; it means: {flags[option]}")
         known = [option for action in self._actions for option in action.option_strings if option.startswith("--")]
         meant = {text: difflib.get_close_matches(text.partition("=")[0], known, 1) for text in texts}

@@ -77,14 +77,15 @@ def warn_if_shown_turned(path: Path, orientation: Orientation, pixels: str) -> N
     """Warn where programs that follow a photograph's EXIF data show its pixels elsewhere than they are counted.
 
     Args:
-        path: the photograph.
+        path: the photograph, or a pattern that is its alone.
         orientation: how its pixels are counted.
         pixels: what holds pixels that somebody read off it, for the message.
     """
     if orientation == "upright":
         return
-    content = _named(path)[0].read_bytes()
-    if b"Exif" not in content and b"eXIf" not in content:
+    file = _named(path)[0]
+    content = file.read_bytes()
+    if not any(mark in content for mark in (b"Exif", b"eXIf", b"EXIF")):  # of JPEG, PNG, WebP
         return
     data = np.frombuffer(content, dtype=np.uint8)
     small = cv2.IMREAD_REDUCED_GRAYSCALE_8  # a copy is enough to see a turn, and decodes fast
@@ -92,12 +93,12 @@ def warn_if_shown_turned(path: Path, orientation: Orientation, pixels: str) -> N
         recorded, shown = (cv2.imdecode(data, flags) for flags in (small | cv2.IMREAD_IGNORE_ORIENTATION, small))
         if recorded is None or shown is None or np.array_equal(recorded, shown):
             return
-        rows, columns = decoded(path, orientation).shape
+        rows, columns = decoded(file, orientation).shape
     places = {1: f"({columns - 1} - y, x)", 2: f"({columns - 1} - x, {rows - 1} - y)", 3: f"(y, {rows - 1} - x)"}
     turns = [turn for turn in places if np.array_equal(np.rot90(recorded, turn), shown)]
     where = f": one that they show at (x, y) is {places[turns[0]]}" if len(turns) == 1 else ""
     warnings.warn(
-        f"{path}: its EXIF data ask programs to show it turned, and {pixels} count as the sensor recorded it, "
+        f"{file}: its EXIF data ask programs to show it turned, and {pixels} count as the sensor recorded it, "
         f"{columns} x {rows} px{where}",
         stacklevel=2,
     )

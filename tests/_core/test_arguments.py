@@ -1,14 +1,14 @@
 """Checks of arguments: messages that name the argument and all that was given."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 import torch
 
 import diffproj as dp
-from diffproj._core.arguments import called, first_of, number, numbers, whole_number
+from diffproj._core.arguments import called, first_of, listing, number, numbers, whole_number
 
 
 @pytest.mark.parametrize(
@@ -106,3 +106,12 @@ def test_tensors_that_are_not_dense_are_named(made: Callable[[torch.Tensor], tor
 def test_what_is_no_whole_number_is_refused_by_name(value: object) -> None:
     with pytest.raises(TypeError, match="^count: want a whole number, got"):
         whole_number("count", value)
+
+
+def test_what_fails_inside_a_generator_is_not_said_of_the_argument() -> None:
+    def photographs() -> Iterator[int]:
+        yield 1
+        raise TypeError("of its own")
+
+    with pytest.raises(TypeError, match="^of its own$"):
+        listing("photographs", photographs(), "files")

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import diffproj as dp
 from diffproj import synthetic
@@ -22,7 +23,9 @@ from diffproj.cli.inputs import HAND
 from diffproj.cli.measure_document import REASONS, between, listed
 from diffproj.cli.measure_plane import equation
 from diffproj.cli.measure_tables import coordinate, shown
+from diffproj.cli.photographs import warn_if_shown_turned
 from diffproj.measurement.choices import HAND_PX
+from diffproj.targets.images import decoded
 from tests.cli.commands import parser, runner
 from tests.targets.test_detection import with_orientation
 
@@ -564,3 +567,18 @@ def test_a_photograph_that_programs_show_turned_is_told(
         capsys, path, "--camera", "camera.json", *BOARD, "--points", CORNERS[0], "--orientation", "upright"
     )
     assert "EXIF" not in err
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+def test_what_is_shown_turned_is_told_of_every_format_that_is_turned(tmp_path: Path, suffix: str) -> None:
+    """And of a file that a pattern names."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    path = tmp_path / f"turned{suffix}"
+    Image.fromarray(cv2.imread("photo.png", cv2.IMREAD_GRAYSCALE)).save(path, exif=exif.tobytes())
+    turned = decoded(path, "sensor").shape != decoded(path, "upright").shape
+    assert turned or suffix == ".webp"  # of which not every OpenCV follows the data
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        warn_if_shown_turned(tmp_path / "turned.*", "sensor", "--points")
+    assert [str(one.message).startswith(f"{path}: its EXIF data") for one in told] == [True] * turned

@@ -189,6 +189,8 @@ def test_a_misspelt_option_is_told_from_the_right_one(capsys: pytest.CaptureFixt
     assert err.endswith(
         "diffproj measure: --csv: takes no value, got 'points.csv'; it means: print one table for spreadsheets\n"
     )
+    code, _, err = run(capsys, "info", "camera.json", "--json", "--quite")
+    assert err.endswith("unrecognized arguments: --quite; did you mean --quiet?\n")
 
 
 @pytest.mark.parametrize(

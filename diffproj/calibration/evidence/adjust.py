@@ -28,9 +28,13 @@ from diffproj.targets.views import Views
 
 UPRIGHT = 0.2
 """Cosine between z and up in the photograph from which on a camera below landmarks may look at a ceiling."""
-BELOW = (
-    "the camera is below all landmarks and not upright: are x and y exchanged, has one of them the wrong sign, or do "
-    "pixels count from another corner? z is up, as with x east and y north"
+LEVEL = 0.1
+"""Relief of landmarks, as a part of their extent, below which they lie on a ground; below a facade one stands anyway,
+also with the camera on its side."""
+BELOW = "the camera is below all landmarks and not upright"
+WHY_BELOW = (
+    "are x and y exchanged, has one of them the wrong sign, or do pixels count from another corner? z is up, as with x "
+    "east and y north"
 )
 """What is said of a camera that sees level ground from below."""
 
@@ -195,14 +199,16 @@ def _outcome(
 
 
 def _from_below(posed: Camera, pieces: Sequence[Observation], status: Tensor) -> tuple[Remarks, ...]:
-    """For each camera a remark where it stands below all landmarks, and not upright, as where x and y are exchanged."""
-    heights = [piece.points[:, 2].detach() for piece in pieces if isinstance(piece, Seen)]
+    """For each camera a remark where it stands below level ground, and not upright, as where x and y are exchanged."""
+    seen = [piece.points.detach() for piece in pieces if isinstance(piece, Seen) and len(piece.points)]
     center, R = posed.center.detach().reshape(-1, 3), posed.R.detach().reshape(-1, 3, 3)
-    if not heights:
+    if not seen:
         return ((),) * len(center)
-    below = center[:, 2] < torch.cat(heights).amin().to(center)
+    low, high = torch.cat(seen).to(center).aminmax(dim=0)
+    extent = high - low
+    below = (center[:, 2] < low[2]) & (extent[2] < LEVEL * extent[:2].amax())
     wrong = below & (-R[:, 1, 2] < UPRIGHT) & (status.flatten() == Status.CONVERGED)
-    said = Remark(BELOW, Kind.BELOW)
+    said = Remark(f"{BELOW}: {WHY_BELOW}", Kind.BELOW, BELOW)
     return tuple((said,) if each else () for each in wrong.tolist())
 
 

@@ -142,7 +142,8 @@ class Adjustment(Calibration):
             return f"{int(self.converged.sum())} of {self.status.numel()} cameras converged."
         if self.status:
             return f"Not usable: {self._ends()[0]}."
-        return f"Usable: {self.doubts or 'nothing speaks against it'}."
+        against = [self.doubts, *(one.reason for one in self.findings[0])]
+        return f"Usable: {'; '.join(filter(None, against)) or 'nothing speaks against it'}."
 
     def summary(self) -> str:
         """One camera as a text for people: mounting and free intrinsics with deviations, the evidence, how it ended.

@@ -577,3 +577,26 @@ def test_lines_have_a_deviation_each() -> None:
     assert len(given) == 3
     with pytest.raises(ValueError, match="pixel_sigma"):
         dp.VanishingPoints(directions, segments=segments, pixel_sigma=torch.tensor([0.5, 1.0], dtype=D))
+
+
+BELOW = "the camera is below all landmarks and not upright"
+
+
+def test_exchanged_axes_are_a_reason_in_the_verdict() -> None:
+    """Residuals are those of noise: level ground mirrored is level ground, seen from below."""
+    ground = torch.tensor([[-8.0, 20], [10, 26], [18, 22], [25, 35], [6, 14]], dtype=D)
+    level = torch.nn.functional.pad(ground, (0, 1))
+    found = dp.adjust(START, dp.Seen(level[:, [1, 0, 2]], seen(TRUE, level)))
+    assert found.remarks[0].startswith(f"{BELOW}: are x and y exchanged")
+    assert found.verdict == f"Usable: {BELOW}."
+    assert dp.adjust(START, dp.Seen(level, seen(TRUE, level))).verdict == "Usable: nothing speaks against it."
+
+
+@pytest.mark.parametrize("roll", [90.0, -90.0])
+def test_a_facade_in_an_upright_photograph_of_a_camera_on_its_side(roll: float) -> None:
+    """From the street all landmarks are above, and a photograph as its sensor recorded it lies on its side."""
+    street = dp.Camera.mounted(1.6, -15.0, roll, focal=800.0, size=(640, 480)).to(D)
+    facade = torch.tensor([[-4.0, 30, 4], [5, 30, 6], [-3, 30.5, 14], [4, 30, 19], [0, 30, 10], [2, 31, 12]], dtype=D)
+    found = dp.adjust(street, dp.Seen(facade, seen(street, facade)))
+    assert float(found.mounting.height) < float(facade[:, 2].min())
+    assert found.remarks == ("",)

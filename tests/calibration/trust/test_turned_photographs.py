@@ -139,6 +139,15 @@ def test_a_lens_that_the_model_lacks_turns_nothing(lens: dp.Lens, focal: float, 
     assert not any(TURNED in remark for remark in found.remarks)
 
 
+def test_of_rational_lenses_they_are_named_in_a_batch_as_alone() -> None:
+    """A prior that keeps another lens of the batch, or this one, from folding tells nothing of the principal point."""
+    views = dp.example_views("left")
+    for remark, which in zip(
+        dp.calibrate(side_by_side(views, [(7,), (4, 10)]), BOARD, "brown8").remarks, ((7,), (4, 10)), strict=True
+    ):
+        assert f"{said(views.names, which)} {TURNED}" in remark
+
+
 def test_without_a_size_or_with_all_turned_nothing_is_said() -> None:
     views = turned(dp.example_views("left"), [1, 4])
     start = dp.calibrate(views, BOARD)
