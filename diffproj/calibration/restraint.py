@@ -9,7 +9,8 @@ nothing by this, a restrained lens does not end above the poorer one either.
 Of several minima without restraint one may make sense. A factor that stands both above and below the line changes
 nothing, and leads away from the poles: the poorer lens with such factors is where the solver starts again. And the
 terms are held: then the valley is short, and its lowest place is found; from there they are let go step by step, as
-long as the lens does not fold. Either may end lower, so that both are done.
+long as the lens does not fold. Either may end lower, so that both are done. But factors may also lead to a needle in
+the image's middle, which is no lower than chance and leaves the focal lengths open: that is not taken.
 """
 
 import math
@@ -46,6 +47,9 @@ HAIR = 1.1
 """Factor of the cost that is paid to make a lens that reaches all of its corners reach the whole image, too."""
 LOWER = 1e-9
 """Part of the cost by which another minimum must be lower to be taken."""
+WORTH, OPEN = 1.0, 0.05
+"""Residuals' worth of noise by which one from a start with factors must be lower; and the deviation of a focal length
+or principal point, relative to the focal length, above which it is not taken: at twice that the views are refused."""
 
 
 def restrained(
@@ -84,12 +88,13 @@ def restrained(
     lost = reached < 0
     dearest = torch.where(lost, torch.inf, HAIR * _data_cost(found))
 
-    def weighed(which: Tensor, other: Fit) -> Tensor:
-        """Which of the others `(n,)` do not fold; they are kept where they are better."""
+    def weighed(which: Tensor, other: Fit, allowed: Tensor, lower: Tensor | float = LOWER) -> Tensor:
+        """Which of the others `(n,)` do not fold; they are kept where they are allowed, and better."""
         nonlocal best, reached
         cost = _data_cost(other)
-        reach = torch.where(cost <= dearest[which], _reached(other, size), -1.0)
-        better = (reach > reached[which]) | ((reach == reached[which]) & (cost < _data_cost(best)[which] * (1 - LOWER)))
+        reach = torch.where(allowed & (cost <= dearest[which]), _reached(other, size), -1.0)
+        lowest = _data_cost(best)[which] * (1 - lower)
+        better = allowed & ((reach > reached[which]) | ((reach == reached[which]) & (cost < lowest)))
         best = _put(best, which[better], other, better)
         reached[which] = reach.maximum(reached[which])
         return reach >= 1
@@ -103,8 +108,15 @@ def restrained(
             steps if strength == math.inf else steps | {"max_iterations": min(max_iterations, RUNG_STEPS)}
         )
         other = fit(part, near.solution.shared, near.solution.local, reject=reject, **limits)
-        return other, weighed(which, other)
+        return other, weighed(which, other, torch.ones_like(which, dtype=torch.bool))
 
+    first, sound = tried(which, FIRST, start.part(which))
+    up, near = which[sound], first.part(sound.nonzero().flatten())
+    for strength in LOOSER:
+        if len(up) == 0:
+            break
+        near, sound = tried(up, strength, near)
+        up, near = up[sound], near.part(sound.nonzero().flatten())
     with_factors = _with_factors(start, size)
     if with_factors is not None:
         count = len(FACTORS)
@@ -114,15 +126,10 @@ def restrained(
         near = fit(given.part(which.repeat(count)), begin, local, reject=reject, **short)
         folds = folds_at_corners(near.task, near.solution.shared, near.solution.local)
         costs = torch.where(folds, torch.inf, _data_cost(near)).reshape(count, -1)
-        near = near.part(costs.argmin(0) * len(which) + torch.arange(len(which), device=which.device)).solution
-        weighed(which, fit(given.part(which), near.shared, near.local, reject=reject, **steps))
-    first, sound = tried(which, FIRST, start.part(which))
-    up, near = which[sound], first.part(sound.nonzero().flatten())
-    for strength in LOOSER:
-        if len(up) == 0:
-            break
-        near, sound = tried(up, strength, near)
-        up, near = up[sound], near.part(sound.nonzero().flatten())
+        near = near.part(costs.argmin(0) * len(which) + torch.arange(len(which), device=which.device))
+        other = fit(given.part(which), near.solution.shared, near.solution.local, reject=reject, **steps)
+        spare = found.degrees_of_freedom()[which].to(costs)
+        weighed(which, other, _knows_focal(other), WORTH / spare)
     down = which[reached[which] < 1]
     for strength in TIGHTER:
         if len(down) == 0:
@@ -157,6 +164,12 @@ def _reached(found: Fit, size: tuple[int, int]) -> Tensor:
     task, solution = found.task, found.solution
     lost = folds_at_corners(task, solution.shared, solution.local) | (solution.status != Status.CONVERGED)
     return torch.where(lost, -1.0, reaches_image(task, solution.shared, size))
+
+
+def _knows_focal(found: Fit) -> Tensor:
+    """Where focal lengths and principal point are known well enough `(P,)`."""
+    deviation = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, :4].sqrt()
+    return (deviation <= OPEN * found.solution.shared[:, (0, 1, 0, 1)].abs()).all(-1)
 
 
 def _with_factors(start: Fit, size: tuple[int, int]) -> list[Tensor] | None:
