@@ -563,4 +563,13 @@ def test_a_photograph_that_programs_show_turned_is_told(
     code, _, err = run(
         capsys, path, "--camera", "camera.json", *BOARD, "--points", CORNERS[0], "--orientation", "upright"
     )
-    assert "EXIF" not in err
+    assert "ask programs to show it turned" not in err
+    refused = "leave out --orientation upright, with which EXIF data turn this one" in " ".join(err.split())
+    assert refused == (code == 1) == (orientation in (6, 8))  # the camera's photographs are 640 x 480 px
+
+
+def test_a_photograph_that_is_turned_is_not_called_resized(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "turned.png"), cv2.rotate(cv2.imread("photo.png"), cv2.ROTATE_90_CLOCKWISE))
+    code, _, err = run(capsys, tmp_path / "turned.png", "--camera", "camera.json", *BOARD, "--points", CORNERS[0])
+    assert code == 1
+    assert "it is turned against those that the camera was calibrated on" in " ".join(err.split())
