@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
     if options.photograph is not None:
         picture = grey(one_photograph(options.photograph, options.orientation))
         size = picture.shape[1], picture.shape[0]
-        check_size(camera, size, options.camera, options.photograph)
+        check_size(camera, size, options)
         warn_if_shown_turned(options.photograph, options.orientation, f"the pixels in {options.landmarks}")
     if size is None and options.draw is not None:
         raise ValueError(f"--draw: want PHOTO, or the image's size in {options.camera}, got neither")

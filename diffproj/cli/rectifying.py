@@ -79,7 +79,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         scene = stored_view(options)
         height, width = photograph.source.shape[:2]  # type: ignore[union-attr]
-        check_size(scene.camera, (width, height), options.camera, options.photograph)
+        check_size(scene.camera, (width, height), options)
     plane = plane_of(scene, options)
     _, along_x, along_y = plane_axes(plane)
     level = along_x.tolist() == [1, 0, 0] and along_y.tolist() == [0, 1, 0]

@@ -122,7 +122,7 @@ def new_photograph(options: argparse.Namespace, photograph: Photograph) -> Scene
             warnings.warn(doubt, stacklevel=2)
     with progress_bars() as bars:
         views = search([photograph], board, bars, orientation=options.orientation).views
-    check_size(camera, views.size, options.camera, options.photograph)
+    check_size(camera, views.size, options)
     try:
         found = locate(views, board, camera if calibration is None else calibration)
     except CalibrationError as error:
@@ -164,18 +164,29 @@ def loaded(path: Path) -> tuple[Camera, Calibration | None]:
     return camera, calibration
 
 
-def check_size(camera: Camera, size: tuple[int, int] | None, path: Path, photograph: Path) -> None:
+def check_size(camera: Camera, size: tuple[int, int] | None, options: argparse.Namespace) -> None:
     """Check that a photograph has the size of the camera's images.
 
     Raises:
         ValueError: it has not.
     """
-    if camera.size is not None and camera.size != size:
-        (w, h), (width, height) = size or (0, 0), camera.size
-        raise ValueError(
-            f"PHOTO: want {width} x {height} px as in {path}, got {w} x {h} px in {photograph}; take it with the "
-            "camera as it was calibrated, and do not resize or crop it"
+    if camera.size is None or camera.size == size:
+        return
+    (w, h), (width, height) = size or (0, 0), camera.size
+    remedy = "take it with the camera as it was calibrated, and do not resize or crop it"
+    if (h, w) == camera.size and options.orientation == "upright":
+        remedy = (
+            "the camera was calibrated on photographs as the sensor recorded them: leave out --orientation upright, "
+            "with which EXIF data turn this one, or calibrate with it as well"
         )
+    elif (h, w) == camera.size:
+        remedy = (
+            "it is turned against those that the camera was calibrated on: take one that is not, or give "
+            "--orientation upright if EXIF data are what turned those"
+        )
+    raise ValueError(
+        f"PHOTO: want {width} x {height} px as in {options.camera}, got {w} x {h} px in {options.photograph}; {remedy}"
+    )
 
 
 def _calibrated_square(calibration: Calibration) -> Length:

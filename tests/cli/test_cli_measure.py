@@ -566,7 +566,9 @@ def test_a_photograph_that_programs_show_turned_is_told(
     code, _, err = run(
         capsys, path, "--camera", "camera.json", *BOARD, "--points", CORNERS[0], "--orientation", "upright"
     )
-    assert "EXIF" not in err
+    assert "ask programs to show it turned" not in err
+    refused = "leave out --orientation upright, with which EXIF data turn this one" in " ".join(err.split())
+    assert refused == (code == 1) == (orientation in (6, 8))  # the camera's photographs are 640 x 480 px
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
@@ -582,3 +584,10 @@ def test_what_is_shown_turned_is_told_of_every_format_that_is_turned(tmp_path: P
         warnings.simplefilter("always")
         warn_if_shown_turned(tmp_path / "turned.*", "sensor", "--points")
     assert [str(one.message).startswith(f"{path}: its EXIF data") for one in told] == [True] * turned
+
+
+def test_a_photograph_that_is_turned_is_not_called_resized(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "turned.png"), cv2.rotate(cv2.imread("photo.png"), cv2.ROTATE_90_CLOCKWISE))
+    code, _, err = run(capsys, tmp_path / "turned.png", "--camera", "camera.json", *BOARD, "--points", CORNERS[0])
+    assert code == 1
+    assert "it is turned against those that the camera was calibrated on" in " ".join(err.split())

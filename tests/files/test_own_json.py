@@ -152,6 +152,24 @@ def test_fields_come_and_go_without_a_file(calibration: dp.Calibration) -> None:
         )
 
 
+def test_a_noise_that_was_known_stays_known(tmp_path: Path) -> None:
+    """JSON has no infinity: without degrees of freedom `locate` would take the corners' noise from a few residuals."""
+    views, board = dp.example_views("left"), dp.Chessboard()
+    known = dp.calibrate(views[:4], board, pixel_sigma=0.2)
+    dp.save_camera(tmp_path / "c.json", known)
+    loaded = dp.load_calibration(tmp_path / "c.json")
+    assert loaded.degrees_of_freedom is not None
+    assert bool(loaded.degrees_of_freedom.isinf())
+    assert loaded.summary() == known.summary()
+    found, again = (dp.locate(views[4:6], board, one) for one in (known, loaded))
+    assert torch.equal(found.covariance.full(), again.covariance.full())
+    old = dp.Calibration.from_fields(
+        {name: field for name, field in known.to_fields().items() if name != "degrees_of_freedom"}, known.camera
+    )
+    assert old.degrees_of_freedom is None
+    assert "degrees_of_freedom" not in old.to_fields()
+
+
 def test_many_views_are_packed_and_come_back_exactly(tmp_path: Path) -> None:
     views = dp.example_views("left")
     many = dp.Views(views.pixels[torch.arange(100) % 13] + 0.1 * torch.randn(100, 54, 2, dtype=D), size=views.size)

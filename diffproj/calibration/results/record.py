@@ -53,6 +53,8 @@ class Recorded:
             "visible": self.views.visible,
         }
         others = self.other_poses if self.has_alternatives else None
+        if self.degrees_of_freedom is None:
+            del lists["degrees_of_freedom"]  # where it is there without a number, that is infinite: see `_freedom`
         return {
             "objective": self.objective,
             "unit": self.unit,
@@ -211,9 +213,11 @@ def _later(fields: dict[str, Any], name: str, shape: tuple[int, ...]) -> Tensor 
 
 
 def _freedom(fields: dict[str, Any], batch: tuple[int, ...]) -> Tensor | None:
-    """Degrees of freedom, infinite where the noise was known, which a file has no number for."""
-    found = _later(fields, "degrees_of_freedom", batch)
-    return None if found is None else torch.where(found.isnan(), torch.inf, found)
+    """Degrees of freedom, infinite where the noise was known, which a file has no number for; `None` if left out."""
+    if "degrees_of_freedom" not in fields:
+        return None
+    found = tensor(fields, "degrees_of_freedom", batch, least=0, gaps=True)
+    return torch.where(found.isnan(), torch.inf, found)
 
 
 def _region(fields: dict[str, Any]) -> Tensor | None:

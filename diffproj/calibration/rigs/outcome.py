@@ -15,6 +15,7 @@ from diffproj.calibration.results.covariance import Covariance
 from diffproj.calibration.results.distinct import ALIKE_PX
 from diffproj.calibration.rigs.alone import Alone
 from diffproj.calibration.rigs.fit import RigFit
+from diffproj.calibration.rigs.prior_contradiction import contradicted_priors
 from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.calibration.rigs.uncertainty import CameraNoise, camera_noise, of_camera, plain_covariance, rig_covariance
 from diffproj.calibration.trust.verdict import FEWEST_FOR_A_SHAPE, MAX_RELATIVE_STD
@@ -90,7 +91,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
         found.iterations,
         cause,
         _covariance=joint,
-        _remarks=partial(_remarks, found, noise, alone, status),
+        _remarks=partial(_remarks, found, noise, joint, alone, status),
     )
 
 
@@ -149,9 +150,10 @@ def _verdict(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone]) -> t
         if not rms <= max(FAR_WORSE * alone[name].rms, FAR_OFF * extent):
             worse.append(f"{name} by {rms:.1f} px, on its own by {alone[name].rms:.2f}")
     if worse:
+        said = "" if found.problem.known is None else "are the priors right, "
         return Status.DEGENERATE, (
-            f"no rig explains what the cameras see ({'; '.join(worse)}): do the moments fit together (moments=), did "
-            "the cameras stand still, and are the corners numbered from the same end?"
+            f"no rig explains what the cameras see ({'; '.join(worse)}): {said}do the moments fit together (moments=), "
+            "did the cameras stand still, and are the corners numbered from the same end?"
         )
     if not float(noise.freedom.sum()) > 0:
         return Status.DEGENERATE, "there are fewer corners than unknowns: add moments"
@@ -185,7 +187,9 @@ def _verdict(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone]) -> t
     return status, ""
 
 
-def _remarks(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone], status: Status) -> tuple[str, ...]:
+def _remarks(
+    found: RigFit, noise: CameraNoise, joint: _Late, alone: Mapping[str, Alone], status: Status
+) -> tuple[str, ...]:
     """What is to be known of the rig."""
     if status != Status.CONVERGED:
         return ()
@@ -200,6 +204,7 @@ def _remarks(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone], stat
     for name in found.restrained:
         said.append(f"k4, k5 and k6 of {name} are held as on its own, for without that its lens folds inside the image")
     said += _same_views(found)
+    said += contradicted_priors(found, noise, float(joint().dispersion))
     said += _unlike(found, noise)
     residuals = found.by_camera
     for name in names:

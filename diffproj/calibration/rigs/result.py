@@ -129,7 +129,7 @@ class RigCalibration(RigAccount, Copied, RigRecorded):
         """What is to be known of a rig that converged, and what to try; computed at the first call.
 
         Views that contradict the others and were left out, cameras that fit worse together than alone, moments that fit
-        badly, and the remarks on each camera on its own.
+        badly, a prior that the views contradict, and the remarks on each camera on its own.
         """
         return self._remarks() if self._remarks is not None else ()
 

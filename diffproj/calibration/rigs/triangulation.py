@@ -13,6 +13,7 @@ freedom a camera, less three: with two cameras that of the distance from each ot
 not explain it nothing tells which pixel is wrong, and the covariance grows by chi-square over its degrees of freedom.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -60,7 +61,7 @@ class Triangulation(Shown, Copied):
     Attributes:
         points: `(N, 3)` in world units; 0 where not valid.
         valid: where at least two cameras see the point, in front of them, from different directions `(N,)`.
-        covariance: of each point `(N, 3, 3)`, in squared world units: of its pixels and of the rig.
+        covariance: of each point `(N, 3, 3)`, in squared world units: of its pixels and the rig; NaN if not valid.
         residuals: projected minus seen pixels, by camera, `(N, 2)`; 0 where a camera does not see the point.
         disagrees: where the residuals are larger than noise and rig explain, as where a camera's pixel is that of
             another point `(N,)`. The covariance there is as much larger as it takes to explain them.
@@ -76,7 +77,7 @@ class Triangulation(Shown, Copied):
 
     @property
     def deviations(self) -> Float[Tensor, "n 3"]:
-        """The standard deviation of each coordinate `(N, 3)`, in world units."""
+        """The standard deviation of each coordinate `(N, 3)`, in world units; NaN where not valid."""
         return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
     def between(self, i: int, j: int) -> Float[Tensor, "3 3"]:
@@ -92,7 +93,7 @@ class Triangulation(Shown, Copied):
         return self._by_rig[i] @ self._by_rig[j].mT
 
     def length(self, i: int, j: int) -> tuple[float, float]:
-        """The distance between two points and its standard deviation, in world units.
+        """The distance between two points and its standard deviation, in world units; NaN where one is not valid.
 
         Raises:
             TypeError: a number of a point is no whole number.
@@ -104,11 +105,13 @@ class Triangulation(Shown, Copied):
         along = apart / length.clamp(min=torch.finfo(length.dtype).tiny)
         shift = along @ (self._by_rig[j] - self._by_rig[i])
         variance = shift @ shift + along @ (self._of_pixels[i] + self._of_pixels[j]) @ along
-        return float(length), float(variance.sqrt())
+        known = bool(self.valid[i] & self.valid[j])
+        return float(length) if known else math.nan, float(variance.sqrt())
 
     def to_dict(self) -> dict[str, list[Any]]:
-        """Points and deviations as columns of Python's own numbers: `pandas.DataFrame` takes it."""
-        columns = {name: self.points[:, i].tolist() for i, name in enumerate("xyz")}
+        """Points and deviations as columns of numbers, NaN where not valid: `pandas.DataFrame` takes it."""
+        points = torch.where(self.valid.unsqueeze(-1), self.points, torch.nan)
+        columns = {name: points[:, i].tolist() for i, name in enumerate("xyz")}
         columns |= {f"{name}_deviation": self.deviations[:, i].tolist() for i, name in enumerate("xyz")}
         return columns | {"valid": self.valid.tolist(), "disagrees": self.disagrees.tolist()}
 
@@ -153,8 +156,8 @@ def triangulated(rig: Rig, pixels_by_camera: Any, pixel_sigma: Any) -> Triangula
     disagrees, scale = _disagreement(slopes, shifts, off, inverse, count, valid)
     if bool(disagrees.any()):
         warn_caller(_doubt(disagrees), CameraDisagreementWarning)
-    by_rig = torch.where(valid[:, None, None], scale.sqrt()[:, None, None] * by_rig, 0.0)
-    inverse = torch.where(valid[:, None, None], scale[:, None, None] * inverse, 0.0)
+    by_rig = torch.where(valid[:, None, None], scale.sqrt()[:, None, None] * by_rig, torch.nan)
+    inverse = torch.where(valid[:, None, None], scale[:, None, None] * inverse, torch.nan)
     covariance = inverse + by_rig @ by_rig.mT
     points = torch.where(valid.unsqueeze(-1), X, 0.0)
     left = {name: torch.where(valid.unsqueeze(-1), residuals[name], 0.0) for name in pixels}

@@ -1,6 +1,7 @@
 """What is known of a rig's cameras beforehand: the minimum, its covariance, and what is refused."""
 
 import math
+import re
 from typing import Any
 
 import pytest
@@ -124,6 +125,42 @@ def test_it_goes_along_with_a_shape(pair: Scene, options: dict[str, Any]) -> Non
     assert deviation == pytest.approx(0.01, rel=0.02)
 
 
+@pytest.mark.parametrize(
+    ("what", "off", "deviation", "shape", "says"),
+    [
+        ("cam1.baseline", 30.0, 0.1, "flat", r"cam1\.baseline: they tell (\S+) ± (\S+), and it says"),
+        ("cam1.center", 30.0, 0.1, "flat", r"cam1\.center: they tell \S+ ± \S+ along [xyz], and it says"),
+        ("cam1.rotation", 3.0, 0.01, "flat", r"cam1\.rotation: they tell \S+ ± \S+ degrees about [xyz] off it, and"),
+        ("cam0.focal", 50.0, 0.1, "bow", r"cam0\.f_[xy]: they tell \S+ ± \S+, and it says"),
+    ],
+)
+def test_a_prior_that_the_views_contradict_is_named(
+    pair: Scene, what: str, off: float, deviation: float, shape: Any, says: str
+) -> None:
+    """It bends the rig towards it, whose deviations do not tell: a remark says what the views tell by themselves."""
+    mean = told(pair.cameras, what)
+    wrong, right = (
+        dp.calibrate_rig(pair.views, pair.board, shape=shape, priors={what: (mean + shift, deviation)})
+        for shift in (off, 0.0)
+    )
+    said = [remark for remark in wrong.remarks if remark.startswith("the views contradict the prior on ")]
+    assert len(said) == 1, wrong.remarks
+    match = re.search(says, said[0])
+    assert match is not None, said
+    assert not any("contradict" in remark for remark in right.remarks)
+    if match.groups():
+        length, spread = dp.calibrate_rig(pair.views, pair.board, shape=shape).baseline("cam0", "cam1")
+        assert float(match[1]) == pytest.approx(length, abs=spread)  # found 0.75 of that
+        assert float(match[2]) == pytest.approx(spread, rel=0.5)  # found 4.5 and 3.2
+
+
+def test_where_there_is_no_rig_the_priors_are_asked_for(pair: Scene) -> None:
+    """One number for all of a centre is easily said in the place of a distance."""
+    length = float(pair.cameras["cam1"].center.norm())
+    with pytest.raises(dp.CalibrationError, match="no rig explains .*: are the priors right, do the moments fit"):
+        dp.calibrate_rig(pair.views, pair.board, priors={"cam1.center": (5 * length, 0.01)})
+
+
 def known(true: Scene, seed: int) -> dict[str, Any]:
     """What is measured beforehand of a pair, with errors as large as is said: a little of each kind."""
     draw = torch.Generator().manual_seed(seed)
@@ -149,6 +186,7 @@ def test_errors_are_what_the_covariance_says(weights: float | None) -> None:
     for seed in range(40):
         true = scene(2, 6, missing=0.0, seed=1000 + seed)
         rig = dp.calibrate_rig(true.views, true.board, weights=weights, priors=known(true, seed))
+        assert not any("contradict the prior" in remark for remark in rig.remarks)
         off, C = off_truth(rig, true, "cam1"), rig.place_covariance("cam1")
         squares["place"].append(float(off @ torch.linalg.solve(C, off)) / 6)
         length, deviation = rig.baseline("cam0", "cam1")

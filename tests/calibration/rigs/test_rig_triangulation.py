@@ -1,5 +1,6 @@
 """Points whose pixels in two cameras are not of one point are told, and the deviations hold it."""
 
+import math
 import warnings
 
 import pytest
@@ -86,6 +87,13 @@ def test_a_point_that_one_camera_alone_sees_is_not_doubtful(rig):
     found = rig.triangulate(pixels, pixel_sigma=0.2)
     assert found.valid.tolist() == [True, False, True, True]
     assert not found.disagrees.any()
+    assert found.deviations.isnan().all(-1).tolist() == [False, True, False, False]
+    assert found.between(0, 1).isnan().all()
+    assert all(math.isnan(number) for number in found.length(0, 1))
+    assert all(math.isfinite(number) for number in found.length(0, 2))
+    columns = found.to_dict()
+    assert [math.isnan(x) for x in columns["x"]] == [math.isnan(x) for x in columns["z_deviation"]]
+    assert math.isnan(columns["x"][1])
 
 
 def test_pixels_beyond_the_photograph_are_told(rig):
