@@ -70,6 +70,8 @@ class Seen(Observed):
         given = landmarks.points if isinstance(landmarks, Target) else tensor_of("landmarks", landmarks)
         if given.ndim != 2 or given.shape[-1] not in (2, 3):
             raise ValueError(f"landmarks: want points (N, 3), or (N, 2) on z = 0, got shape {tuple(given.shape)}")
+        if len(given) == 0:
+            raise ValueError("landmarks: want some, got none")
         points = valued("landmarks", given)
         points = torch.nn.functional.pad(points, (0, 3 - points.shape[-1]))
         lost = ~points.detach().isfinite().all(-1)

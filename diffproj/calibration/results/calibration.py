@@ -177,7 +177,10 @@ class Calibration(Account, Copied, Recorded, Indexed):
 
     @property
     def rms(self) -> Float[Tensor, "*batch"]:
-        """RMS reprojection error `(*B,)` in pixels as OpenCV defines it: `sqrt(sum |e|^2 / number of points)`."""
+        """RMS reprojection error `(*B,)` in pixels as OpenCV defines it: `sqrt(sum |e|^2 / number of points)`.
+
+        NaN where there are no corners, as after `adjust`, whose evidence is counted in deviations of its own.
+        """
         return (self.residuals.square().sum(dim=(-3, -2, -1)) / self.used.sum((-2, -1))).sqrt()
 
     @property

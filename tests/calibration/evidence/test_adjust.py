@@ -508,6 +508,7 @@ def test_turns_are_known_of_a_camera_that_looks_straight_down() -> None:
         (lambda: dp.adjust(START, priors={"tilt": (200.0, 1.0)}), "priors: want a tilt in degrees below the horizon"),
         (lambda: dp.adjust(START, priors={"focal": (-900.0, 1.0)}), "priors: want a focal length in px, more than 0"),
         (lambda: dp.adjust(START, priors=0.3), "priors: want a mapping from names, got "),  # type: ignore[arg-type]
+        (lambda: dp.Seen(LANDMARKS[:0], seen()[:0]), "landmarks: want some, got none"),
         (lambda: dp.Seen(LANDMARKS, seen()[:4]), "pixels: want one for each of 6 landmarks, got 4"),
         (lambda: dp.Seen(LANDMARKS, seen(), sigma=[1.0, 2.0]), "sigma: want a number"),
         (lambda: dp.Horizon([[1.0, float("nan")]]), "pixels: want finite pixels"),
