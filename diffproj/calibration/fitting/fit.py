@@ -174,6 +174,11 @@ class Fit:
         prior = self.task.prior
         return None if prior is None else prior.precision if prior.known is None else prior.known
 
+    def has_prior(self) -> Tensor:
+        """Of which cameras something is known beforehand `(P,)`; a lens that is restrained needs a prior, too."""
+        known = self.measured_precision()
+        return torch.zeros_like(self.rejected[:, 0, 0]) if known is None else (known != 0).any(-1).any(-1)
+
 
 def fit(
     task: Task,

@@ -104,8 +104,7 @@ def remarks(
         left, groups = leftover(found, which, SIGNIFICANT), two_groups(found, which)
         wrong = prior_contradictions(found, which)
         # What is known beforehand and does not fit holds the camera where turned photographs would fit better.
-        known = found.measured_precision()
-        turned = turned_photographs(found, which if known is None else which[~_any_known(known[which])], sizes)
+        turned = turned_photographs(found, which[~found.has_prior()[which]], sizes)
         for i, p in enumerate(map(int, which.tolist())):
             saved = groups[p].saved if p in groups else 0.0
             if p in turned and turned[p].saved > max(
@@ -126,11 +125,6 @@ def remarks(
                 remark = None if remark is not None and remark.kind in OF_THE_CAMERA else remark
             said[p] += [] if remark is None else [remark]
     return tuple(map(tuple, said))
-
-
-def _any_known(precision: Tensor) -> Tensor:
-    """Of which cameras `(n,)` something is known beforehand; where a lens is restrained, or another's, it is all 0."""
-    return (precision != 0).any(-1).any(-1)
 
 
 def _otherwise(left: Leftover, i: int) -> float:

@@ -99,7 +99,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     none = ~used.any(-1)
     finite = solution.cost.isfinite()
     folded = finite & ~no_pose.any(-1) & folds_at_corners(task, solution.shared, solution.local)
-    redundant = (found.degrees_of_freedom() > 0) | (task.prior is not None)
+    redundant = (found.degrees_of_freedom() > 0) | found.has_prior()
     held = poses_only(task)
     if held:  # four corners leave two degrees of freedom
         unknown[:] = False
