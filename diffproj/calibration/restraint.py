@@ -10,7 +10,7 @@ Of several minima without restraint one may make sense. A factor that stands bot
 nothing, and leads away from the poles: the poorer lens with such factors is where the solver starts again. And the
 terms are held: then the valley is short, and its lowest place is found; from there they are let go step by step, as
 long as the lens does not fold. Either may end lower, so that both are done. But factors may also lead to a needle in
-the image's middle, which is no lower than chance and leaves the focal lengths open: that is not taken.
+the image's middle, no lower than chance makes it, or with focal lengths left open: that is not taken.
 """
 
 import math

@@ -200,7 +200,7 @@ def _outcome(
 
 def _from_below(posed: Camera, pieces: Sequence[Observation], status: Tensor) -> tuple[Remarks, ...]:
     """For each camera a remark where it stands below level ground, and not upright, as where x and y are exchanged."""
-    seen = [piece.points.detach() for piece in pieces if isinstance(piece, Seen) and len(piece.points)]
+    seen = [piece.points.detach() for piece in pieces if isinstance(piece, Seen)]
     center, R = posed.center.detach().reshape(-1, 3), posed.R.detach().reshape(-1, 3, 3)
     if not seen:
         return ((),) * len(center)
