@@ -204,7 +204,8 @@ def _remarks(
     for name in found.restrained:
         said.append(f"k4, k5 and k6 of {name} are held as on its own, for without that its lens folds inside the image")
     said += _same_views(found)
-    said += contradicted_priors(found, noise, float(joint().dispersion))
+    if found.problem.known is not None:  # else the covariance is not asked for here
+        said += contradicted_priors(found, noise, float(joint().dispersion))
     said += _unlike(found, noise)
     residuals = found.by_camera
     for name in names:
