@@ -14,10 +14,10 @@ from diffproj.calibration.fitting.own_frame import are_solid
 from diffproj.calibration.fitting.second_look import lower_fit
 from diffproj.calibration.fitting.space_start import space_starts
 from diffproj.calibration.fitting.start import Straightened
-from diffproj.calibration.nested import Nested
+from diffproj.calibration.nested.restraint import unfolded
+from diffproj.calibration.nested.richest import Nested
 from diffproj.calibration.outcome import outcome
 from diffproj.calibration.problem.parametrisation import Parametrisation, Pose
-from diffproj.calibration.restraint import unfolded
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.lens.models import LensModel, model_named
 from diffproj.targets.target import Target

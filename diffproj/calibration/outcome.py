@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.fit import Fit, fit
 from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.fitting.surveyed import in_common
+from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.least_squares.eliminated import local_inverse
 from diffproj.calibration.least_squares.solver import Prior, Status
 from diffproj.calibration.problem.constraints import free_basis, held_at, make_prior, of_camera, of_points
@@ -41,6 +43,22 @@ BELOW = (
 """What is said of views that see landmarks of a level plane from below."""
 
 
+class Begun(NamedTuple):
+    """What is to be minimised, and from where.
+
+    Attributes:
+        task: what; of a flat target if points are to be free.
+        shared: where the shared parameters start `(P, s)`.
+        local: where the poses start.
+        prior: that of the task, with its graph.
+    """
+
+    task: Task
+    shared: Tensor
+    local: tuple[Tensor, ...]
+    prior: Prior | None
+
+
 def minimised(
     data: Data,
     options: Options,
@@ -49,14 +67,26 @@ def minimised(
     local: tuple[Tensor, ...],
     reference: Tensor,
 ) -> tuple[Fit, Prior | None]:
-    """Where the solver ends from that start, and the prior with its graph; of a flat target if points are to be free.
+    """Where the solver ends from that start, and the prior with its graph: see `begun`."""
+    task, shared, local, prior = begun(data, options, parameters, shared, local, reference)
+    return fit(task, shared, local, reject=options.outlier_limit, **_steps(options)), prior
+
+
+def begun(
+    data: Data,
+    options: Options,
+    parameters: Parametrisation,
+    shared: Tensor,
+    local: tuple[Tensor, ...],
+    reference: Tensor,
+) -> Begun:
+    """What is to be minimised from that start.
 
     Skew that is not to be fitted is held. `reference (P, s)` is what fixed parameters keep and priors without a mean
     are about; NaN where nothing is known.
     """
     fixed = tuple(name for name in options.fixed if not of_points(name))
     fixed = fixed if options.skew or not parameters.skew else (*fixed, SKEW)
-    steps = {name: getattr(options, name) for name in ("max_iterations", "tolerance", "progress")}
     prior = make_prior(of_camera(options.priors), reference, parameters, data.batch, options.tied_focal)
     shared = held_at(reference, shared, parameters, fixed)
     task = data.task(
@@ -70,9 +100,13 @@ def minimised(
     )
     if options.objective == "plane":
         # From a rough start a pixel may miss the board; the image objective bears that.
-        near = fit(replace(task, loss=None), shared, local, **steps).solution
+        near = fit(replace(task, loss=None), shared, local, **_steps(options)).solution
         shared, local, task = near.shared, near.local, replace(task, objective="plane")  # type: ignore[assignment]
-    return fit(task, shared, local, reject=options.outlier_limit, **steps), prior
+    return Begun(task, shared, local, prior)
+
+
+def _steps(options: Options) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in ("max_iterations", "tolerance", "progress")}
 
 
 def outcome(

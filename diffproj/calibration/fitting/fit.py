@@ -186,14 +186,15 @@ def fit(
     local: tuple[Tensor, ...],
     *,
     reject: float | None = None,
-    max_iterations: int = 300,
+    max_iterations: int | Tensor = 300,
     tolerance: float = 3e-14,
     progress: Progress | None = None,
 ) -> Fit:
     """Minimise; with `reject`, leave out corners whose residual exceeds that many robust std, and repeat.
 
     A camera's robust std is 1.4826 times the median absolute residual component (Rousseeuw and Leroy 1987); where the
-    noise is known, that counts: see `inliers`. At most `MAX_REJECTION_ROUNDS` rounds are run.
+    noise is known, that counts: see `inliers`. At most `MAX_REJECTION_ROUNDS` rounds are run. `max_iterations` of the
+    solver is one number, or one for each camera `(P,)`.
     """
     with torch.inference_mode():  # a fifth faster where call overhead dominates; derivatives are added afterwards
         found = _fit(task, shared, local, reject, max_iterations, tolerance, progress)
@@ -211,18 +212,19 @@ def _fit(
     shared: Tensor,
     local: tuple[Tensor, ...],
     reject: float | None,
-    max_iterations: int,
+    max_iterations: int | Tensor,
     tolerance: float,
     progress: Progress | None,
 ) -> Fit:
     given = near = task.used
     rounds = 1 if reject is None else 1 + MAX_REJECTION_ROUNDS
-    total = rounds * max_iterations
+    most = int(torch.as_tensor(max_iterations).max())
+    total = rounds * most
 
     def attempt(task: Task, shared: Tensor, local: tuple[Tensor, ...], done: int) -> Solution:
         def tell(step: int, _: int) -> None:
             if progress is not None:
-                progress(done * max_iterations + step, total)
+                progress(done * most + step, total)
 
         return settled(task, shared, local, max_iterations=max_iterations, tolerance=tolerance, progress=tell)
 

@@ -143,23 +143,26 @@ def solved(
     shared: Tensor,
     local: tuple[Tensor, ...],
     *,
-    max_iterations: int,
+    max_iterations: int | Tensor,
     tolerance: float,
     progress: Progress | None = None,
 ) -> Solution:
     """Run the solver from shared parameters `(P, s)` and poses `(P, V, ...)`, in blocks of cameras.
 
-    `progress` is told of the steps of each block in turn, as a part of `max_iterations`.
+    `max_iterations` is one number, or one of each camera `(P,)`. `progress` is told of the steps of the blocks in turn,
+    as a part of the most.
     """
     blocks, parts = _blocks(task), []
+    limits = torch.as_tensor(max_iterations).expand(len(shared))
+    most = int(limits.max()) if len(limits) > 0 else 0
     for number, where in enumerate(blocks):
 
         def report(step: int, _: Tensor, number: int = number) -> None:
             if progress is not None:
-                progress((number * max_iterations + step) // len(blocks), max_iterations)
+                progress((number * most + step) // len(blocks), most)
 
         block, start = task.part(where), tuple(z[where] for z in local)
-        options = {"max_iterations": max_iterations, "tolerance": tolerance, "progress": report}
+        options = {"max_iterations": limits[where], "tolerance": tolerance, "progress": report}
         parts.append(_solved(block, shared[where], start, **options))
     return parts[0] if len(parts) == 1 else _joined(parts)
 

@@ -52,20 +52,22 @@ def settled(
     shared: Tensor,
     local: Pose,
     *,
-    max_iterations: int,
+    max_iterations: int | Tensor,
     tolerance: float,
     progress: Progress | None = None,
 ) -> Solution:
     """Minimise from shared parameters `(P, s)` and poses `(P, V, ...)`; the other pose of no view is then better."""
-    options: dict[str, Any] = {"max_iterations": max_iterations, "tolerance": tolerance}
-    solution = solved(task, shared, local, progress=progress, **options)
+    limits = torch.as_tensor(max_iterations, device=shared.device).expand(len(shared))
+    options: dict[str, Any] = {"tolerance": tolerance}
+    solution = solved(task, shared, local, max_iterations=limits, progress=progress, **options)
     open_ = torch.ones(len(shared), dtype=torch.bool, device=shared.device)
     for _ in range(MAX_ROUNDS):
         poses, changed = better_poses(task, solution, open_)
         if not bool(changed.any()):
             break
         which = changed.nonzero().flatten()
-        again = solved(task.part(which), solution.shared[which], tuple(z[which] for z in poses), **options)
+        start = solution.shared[which], tuple(z[which] for z in poses)
+        again = solved(task.part(which), *start, max_iterations=limits[which], **options)
         gained = again.cost.isfinite() & ~(again.cost >= solution.cost[which])  # a start may have had no cost at all
         solution = replaced(solution, which[gained], again, gained)
         open_ = torch.zeros_like(open_).index_fill(0, which[gained], True)

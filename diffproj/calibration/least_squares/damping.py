@@ -42,8 +42,8 @@ class Status(IntEnum):
 class DampingControl:
     """Damping, acceptance and stopping per problem, in NumPy, which is faster than PyTorch for a few numbers."""
 
-    def __init__(self, cost: np.ndarray, negligible: np.ndarray) -> None:
-        self.cost, self.negligible = cost, negligible
+    def __init__(self, cost: np.ndarray, negligible: np.ndarray, limit: np.ndarray) -> None:
+        self.cost, self.negligible, self.limit = cost, negligible, limit
         self.damping = np.full_like(cost, INITIAL_DAMPING)
         self.increase, self.decrease = np.full_like(cost, FIRST_INCREASE), np.full_like(cost, DAMPING_DECREASE)
         self.active = np.isfinite(cost)
@@ -59,7 +59,8 @@ class DampingControl:
         return other
 
     def stop(self, expected: np.ndarray, tolerance: float) -> np.ndarray:
-        """Stop problems that have converged, which are returned, and those whose damping exceeds its maximum."""
+        """Stop problems that have converged, which are returned; and those with too many steps, or too much damping."""
+        self.active &= self.iterations < self.limit
         # The current step will still be applied: the criterion is the reduction of the step after it, extrapolated.
         after = expected * np.minimum(np.maximum(expected / self.previous, BEST_CONTRACTION), 1)
         self.previous = np.where(self.active, expected, self.previous)

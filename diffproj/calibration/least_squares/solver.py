@@ -198,7 +198,7 @@ def solve(
     loss: Loss | None = None,
     prior: Prior | None = None,
     basis: Float[Tensor, "p s q"] | None = None,
-    max_iterations: int = 50,
+    max_iterations: int | Int[Tensor, " p"] = 50,
     tolerance: float = 3e-14,
     negligible: float | Float[Tensor, " p"] = 0.0,
     progress: Callable[[int, Tensor], None] | None = None,
@@ -214,7 +214,7 @@ def solve(
         loss: a robust loss; least squares if left out.
         prior: on the shared unknowns.
         basis: spans the directions in which x may move; all if left out.
-        max_iterations: maximum number of steps.
+        max_iterations: maximum number of steps; one for all problems, or for each.
         tolerance: of convergence: the relative reduction of the cost that the step after the current one would bring,
             extrapolated from the ratio of the last two predicted reductions.
         negligible: a cost, in the cost's unit, that counts as zero; one for all problems, or for each.
@@ -228,9 +228,10 @@ def solve(
     cost, equations = terms.at(shared, local)
     state = _State(shared, local, cost, equations)
     negligible = negligible if isinstance(negligible, Tensor) else torch.full_like(cost, negligible)
-    control = DampingControl(_array(cost), _array(negligible))
+    limit = torch.as_tensor(max_iterations).expand(len(cost)).numpy(force=True)
+    control = DampingControl(_array(cost), _array(negligible), limit)
     everyone = Everyone(state, control)
-    for iteration in range(1, max_iterations + 1):
+    for iteration in range(1, int(limit.max(initial=0)) + 1):
         along = state.equations.along(basis)
         q, dz, reduction = damped_step(along, torch.from_numpy(control.damping).to(cost))
         predicted = _array(reduction)

@@ -8,7 +8,9 @@ that it was fitted to is no calibration.
 import torch
 from torch import Tensor
 
+from diffproj.calibration.fitting.fit import Fit
 from diffproj.calibration.fitting.task import Task
+from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.problem.parametrisation import Pose
 from diffproj.calibration.results.border import border_with_rays
 from diffproj.lens.brown_domain import clearly_one_to_one
@@ -30,6 +32,13 @@ def folds_at_corners(task: Task, shared: Tensor, poses: Pose) -> Tensor:
         if model.count in (4, 5) and bool(clearly_one_to_one(coefficients, outermost).all()):
             return torch.zeros_like(task.used[:, 0, 0])  # a tenth of the time that the domain takes
         return ~(outermost <= model.lens(coefficients.clone()).domain)  # type: ignore[union-attr]
+
+
+def reach_of(found: Fit, size: tuple[int, int]) -> Tensor:
+    """Which part of the image's border the lens reaches `(P,)`; -1 where not even its own corners, or no minimum."""
+    task, solution = found.task, found.solution
+    lost = folds_at_corners(task, solution.shared, solution.local) | (solution.status != Status.CONVERGED)
+    return torch.where(lost, -1.0, reaches_image(task, solution.shared, size))
 
 
 def lost_corners(task: Task, shared: Tensor, poses: Pose) -> Tensor:

@@ -257,10 +257,22 @@ def test_losses(loss: Huber | SoftL1 | Cauchy) -> None:
         type(loss)(0.0)
 
 
+def test_each_problem_may_have_its_own_number_of_steps() -> None:
+    problem, shared, local = curves()
+    limits = torch.tensor([1, 50, 2])
+    together = run(problem, shared, local, max_iterations=limits)
+    assert together.iterations.tolist()[::2] == [1, 2]
+    assert together.status.tolist() == [Status.MAX_ITERATIONS, Status.CONVERGED, Status.MAX_ITERATIONS]
+    for i, limit in enumerate(limits.tolist()):
+        alone = Curves(problem.x, problem.seen[i : i + 1])
+        one = run(alone, shared[i : i + 1], local[i : i + 1], max_iterations=limit)
+        torch.testing.assert_close(together.shared[i], one.shared[0], rtol=1e-12, atol=1e-12)
+
+
 def test_a_step_that_leaves_nothing_to_gain_is_the_last() -> None:
     """Each step gains a tenth of the one before: the one after the current may be within the tolerance already."""
     tolerance, cost = 1e-10, np.ones(2)
-    control = DampingControl(cost, np.zeros(2))
+    control = DampingControl(cost, np.zeros(2), np.full(2, 9))
     first = np.array([9e-9, 9e-8])
     assert not control.stop(first, tolerance).any()
     assert control.stop(0.1 * first, tolerance).tolist() == [True, False]  # the next gain 9e-11 and 9e-10

@@ -6,11 +6,14 @@ fraction of the noise. Then the terms below the line, k4 to k6, are drawn toward
 starts from, 0 if it has none, as little as makes the lens one-to-one over its corners and the image. As the start costs
 nothing by this, a restrained lens does not end above the poorer one either.
 
-Of several minima without restraint one may make sense. A factor that stands both above and below the line changes
-nothing, and leads away from the poles: the poorer lens with such factors is where the solver starts again. And the
-terms are held: then the valley is short, and its lowest place is found; from there they are let go step by step, as
-long as the lens does not fold. Either may end lower, so that both are done. But factors may also lead to a needle in
-the image's middle, no lower than chance makes it, or with focal lengths left open: that is not taken.
+Of several minima without restraint one may make sense. The solver starts again from the poorer lens with factors
+(`factors.py`), which lead away from the poles. And the terms are held: then the valley is short, and its lowest place
+is found; from there they are let go step by step, as long as the lens does not fold. Either may end lower, so that both
+are done. But factors may also lead to a needle in the image's middle, no lower than chance makes it, or with focal
+lengths left open: that is not taken.
+
+Where the first minimum makes sense none that is lower is found by holding terms, and by factors only what looks lower
+after a few steps.
 """
 
 import math
@@ -22,15 +25,13 @@ from torch import Tensor
 
 from diffproj.calibration.fitting.fit import Fit, fit
 from diffproj.calibration.fitting.task import Task
-from diffproj.calibration.fitting.two_poses import replaced, view_costs
-from diffproj.calibration.least_squares.solver import Prior, Status
+from diffproj.calibration.fitting.two_poses import replaced
+from diffproj.calibration.least_squares.solver import Prior
+from diffproj.calibration.nested.factors import FACTORS, data_cost, with_factor
 from diffproj.calibration.problem.parametrisation import Pose
 from diffproj.calibration.trust.entangled import DENOMINATOR
-from diffproj.calibration.trust.reach import folds_at_corners, reaches_image
+from diffproj.calibration.trust.reach import folds_at_corners, reach_of
 
-FACTORS = ((3.0, 2.25), (30.0, 225.0))
-"""Terms in r^2 and r^4, with r in half diagonals of the image, of factors above and below the line: squares of positive
-ones, so that they have no pole."""
 FIRST = 1.0
 """Deviation to which the terms below the line are held at first: what each adds to the denominator half an image's
 diagonal from the axis, where 1 is as much as there is without it."""
@@ -38,8 +39,6 @@ TIGHTER = (0.3, 0.1, 0.03, 0.01)
 """Then these, one after the other until the lens does not fold."""
 LOOSER = (3.0, 10.0, 30.0, math.inf)
 """Or these, as long as it does not."""
-RADIAL = ("k1", "k2", "k3", *DENOMINATOR)
-"""The terms above and below the line."""
 RUNG_STEPS = 100
 """Steps of the solver at one of these, where with the terms held most take ten to twenty; and steps after which only
 the lower of the starts with factors goes on."""
@@ -57,6 +56,7 @@ def restrained(
     shared: Tensor,
     poses: Pose,
     size: tuple[int, int],
+    aside: Fit | None = None,
     *,
     reject: float | None,
     max_iterations: int,
@@ -69,6 +69,7 @@ def restrained(
         shared: `(P, s)` of the fit of a poorer lens.
         poses: of that fit.
         size: of the image.
+        aside: where a few steps from there with a factor lead.
         reject: robust standard deviations beyond which a corner is an outlier.
         max_iterations: of the solver.
         tolerance: of the solver.
@@ -77,27 +78,41 @@ def restrained(
     below = [names.index(name) for name in DENOMINATOR if name in names]
     if task.basis is not None:
         below = [i for i in below if bool(task.basis[:, i].any())]
-    which = (found.degrees_of_freedom() > 0).nonzero().flatten()
-    if not below or len(which) == 0:
+    spare = found.degrees_of_freedom().to(found.solution.cost)
+    if not below or not bool((spare > 0).any()):
         return found
-    steps: dict[str, Any] = {"max_iterations": max_iterations, "tolerance": tolerance}
-    given = replace(task, used=task.used | found.rejected)
-    start = fit(given, shared, poses, max_iterations=0)
-    precision = _unit_precision(start, below, size)
-    best, reached = found, _reached(found, size)
+    best, reached = found, reach_of(found, size)
     lost = reached < 0
-    dearest = torch.where(lost, torch.inf, HAIR * _data_cost(found))
+    which = ((spare > 0) & (reached < 1)).nonzero().flatten()
+    dearest = torch.where(lost, torch.inf, HAIR * data_cost(found))
 
     def weighed(which: Tensor, other: Fit, allowed: Tensor, lower: Tensor | float = LOWER) -> Tensor:
         """Which of the others `(n,)` do not fold; they are kept where they are allowed, and better."""
         nonlocal best, reached
-        cost = _data_cost(other)
-        reach = torch.where(allowed & (cost <= dearest[which]), _reached(other, size), -1.0)
-        lowest = _data_cost(best)[which] * (1 - lower)
+        cost = data_cost(other)
+        reach = torch.where(allowed & (cost <= dearest[which]), reach_of(other, size), -1.0)
+        lowest = data_cost(best)[which] * (1 - lower)
         better = allowed & ((reach > reached[which]) | ((reach == reached[which]) & (cost < lowest)))
         best = _put(best, which[better], other, better)
         reached[which] = reach.maximum(reached[which])
         return reach >= 1
+
+    steps: dict[str, Any] = {"max_iterations": max_iterations, "tolerance": tolerance}
+    given = replace(task, used=task.used | found.rejected)
+
+    def ended(which: Tensor, near: Fit) -> None:
+        """Some cameras `(n,)` from near the end of a start with a factor."""
+        other = fit(given.part(which), near.solution.shared, near.solution.local, reject=reject, **steps)
+        weighed(which, other, _knows_focal(other), WORTH / spare[which])
+
+    if aside is not None:
+        lower = ((spare > 0) & (reached >= 1) & (data_cost(aside) < data_cost(found) * (1 - LOWER))).nonzero().flatten()
+        if len(lower) > 0:
+            ended(lower, aside.part(lower))
+    if len(which) == 0:
+        return best
+    start = fit(given, shared, poses, max_iterations=0)
+    precision = _unit_precision(start, below, size)
 
     def tried(which: Tensor, strength: float, near: Fit) -> tuple[Fit, Tensor]:
         """Those of the cameras `(n,)` at that strength, from `near` `(n, ...)`; and which of them do not fold."""
@@ -117,19 +132,21 @@ def restrained(
             break
         near, sound = tried(up, strength, near)
         up, near = up[sound], near.part(sound.nonzero().flatten())
-    with_factors = _with_factors(start, size)
-    if with_factors is not None:
-        count = len(FACTORS)
-        local = tuple(z[which].repeat(count, *[1] * (z.ndim - 1)) for z in start.solution.local)
-        begin = torch.cat([shared[which] for shared in with_factors])
+    starts = [
+        (with_factor(start.task, start.solution.shared, size, factor), start.solution.local) for factor in FACTORS
+    ]
+    if aside is not None:
+        starts[0] = aside.solution.shared, aside.solution.local
+    if starts[0][0] is not None:
+        begin = torch.cat([shared[which] for shared, _ in starts if shared is not None])
+        local = tuple(
+            torch.cat([z[which] for z in parts]) for parts in zip(*(poses for _, poses in starts), strict=True)
+        )
         short: dict[str, Any] = steps | {"max_iterations": min(max_iterations, RUNG_STEPS)}
-        near = fit(given.part(which.repeat(count)), begin, local, reject=reject, **short)
+        near = fit(given.part(which.repeat(len(starts))), begin, local, reject=reject, **short)
         folds = folds_at_corners(near.task, near.solution.shared, near.solution.local)
-        costs = torch.where(folds, torch.inf, _data_cost(near)).reshape(count, -1)
-        near = near.part(costs.argmin(0) * len(which) + torch.arange(len(which), device=which.device))
-        other = fit(given.part(which), near.solution.shared, near.solution.local, reject=reject, **steps)
-        spare = found.degrees_of_freedom()[which].to(costs)
-        weighed(which, other, _knows_focal(other), WORTH / spare)
+        costs = torch.where(folds, torch.inf, data_cost(near)).reshape(len(starts), -1)
+        ended(which, near.part(costs.argmin(0) * len(which) + torch.arange(len(which), device=which.device)))
     down = which[reached[which] < 1]
     for strength in TIGHTER:
         if len(down) == 0:
@@ -159,35 +176,10 @@ def unfolded(
     return _put(freed, rows, held, torch.ones_like(rows, dtype=torch.bool))
 
 
-def _reached(found: Fit, size: tuple[int, int]) -> Tensor:
-    """Which part of the image's border the lens reaches `(P,)`; -1 where not even its own corners, or no minimum."""
-    task, solution = found.task, found.solution
-    lost = folds_at_corners(task, solution.shared, solution.local) | (solution.status != Status.CONVERGED)
-    return torch.where(lost, -1.0, reaches_image(task, solution.shared, size))
-
-
 def _knows_focal(found: Fit) -> Tensor:
     """Where focal lengths and principal point are known well enough `(P,)`."""
     deviation = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, :4].sqrt()
     return (deviation <= OPEN * found.solution.shared[:, (0, 1, 0, 1)].abs()).all(-1)
-
-
-def _with_factors(start: Fit, size: tuple[int, int]) -> list[Tensor] | None:
-    """The shared parameters `(P, s)` with each of the factors; `None` where not all terms of both sides are free."""
-    names, shared, basis = start.task.names, start.solution.shared, start.task.basis
-    terms = [names.index(name) for name in RADIAL]
-    if basis is not None and not bool((basis[:, terms] != 0).any(-1).all()):
-        return None
-    squared = (shared[:, :2].mean(-1) / (0.5 * math.hypot(*size))).square()
-    found = []
-    for first, second in FACTORS:
-        a, b = first * squared, second * squared.square()
-        multiplied = shared.clone()
-        for side in (terms[:3], terms[3:]):
-            one, two, three = shared[:, side].unbind(-1)
-            multiplied[:, side] = torch.stack([one + a, two + a * one + b, three + a * two + b * one], dim=-1)
-        found.append(multiplied)
-    return found
 
 
 def _unit_precision(start: Fit, below: list[int], size: tuple[int, int]) -> Tensor:
@@ -210,11 +202,6 @@ def _drawn_to(shared: Tensor, precision: Tensor, task: Task) -> Prior:
     own = given.diagonal(dim1=-2, dim2=-1)
     total = own + precision
     return Prior(torch.where(total > 0, (own * mean + precision * shared) / total, 0.0), given + more, given)
-
-
-def _data_cost(found: Fit) -> Tensor:
-    costs = view_costs(found.task, found.solution.shared, found.solution.local)
-    return (costs if found.task.shares is None else costs * found.task.shares).sum(-1)
 
 
 def _put(found: Fit, which: Tensor, other: Fit, taken: Tensor) -> Fit:

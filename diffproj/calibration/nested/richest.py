@@ -14,14 +14,16 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.fitting.data import Data
-from diffproj.calibration.fitting.fit import Fit
+from diffproj.calibration.fitting.fit import Fit, fit
 from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.fitting.positive_focal import with_positive_focal_lengths
 from diffproj.calibration.fitting.second_look import second_look
 from diffproj.calibration.fitting.start import Straightened
-from diffproj.calibration.outcome import minimised
+from diffproj.calibration.nested.factors import aside
+from diffproj.calibration.nested.restraint import restrained
+from diffproj.calibration.nested.tilt_twin import lower_valley
+from diffproj.calibration.outcome import begun
 from diffproj.calibration.problem.parametrisation import SKEW, Parametrisation, Pose
-from diffproj.calibration.restraint import restrained
 from diffproj.calibration.trust.entangled import DENOMINATOR
 from diffproj.lens.models import MODELS
 
@@ -100,11 +102,18 @@ class Nested:
 
     def _fit(self, options: Options, start: tuple[Tensor, Pose], inside: tuple[tuple[str, ...], ...] = ()) -> Fit:
         """The lowest fit that is found from there, with these groups."""
-        found, _ = minimised(self.data, options, self.parameters, *start, self.reference)
+        task, shared, local, _ = begun(self.data, options, self.parameters, *start, self.reference)
         steps: dict[str, Any] = {"max_iterations": options.max_iterations, "tolerance": options.tolerance}
-        limit = options.outlier_limit
+        limit, beside = options.outlier_limit, None
+        first: dict[str, Any] = steps | {"reject": limit, "progress": options.progress}
+        if DENOMINATOR in inside:
+            found, beside = aside(task, shared, local, self.size, **first)
+        else:
+            found = fit(task, shared, local, **first)
         # The valleys of a prism alone and of a denominator are long; many steps to a tilt may lead to a side one.
         long_valley = inside == (PRISM,) or DENOMINATOR in inside
         found = second_look(found, self.straight, reject=limit, long_valley=long_valley, **steps)
         found = with_positive_focal_lengths(found, **steps)
-        return restrained(found, *start, self.size, reject=limit, **steps) if DENOMINATOR in inside else found
+        if DENOMINATOR in inside:
+            found = restrained(found, *start, self.size, beside, reject=limit, **steps)
+        return lower_valley(found, self.size, reject=limit, **steps) if TILT in inside else found
