@@ -46,6 +46,8 @@ HAIR = 1.1
 """Factor of the cost that is paid to make a lens that reaches all of its corners reach the whole image, too."""
 LOWER = 1e-9
 """Part of the cost by which another minimum must be lower to be taken."""
+PROMISING = 0.5
+"""Residuals' worth of noise by which a start with a factor must be lower after a few steps to go on to its end."""
 WORTH, OPEN = 1.0, 0.05
 """Residuals' worth of noise by which one from a start with factors must be lower; and the deviation of a focal length
 or principal point, relative to the focal length, above which it is not taken: at twice that the views are refused."""
@@ -106,7 +108,8 @@ def restrained(
         weighed(which, other, _knows_focal(other), WORTH / spare[which])
 
     if aside is not None:
-        lower = ((spare > 0) & (reached >= 1) & (data_cost(aside) < data_cost(found) * (1 - LOWER))).nonzero().flatten()
+        looks_lower = data_cost(aside) < data_cost(found) * (1 - PROMISING / spare)
+        lower = ((spare > 0) & (reached >= 1) & looks_lower).nonzero().flatten()
         if len(lower) > 0:
             ended(lower, aside.part(lower))
     if len(which) == 0:
