@@ -86,7 +86,8 @@ def cross_validate(
 
     The pose of a held-out view is estimated from every second corner and evaluated on the others, then with the roles
     exchanged, so that no corner is evaluated with a pose that it contributed to. (A view with fewer than 4 such corners
-    is not evaluated.) A target's shape is that of the views of the fit alone.
+    is not evaluated.) A target's shape is that of the views of the fit alone. With `reject_outliers`, what the fit to all
+    views rejects is left out first: such a corner is wrong, and tells nothing of the camera.
 
     Args:
         views: corners `(V, N, 2)` of one camera; view i is left out of fit i mod k.
@@ -112,6 +113,10 @@ def cross_validate(
     want = f"a whole number from 2 to the number of views, {len(views)}"
     folds = whole_number("folds", folds, want, least=2, most=len(views))
     views = _with_true_centres(views, target, distortion, chosen, "cross_validate")
+    if chosen.outlier_limit is not None:
+        views = views.hiding(
+            calibrated(views, target, distortion, chosen.but(progress=None), "cross_validate").rejected
+        )
     fits, errors = without_views(views, target, distortion, folds_of(views, folds), chosen, who="cross_validate")
     held_out_px, held_out_world, lost = errors.over_views()
     in_sample_px, in_sample_world, _ = errors_of(fits, fits.views.pixels, fits.used).over_views()

@@ -45,6 +45,24 @@ def test_held_out_errors_are_larger_and_in_their_place() -> None:
     assert lines[-1].startswith("all")
 
 
+@pytest.mark.parametrize("who", ["camera", "rig"])
+def test_corners_that_all_views_reject_are_no_held_out_errors(who: str) -> None:
+    """A wrong corner tells nothing of the camera: one that is 40 px off made the held-out error 1.5 px."""
+    views = dp.example_views("left")
+    pixels = views.pixels.clone()
+    pixels[4, 20] += 40.0
+    wrong = dp.Views(pixels, views.visible, views.names, views.size)
+
+    def held_out(views: dp.Views, **options: bool) -> float:
+        if who == "camera":
+            return float(dp.cross_validate(views, BOARD, folds=3, **options).held_out_px.amax())  # type: ignore[arg-type]
+        pair = {"left": views, "right": dp.example_views("right")}
+        return float(dp.cross_validate_rig(pair, BOARD, folds=3, **options).held_out_px.amax())  # type: ignore[arg-type]
+
+    assert held_out(wrong) > 1
+    assert held_out(wrong, reject_outliers=True) == pytest.approx(held_out(views, reject_outliers=True), rel=0.02)
+
+
 def test_bootstrap_agrees_with_the_covariance() -> None:
     K = torch.tensor([[533.0, 0, 342], [0, 534, 235], [0, 0, 1]], dtype=D)
     truth = synthetic.random_cameras(dp.Camera(K, size=(640, 480)), BOARD, 60)

@@ -91,7 +91,7 @@ def cross_validate_rig(
 
     At a held-out moment the target is located with the rig from every second corner of all cameras together, and
     evaluated on the others, then with the roles exchanged, so that no corner is evaluated with a pose that it
-    contributed to.
+    contributed to. With `reject_outliers`, what the fit to all moments rejects is left out first.
 
     Args:
         views_by_camera: corners by the camera's name, as for `calibrate_rig`; moment i is left out of fit i mod k.
@@ -122,6 +122,9 @@ def cross_validate_rig(
     want = f"a whole number from 2 to the number of moments, {len(whole.moments)}"
     folds = whole_number("folds", folds, want, least=2, most=len(whole.moments))
     labels = {name: [whole.moments[i] for i in where.tolist()] for name, where in whole.where.items()}
+    if chosen.outlier_limit is not None:
+        every = rig_calibrated(rig_task(views_by_camera, target, distortion, labels, cameras, chosen, who)).calibrations
+        views_by_camera = {name: views.hiding(every[name].rejected) for name, views in views_by_camera.items()}
     fits, inside, outside = [], [], []
     for fold in range(folds):
         out = {name: where % folds == fold for name, where in whole.where.items()}
