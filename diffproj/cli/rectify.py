@@ -5,8 +5,8 @@ import functools
 from pathlib import Path
 
 from diffproj.cli.common_options import add_camera, add_photograph, add_plane, add_pose, add_said, describe
-from diffproj.cli.inputs import file_ending, numbers
-from diffproj.cli.units import length
+from diffproj.cli.inputs import file_ending
+from diffproj.cli.units import Length, is_extent, length, place
 from diffproj.cli.which_board import check_board
 
 DESCRIPTION = """\
@@ -23,8 +23,9 @@ landmarks.
 EPILOG = """\
 the top view:
   It is seen from the camera's side of the plane, never mirrored. --extent is in
-  the frame and the unit of the board, or of the landmarks. --height and --plane
-  say which plane, as for 'diffproj measure'; what stands above it leans away.
+  the frame of the board, or of the landmarks, and in their unit where it names
+  none. --height and --plane say which plane, as for 'diffproj measure'; what
+  stands above it leans away.
 
 on a map:
   --world-file writes where the pixels are: six lines, in a .pgw for a .png and
@@ -34,10 +35,15 @@ on a map:
 examples:
   diffproj rectify photo.jpg --camera camera.json --board 9x6 --square 25mm
   diffproj rectify photo.jpg --camera camera.json --board 9x6 --square 25mm \\
-      --extent -50,-50,250,175 --resolution 0.25mm -o board.png
+      --extent -50mm,-50mm,250mm,175mm --resolution 0.25mm -o board.png
   diffproj rectify mast.jpg --camera located.json --view mast.jpg \\
       --resolution 0.05 --world-file -o ground.tif
 """
+
+EXTENT = (
+    "want x0,y0,x1,y1 without spaces, x1 above x0 and y1 above y0, with their units or without, "
+    "such as -50mm,-50mm,250mm,175mm"
+)
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
@@ -83,14 +89,13 @@ def add_options(command: argparse.ArgumentParser) -> None:
     command.set_defaults(work="rectifying", check=functools.partial(_check_pose, command))
 
 
-def _extent(text: str) -> tuple[float, ...]:
-    values = numbers(text, 4)
-    if values is None or not (values[2] > values[0] and values[3] > values[1]):
-        raise argparse.ArgumentTypeError(
-            "want x0,y0,x1,y1 without spaces, x1 above x0 and y1 above y0, such as -50,-50,250,175, "
-            f"got {text.strip()!r}"
-        )
-    return values
+def _extent(text: str) -> tuple[Length, ...]:
+    places = [place(part) for part in text.split(",")]
+    read = [each for each in places if each is not None]
+    alike = len({each.unit for each in read}) == 1  # else only the board's unit tells which is larger
+    if len(read) != 4 or len(places) != 4 or (alike and not is_extent([each.value for each in read])):
+        raise argparse.ArgumentTypeError(f"{EXTENT}, got {text.strip()!r}")
+    return tuple(read)
 
 
 def _check_pose(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:

@@ -16,7 +16,7 @@ from diffproj.cli.measure_plane import described, height_above_face, plane_of
 from diffproj.cli.photographs import one_photograph
 from diffproj.cli.scene import Scene, check_size, new_photograph, stored_view
 from diffproj.cli.terminal import as_json, progress_bars, result
-from diffproj.cli.units import Length, in_unit
+from diffproj.cli.units import Length, in_unit, is_extent
 from diffproj.geometry.back_projection import ground_resolution
 from diffproj.geometry.plane import Plane
 from diffproj.geometry.rectification import plane_axes, rectify
@@ -130,7 +130,7 @@ def _view(options: argparse.Namespace, scene: Scene, plane: Plane) -> View:
     places = torch.stack([known @ along_x, known @ along_y], dim=-1)
     low, high = places.amin(0), places.amax(0)
     around = AROUND * (high - low).max()
-    extent = options.extent or (*(low - around).tolist(), *(high + around).tolist())
+    extent = _extent(options.extent, scene) or (*(low - around).tolist(), *(high + around).tolist())
     resolution = _resolution(options.resolution, scene, plane, origin, along_x, along_y, extent)
     x0, y0, x1, y1 = extent
     columns, rows = (max(1, math.ceil(side / resolution - 1e-6)) for side in (x1 - x0, y1 - y0))
@@ -144,6 +144,24 @@ def _view(options: argparse.Namespace, scene: Scene, plane: Plane) -> View:
     above = float(normal @ (scene.camera.center - origin)) > 0
     whole = (x0, y0, x0 + columns * resolution, y0 + rows * resolution)
     return View(whole, resolution, columns, rows, options.north_up or above)
+
+
+def _extent(given: tuple[Length, ...] | None, scene: Scene) -> tuple[float, ...] | None:
+    """What of the plane is asked for, in world units.
+
+    Raises:
+        ValueError: a unit that the world's cannot be compared with, or no rectangle.
+    """
+    if given is None:
+        return None
+    values = [in_unit(each, scene.square.unit) for each in given]
+    read = [value for value in values if value is not None]
+    words = ",".join(str(each).replace(" ", "") for each in given)
+    if len(read) != len(given):
+        raise ValueError(f"--extent: want it in {scene.unit_in_words}, got {words}; leave the units out")
+    if not is_extent(read):
+        raise ValueError(f"--extent: want x1 above x0 and y1 above y0, got {words}")
+    return tuple(read)
 
 
 def _resolution(

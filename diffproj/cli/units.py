@@ -3,6 +3,7 @@
 import argparse
 import math
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 METRES = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048}
@@ -56,12 +57,24 @@ def length(text: str) -> Length:
 
 def height(text: str) -> Length:
     """Read a height, such as `12`, `-3` or `1.2cm`."""
-    found = _length(text)
-    if found is None or abs(found.value) > 1 / SMALLEST:
+    found = place(text)
+    if found is None:
         raise argparse.ArgumentTypeError(
             f"want a height as a number, with its unit or in that of the board, such as 12mm, got {text!r}"
         )
     return found
+
+
+def place(text: str) -> Length | None:
+    """Read a coordinate, such as `-50mm` or `0.3`; `None` where it is none."""
+    found = _length(text)
+    return None if found is None or abs(found.value) > 1 / SMALLEST else found
+
+
+def is_extent(numbers: Sequence[float]) -> bool:
+    """Whether x0, y0, x1, y1 are those of a rectangle."""
+    x0, y0, x1, y1 = numbers
+    return x1 > x0 and y1 > y0
 
 
 def in_unit(length: Length, unit: str | None) -> float | None:

@@ -113,9 +113,16 @@ def test_what_is_shown_by_itself(capsys: pytest.CaptureFixture[str]) -> None:
     assert "The photograph shows 99 % of it; the rest is transparent" in out
 
 
+@pytest.mark.parametrize("extent", ["-30mm,-3cm,205mm,13cm", "-0.03m,-30,20.5cm,130"])
+def test_the_extent_may_have_units(capsys: pytest.CaptureFixture[str], extent: str) -> None:
+    found = parsed(capsys, *GIVEN, "--extent", extent, "--resolution", "1")
+    assert found["extent"] == pytest.approx([-30, -30, 205, 130])
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ((*GIVEN, "--extent", "30cm,0,250,100"), "--extent: want x1 above x0 and y1 above y0, got 30cm,0,250,100"),
         ((*GIVEN, "--extent", "9000,9000,9100,9100"), "--extent: want a part of the plane that the photograph shows"),
         (
             (*GIVEN, "--extent", "9000,9000,9100,9100", "--resolution", "1"),
