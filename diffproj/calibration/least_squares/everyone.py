@@ -7,13 +7,10 @@ from torch import Tensor
 
 from diffproj.calibration.least_squares.damping import DampingControl
 
-FEWEST = 6
-"""How many more problems than twice those that are still moving there must be, for it to pay to part from the rest."""
-
 
 def pays_to_part(control: DampingControl) -> bool:
     """Whether so few problems are still moving that the solver should go on with those alone."""
-    return 2 * int(control.active.sum()) + FEWEST <= len(control.active)
+    return 2 * int(control.active.sum()) <= len(control.active)
 
 
 class Everyone:
