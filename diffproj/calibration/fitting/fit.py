@@ -16,7 +16,7 @@ from diffproj.calibration.fitting.surveyed import whitening
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.fitting.two_poses import found_again, settled
 from diffproj.calibration.least_squares.eliminated import reduced
-from diffproj.calibration.least_squares.solver import Solution, select
+from diffproj.calibration.least_squares.solver import Solution, for_each, select
 from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.results import covariance as covariances
 from diffproj.calibration.results.covariance import Covariance
@@ -218,7 +218,7 @@ def _fit(
 ) -> Fit:
     given = near = task.used
     rounds = 1 if reject is None else 1 + MAX_REJECTION_ROUNDS
-    most = int(torch.as_tensor(max_iterations).max())
+    most = max(for_each(max_iterations, shared).tolist())
     total = rounds * most
 
     def attempt(task: Task, shared: Tensor, local: tuple[Tensor, ...], done: int) -> Solution:

@@ -10,7 +10,7 @@ from torch import Tensor
 from diffproj.calibration.fitting.options import Progress
 from diffproj.calibration.fitting.own_frame import are_solid
 from diffproj.calibration.least_squares.losses import Loss
-from diffproj.calibration.least_squares.solver import Equations, Prior, Solution, solve
+from diffproj.calibration.least_squares.solver import Equations, Prior, Solution, for_each, solve
 from diffproj.calibration.problem.board_error import BoardError
 from diffproj.calibration.problem.parametrisation import POSE, Parametrisation
 from diffproj.calibration.problem.reprojection import Reprojection
@@ -153,8 +153,8 @@ def solved(
     as a part of the most.
     """
     blocks, parts = _blocks(task), []
-    limits = torch.as_tensor(max_iterations).expand(len(shared))
-    most = int(limits.max()) if len(limits) > 0 else 0
+    limits = for_each(max_iterations, shared)
+    most = max(limits.tolist(), default=0)
     for number, where in enumerate(blocks):
 
         def report(step: int, _: Tensor, number: int = number) -> None:

@@ -23,7 +23,7 @@ from diffproj.calibration.fitting import closed_form
 from diffproj.calibration.fitting.options import Progress
 from diffproj.calibration.fitting.task import Task, solved
 from diffproj.calibration.least_squares.losses import Cauchy
-from diffproj.calibration.least_squares.solver import Solution
+from diffproj.calibration.least_squares.solver import Solution, for_each
 from diffproj.calibration.problem.parametrisation import POSE, Pose
 from diffproj.geometry.cayley import turned
 
@@ -57,7 +57,7 @@ def settled(
     progress: Progress | None = None,
 ) -> Solution:
     """Minimise from shared parameters `(P, s)` and poses `(P, V, ...)`; the other pose of no view is then better."""
-    limits = torch.as_tensor(max_iterations, device=shared.device).expand(len(shared))
+    limits = for_each(max_iterations, shared)
     options: dict[str, Any] = {"tolerance": tolerance}
     solution = solved(task, shared, local, max_iterations=limits, progress=progress, **options)
     open_ = torch.ones(len(shared), dtype=torch.bool, device=shared.device)

@@ -175,6 +175,11 @@ class Solution(NamedTuple):
     equations: Equations
 
 
+def for_each(max_iterations: int | Tensor, problems: Tensor) -> Int[Tensor, " p"]:
+    """The maximum number of steps of each of the problems `(P, ...)`, where one stands for all."""
+    return torch.as_tensor(max_iterations, device=problems.device).expand(len(problems))
+
+
 def equations_at(
     problem: Problem,
     shared: Float[Tensor, "p s"],
@@ -228,10 +233,10 @@ def solve(
     cost, equations = terms.at(shared, local)
     state = _State(shared, local, cost, equations)
     negligible = negligible if isinstance(negligible, Tensor) else torch.full_like(cost, negligible)
-    limit = torch.as_tensor(max_iterations).expand(len(cost)).numpy(force=True)
-    control = DampingControl(_array(cost), _array(negligible), limit)
+    limits = for_each(max_iterations, cost).numpy(force=True)
+    control = DampingControl(_array(cost), _array(negligible), limits)
     everyone = Everyone(state, control)
-    for iteration in range(1, int(limit.max(initial=0)) + 1):
+    for iteration in range(1, int(limits.max(initial=0)) + 1):
         along = state.equations.along(basis)
         q, dz, reduction = damped_step(along, torch.from_numpy(control.damping).to(cost))
         predicted = _array(reduction)
