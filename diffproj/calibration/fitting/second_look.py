@@ -318,7 +318,7 @@ def lower_fit(found: Fit, other: Fit, which: Tensor, reject: float | None) -> Fi
     before, now = found.solution.cost[which], other.solution.cost
     ended = (found.solution.status[which] != Status.CONVERGED) & (other.solution.status == Status.CONVERGED)
     if reject is not None:
-        before, now = _truncated(found, other, which, reject)
+        before, now = truncated(found, other, which, reject)
     margin = torch.full_like(before, 1 - LOWER).masked_fill(ended, 1 + LOWER)
     lower = now.isfinite() & ~(now >= before * margin)
     taken = which[lower]
@@ -330,7 +330,7 @@ def lower_fit(found: Fit, other: Fit, which: Tensor, reject: float | None) -> Fi
     return Fit(replace(found.task, used=used), solution, rejected)
 
 
-def _truncated(found: Fit, other: Fit, which: Tensor, reject: float) -> tuple[Tensor, Tensor]:
+def truncated(found: Fit, other: Fit, which: Tensor, reject: float) -> tuple[Tensor, Tensor]:
     """Costs `(n,)` of two fits that reject different corners: all corners count, each at most at the limit."""
     given = replace(found.task, used=found.task.used | found.rejected).part(which)
     residuals = []

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.fitting.fit import Fit, fit
+from diffproj.calibration.fitting.second_look import truncated
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.fitting.two_poses import replaced
 from diffproj.calibration.least_squares.solver import Prior
@@ -86,15 +87,14 @@ def restrained(
     best, reached = found, reach_of(found, size)
     lost = reached < 0
     which = ((spare > 0) & (reached < 1)).nonzero().flatten()
-    dearest = torch.where(lost, torch.inf, HAIR * data_cost(found))
 
     def weighed(which: Tensor, other: Fit, allowed: Tensor, lower: Tensor | float = LOWER) -> Tensor:
         """Which of the others `(n,)` do not fold; they are kept where they are allowed, and better."""
         nonlocal best, reached
-        cost = data_cost(other)
-        reach = torch.where(allowed & (cost <= dearest[which]), reach_of(other, size), -1.0)
-        lowest = data_cost(best)[which] * (1 - lower)
-        better = allowed & ((reach > reached[which]) | ((reach == reached[which]) & (cost < lowest)))
+        first, cost = _costs(found, other, which, reject)
+        reach = torch.where(allowed & (lost[which] | (cost <= HAIR * first)), reach_of(other, size), -1.0)
+        lowest, cost = _costs(best, other, which, reject)
+        better = allowed & ((reach > reached[which]) | ((reach == reached[which]) & (cost < lowest * (1 - lower))))
         best = _put(best, which[better], other, better)
         reached[which] = reach.maximum(reached[which])
         return reach >= 1
@@ -108,8 +108,8 @@ def restrained(
         weighed(which, other, _knows_focal(other), WORTH / spare[which])
 
     if aside is not None:
-        looks_lower = data_cost(aside) < data_cost(found) * (1 - PROMISING / spare)
-        lower = ((spare > 0) & (reached >= 1) & looks_lower).nonzero().flatten()
+        first, cost = _costs(found, aside, torch.arange(len(spare), device=spare.device), reject)
+        lower = ((spare > 0) & (reached >= 1) & (cost < first * (1 - PROMISING / spare))).nonzero().flatten()
         if len(lower) > 0:
             ended(lower, aside.part(lower))
     if len(which) == 0:
@@ -141,7 +141,7 @@ def restrained(
     if aside is not None:
         starts[0] = aside.solution.shared, aside.solution.local
     if starts[0][0] is not None:
-        begin = torch.cat([shared[which] for shared, _ in starts if shared is not None])
+        begin = torch.cat([parameters[which] for parameters, _ in starts if parameters is not None])
         local = tuple(
             torch.cat([z[which] for z in parts]) for parts in zip(*(poses for _, poses in starts), strict=True)
         )
@@ -183,6 +183,11 @@ def _knows_focal(found: Fit) -> Tensor:
     """Where focal lengths and principal point are known well enough `(P,)`."""
     deviation = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, :4].sqrt()
     return (deviation <= OPEN * found.solution.shared[:, (0, 1, 0, 1)].abs()).all(-1)
+
+
+def _costs(found: Fit, other: Fit, which: Tensor, reject: float | None) -> tuple[Tensor, Tensor]:
+    """What the corners of some cameras cost `(n,)` in one fit and in the other, whichever of them each rejects."""
+    return (data_cost(found)[which], data_cost(other)) if reject is None else truncated(found, other, which, reject)
 
 
 def _unit_precision(start: Fit, below: list[int], size: tuple[int, int]) -> Tensor:
