@@ -15,8 +15,8 @@ from diffproj.lens.models import MODELS
 
 D = torch.float64
 BOARD = dp.Chessboard()
-PIXELS_AT_ONCE = 40
-"""Poses that are tried for each view at once."""
+TRIES = 20_000
+"""Poses that are tried for each view."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def _photographed(
     R, t = torch.zeros(count, views, 3, 3, dtype=D), torch.zeros(count, views, 3, dtype=D)
     wanting = torch.ones(count, views, dtype=torch.bool)
     many = camera[:, None]
-    for _ in range(1500):
+    for _ in range(TRIES):
         where = wanting.nonzero()
         if len(where) == 0:
             break
@@ -114,7 +114,7 @@ def _photographed(
         rows = where[taken]
         R[rows[:, 0], rows[:, 1]], t[rows[:, 0], rows[:, 1]] = turned[taken], shift[taken]
         wanting[rows[:, 0], rows[:, 1]] = False
-    assert not bool(wanting.any()), f"no place for a board in {int(wanting.sum())} views"
+    assert not bool(wanting.any()), f"no place for a board in {int(wanting.sum())} views; take another seed"
     truth = many.at(R, t)
     pixels, visible = truth.project(points)
     pixels = pixels + noise * draw.normal(*pixels.shape)
