@@ -6,19 +6,12 @@ mark `plain` and run in a session of their own, without the checks, that `test_p
 """
 
 import os
-import sys
-import types
 
 SHAPE_CHECKS = os.environ.get("DIFFPROJ_SHAPE_CHECKS", "1") == "1"
 if SHAPE_CHECKS:
-    from beartype import BeartypeConf, beartype
-    from jaxtyping import install_import_hook
+    from tests import shape_checks
 
-    # The hook takes its checker by name; this one lets an int stand for a float, as Python's typing does.
-    checker = types.ModuleType("shape_checker")
-    checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True))
-    sys.modules["shape_checker"] = checker
-    install_import_hook("diffproj", "shape_checker.check")
+    shape_checks.install("diffproj")
 
 import hypothesis
 import pytest

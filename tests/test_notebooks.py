@@ -53,6 +53,7 @@ def test_notebooks_use_public_names_only() -> None:
         assert not re.search(r"\._[a-z]| import _[a-z]", code)
 
 
+@pytest.mark.slow  # tests of the experiment itself, and of the command that runs it, take seconds
 def test_the_paper_experiment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     found = outcome(
         "01_paper_experiment",

@@ -1,9 +1,8 @@
 """Whatever is given to a command: one line names the argument or the file and what to do, and nothing is written."""
 
+import io
 import json
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -358,13 +357,13 @@ def test_what_nobody_thought_of_is_one_line_too(
     )
 
 
-def test_a_terminal_without_signs_is_no_failure(folder: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "diffproj", *VIEW, *POINTS],
-        cwd=folder,
-        env={**os.environ, "PYTHONIOENCODING": "ascii"},
-        capture_output=True,
-        text=True,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "x ? deviation" in done.stdout
+def test_a_terminal_without_signs_is_no_failure(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding="ascii") for _ in range(2))
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "stderr", err)
+    assert cli.main([*VIEW, *POINTS]) == 0
+    for stream in (out, err):
+        stream.seek(0)
+    assert "x ? deviation" in out.read()
+    assert err.read() == ""

@@ -21,6 +21,11 @@ def scenes() -> list[Scene]:
     return [scene(2, 8, seed=1), scene(3, 9, seed=2), scene(2, 14, seed=3)]
 
 
+@pytest.fixture(scope="module")
+def by_itself(scenes: list[Scene]) -> list[dp.RigCalibration]:
+    return [dp.calibrate_rig(one.views, one.board) for one in scenes]
+
+
 def same(one: object, other: dp.RigCalibration) -> None:
     assert isinstance(one, dp.RigCalibration)
     assert one.status == other.status
@@ -34,15 +39,14 @@ def same(one: object, other: dp.RigCalibration) -> None:
     assert one.summary() == other.summary()
 
 
-def test_each_ends_as_alone(scenes: list[Scene]) -> None:
+def test_each_ends_as_alone(scenes: list[Scene], by_itself: list[dp.RigCalibration]) -> None:
     told: list[tuple[int, int]] = []
     found = dp.calibrate_rig([one.views for one in scenes], scenes[0].board, progress=lambda *at: told.append(at))
     assert told == [(1, 3), (2, 3), (3, 3)]
-    for one, true in zip(found, scenes, strict=True):
-        same(one, dp.calibrate_rig(true.views, true.board))
-    alone = dp.calibrate_rig([scenes[0].views], scenes[0].board)
-    same(alone[0], dp.calibrate_rig(scenes[0].views, scenes[0].board))
-    same(copy.deepcopy(found[1]), dp.calibrate_rig(scenes[1].views, scenes[1].board))
+    for one, true in zip(found, by_itself, strict=True):
+        same(one, true)
+    same(dp.calibrate_rig([scenes[0].views], scenes[0].board)[0], by_itself[0])
+    same(copy.deepcopy(found[1]), by_itself[1])
 
 
 def test_cameras_start_in_batches_that_are_bounded_and_well_filled(
@@ -79,14 +83,14 @@ def test_a_rig_is_little_more_than_what_it_was_found_from(scenes: list[Scene]) -
     assert len(pickle.dumps(rig)) < 22 * len(pickle.dumps(scenes[2].views))
 
 
-def test_what_fails_stands_in_its_place(scenes: list[Scene]) -> None:
+def test_what_fails_stands_in_its_place(scenes: list[Scene], by_itself: list[dp.RigCalibration]) -> None:
     first, second, third = (dict(one.views) for one in scenes)
     stranger = dp.Views(first["cam1"].pixels, first["cam1"].visible, [f"other {i}" for i in range(len(first["cam1"]))])
     unconnected = first | {"cam1": dp.Views(stranger.pixels, stranger.visible, stranger.names, size=(1280, 960))}
     flat = second | {"cam2": second["cam2"][[0]]}
     found = dp.calibrate_rig([first, unconnected, flat, third], scenes[0].board)
-    same(found[0], dp.calibrate_rig(first, scenes[0].board))
-    same(found[3], dp.calibrate_rig(third, scenes[0].board))
+    same(found[0], by_itself[0])
+    same(found[3], by_itself[2])
     assert isinstance(found[1], dp.CalibrationError)
     assert str(found[1]).startswith("calibrate_rig: of rig 1, calibrate_rig: the names of the views tell no moment")
     assert isinstance(found[2], dp.CalibrationError)
