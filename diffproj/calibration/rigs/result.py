@@ -17,8 +17,9 @@ from diffproj.calibration.problem.shape_names import Shape
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.results.covariance import Covariance
 from diffproj.calibration.rigs.account import RigAccount
+from diffproj.calibration.rigs.extrapolation import Rig
 from diffproj.calibration.rigs.record import RigRecorded
-from diffproj.calibration.rigs.triangulation import Rig, Triangulation, triangulated
+from diffproj.calibration.rigs.triangulation import Triangulation, triangulated
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.cayley import cross_matrix
 

@@ -11,12 +11,14 @@ What the residuals of a point tell besides is whether its pixels are of one poin
 the point does not take up, `P e` with P the projection off the columns of J, and their chi-square has two degrees of
 freedom a camera, less three: with two cameras that of the distance from each other's epipolar lines. Where chance does
 not explain it nothing tells which pixel is wrong, and the covariance grows by chi-square over its degrees of freedom.
+
+Where a camera's lens is extrapolated, the rig's part is larger than to first order: see `extrapolation.py`.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -28,10 +30,8 @@ from diffproj._core.numerics import check_tensor
 from diffproj._core.shown import Shown
 from diffproj._core.shown import number as shown
 from diffproj._core.warn import warn_caller
-from diffproj.calibration.results.calibration import Calibration
-from diffproj.calibration.results.covariance import Covariance
 from diffproj.calibration.results.mismatch import CameraDisagreementWarning
-from diffproj.geometry.camera import Camera
+from diffproj.calibration.rigs.extrapolation import Rig, beyond_corners, stretch
 from diffproj.geometry.cayley import cross_matrix
 from diffproj.geometry.grid import warn_if_off_image
 from diffproj.lens.coefficients import CoefficientLens
@@ -45,15 +45,6 @@ STEPS = 12
 """Gauss-Newton steps from the point nearest to all rays; noise of pixels takes three or four."""
 
 
-class Rig(NamedTuple):
-    """What this asks of a calibrated rig: `columns` is where a camera's own stand in the covariance, by name."""
-
-    cameras: dict[str, Camera]
-    calibrations: dict[str, Calibration]
-    covariance: Covariance
-    columns: dict[str, list[int]]
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Triangulation(Shown, Copied):
     """Points in the rig's frame, and how sure each of them is.
@@ -61,10 +52,13 @@ class Triangulation(Shown, Copied):
     Attributes:
         points: `(N, 3)` in world units; 0 where not valid.
         valid: where at least two cameras see the point, in front of them, from different directions `(N,)`.
-        covariance: of each point `(N, 3, 3)`, in squared world units: of its pixels and the rig; NaN if not valid.
+        covariance: of each point `(N, 3, 3)`, in squared world units: of its pixels and the rig; NaN if not valid, and
+            infinite where an extrapolated lens may end before the pixel.
         residuals: projected minus seen pixels, by camera, `(N, 2)`; 0 where a camera does not see the point.
         disagrees: where the residuals are larger than noise and rig explain, as where a camera's pixel is that of
             another point `(N,)`. The covariance there is as much larger as it takes to explain them.
+        extrapolated: seen by a camera outside of the region that its corners covered `(N,)`, where the lens model is
+            extrapolated. The covariance holds what the calibration leaves open there, as long as lens and camera agree.
     """
 
     points: Float[Tensor, "n 3"]
@@ -72,6 +66,7 @@ class Triangulation(Shown, Copied):
     covariance: Float[Tensor, "n 3 3"]
     residuals: dict[str, Float[Tensor, "n 2"]]
     disagrees: Bool[Tensor, " n"]
+    extrapolated: Bool[Tensor, " n"]
     _by_rig: Tensor  # derivative of the points by a root of the rig's covariance (N, 3, s)
     _of_pixels: Tensor  # covariance of the pixels' noise alone (N, 3, 3)
 
@@ -104,7 +99,8 @@ class Triangulation(Shown, Copied):
         length = apart.norm()
         along = apart / length.clamp(min=torch.finfo(length.dtype).tiny)
         shift = along @ (self._by_rig[j] - self._by_rig[i])
-        variance = shift @ shift + along @ (self._of_pixels[i] + self._of_pixels[j]) @ along
+        noise = self._of_pixels[i] + self._of_pixels[j]
+        variance = torch.inf * length if bool(noise.isinf().any()) else shift @ shift + along @ noise @ along
         known = bool(self.valid[i] & self.valid[j])
         return float(length) if known else math.nan, float(variance.sqrt())
 
@@ -113,7 +109,8 @@ class Triangulation(Shown, Copied):
         points = torch.where(self.valid.unsqueeze(-1), self.points, torch.nan)
         columns = {name: points[:, i].tolist() for i, name in enumerate("xyz")}
         columns |= {f"{name}_deviation": self.deviations[:, i].tolist() for i, name in enumerate("xyz")}
-        return columns | {"valid": self.valid.tolist(), "disagrees": self.disagrees.tolist()}
+        flags = {"valid": self.valid, "disagrees": self.disagrees, "extrapolated": self.extrapolated}
+        return columns | {name: flag.tolist() for name, flag in flags.items()}
 
     def _facts(self) -> list[str]:
         size = self.deviations[self.valid].square().sum(-1).sqrt()
@@ -122,6 +119,7 @@ class Triangulation(Shown, Copied):
             f"{int(self.valid.sum())} valid",
             f"deviation {shown(size, '.3g')}",
             f"{int(self.disagrees.sum())} doubtful" if bool(self.disagrees.any()) else "",
+            f"{int(self.extrapolated.sum())} extrapolated" if bool(self.extrapolated.any()) else "",
         ]
 
     def _columns(self) -> dict[str, list[Any]]:
@@ -153,15 +151,21 @@ def triangulated(rig: Rig, pixels_by_camera: Any, pixel_sigma: Any) -> Triangula
     shifts = torch.cat([_by_parameters(rig, name, X) * whole[name] @ root[rig.columns[name]] for name in pixels], -2)
     off = torch.cat([residuals[name].unsqueeze(-1) * whole[name] for name in pixels], dim=-2)
     by_rig = -inverse @ slopes.mT @ shifts
-    disagrees, scale = _disagreement(slopes, shifts, off, inverse, count, valid)
+    extrapolated = valid & beyond_corners(rig, pixels, seen)
+    factor = stretch(rig, extrapolated, X, whole, slopes, inverse, root, by_rig)
+    unknown = factor.isinf()
+    factor = torch.where(unknown, 0.0, factor)[:, None, None]  # an unknown point's errors go with no other's
+    by_rig, shifts = factor * by_rig, factor * shifts
+    disagrees, scale = _disagreement(slopes, shifts, off, inverse, count, valid & ~unknown)
     if bool(disagrees.any()):
         warn_caller(_doubt(disagrees), CameraDisagreementWarning)
     by_rig = torch.where(valid[:, None, None], scale.sqrt()[:, None, None] * by_rig, torch.nan)
+    inverse = torch.where(unknown[:, None, None], torch.diag_embed(torch.full_like(X, torch.inf)), inverse)
     inverse = torch.where(valid[:, None, None], scale[:, None, None] * inverse, torch.nan)
     covariance = inverse + by_rig @ by_rig.mT
     points = torch.where(valid.unsqueeze(-1), X, 0.0)
     left = {name: torch.where(valid.unsqueeze(-1), residuals[name], 0.0) for name in pixels}
-    return Triangulation(points, valid, covariance, left, disagrees, by_rig, inverse)
+    return Triangulation(points, valid, covariance, left, disagrees, extrapolated, by_rig, inverse)
 
 
 def _disagreement(
