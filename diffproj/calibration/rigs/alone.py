@@ -81,6 +81,7 @@ class Alone(NamedTuple):
         rms: RMS reprojection error in pixels.
         remark: what is to be known of it, in one text; computed when called.
         others: the other pose of each of its views, from the target's own frame; computed when called.
+        restrained: whether its terms below the line are held near those of a poorer lens, for without that it folds.
     """
 
     parameters: Parametrisation
@@ -88,6 +89,7 @@ class Alone(NamedTuple):
     rms: float
     remark: Callable[[], str]
     others: Callable[[], OtherPoses]
+    restrained: bool = False
 
 
 class Asked(NamedTuple):
@@ -248,7 +250,9 @@ def _calibrated(
         R, t = found.cameras.R[row, :count].detach(), found.cameras.t[row, :count].detach()
         seen = Seen(shared[row], *data.frame.pose(R, t), found.used[row, :count])
         part = _Part(first.who, data, fit.alone(row, count))
-        results.append(Alone(found.parameters, seen, rms[row], part.remark, part.others))
+        prior = fit.task.prior
+        near = prior is not None and prior.known is not None and bool((prior.precision != prior.known)[row].any())
+        results.append(Alone(found.parameters, seen, rms[row], part.remark, part.others, near))
     return results
 
 

@@ -13,6 +13,7 @@ from diffproj.calibration.fitting.task import NEGLIGIBLE_PX
 from diffproj.calibration.least_squares.losses import Loss
 from diffproj.calibration.least_squares.solver import Equations, Prior
 from diffproj.calibration.problem.shape import Restraint
+from diffproj.calibration.results.border import border_with_rays
 from diffproj.calibration.rigs.knowledge import RigKnowledge
 from diffproj.calibration.rigs.options import free_directions
 from diffproj.calibration.rigs.parameters import RigParameters
@@ -98,6 +99,7 @@ def rig_fit(
     positions: Sequence[int],
     options: Options,
     known: RigKnowledge | None = None,
+    restrained: Sequence[str] = (),
 ) -> Refinement[RigFit]:
     """The minimum, by what it wants of the solver.
 
@@ -110,28 +112,53 @@ def rig_fit(
         positions: of the shared unknowns that are held.
         options: checked.
         known: what is known of the cameras beforehand.
+        restrained: cameras whose terms below the line had to be held near others on their own. Let go, they nearly
+            cancel, if the lens folds by that or not; so they are held here, too.
     """
+    terms = _below(parameters)
+    below = {name: terms[name] for name in restrained if not set(terms[name]) <= set(positions)}
+    positions = sorted({*positions, *(position for one in below.values() for position in one)})
     found = yield from _fitted(views, parameters, intrinsics, start, inliers, positions, options, known)
-    below = _folding(found)
-    if below:  # two terms of a rational lens that nearly cancel: on its own, the camera's was kept from that
-        positions = sorted({*positions, *(position for one in below.values() for position in one)})
+    folding = _folding(found, intrinsics)
+    if folding:  # two terms of a rational lens that nearly cancel: on its own, the camera's was kept from that
+        positions = sorted({*positions, *(position for one in folding.values() for position in one)})
         found = yield from _fitted(views, parameters, intrinsics, start, inliers, positions, options, known)
+    below |= folding
     return replace(found, restrained=tuple(below), positions=tuple(positions))
 
 
-def _folding(found: RigFit) -> dict[str, list[int]]:
-    """Where the free terms below the line stand, of the cameras whose lens folds at its corners."""
+def _below(parameters: RigParameters) -> dict[str, list[int]]:
+    """Where the terms below the line stand among the shared unknowns, by camera."""
+    found = {}
+    for c, (name, kind) in enumerate(zip(parameters.cameras, parameters.kinds, strict=True)):
+        start = parameters.intrinsics(c).start
+        found[name] = [start + kind.names.index(term) for term in DENOMINATOR if term in kind.names]
+    return found
+
+
+def _folding(found: RigFit, alone: Mapping[str, Tensor]) -> dict[str, list[int]]:
+    """Where the free terms below the line stand, of the cameras whose lens folds at its corners.
+
+    Or inside the image, of which it has rays for less than with the intrinsics of the camera `alone`.
+    """
     R, t = found.problem.cameras(found.shared)
     free = torch.ones_like(found.shared[0]) if found.basis is None else found.basis[0].abs().sum(-1)
-    below = {}
+    below, every = {}, _below(found.parameters)
     for c, (name, kind) in enumerate(zip(found.views.names, found.parameters.kinds, strict=True)):
         own, where = found.parameters.intrinsics(c), found.views.where[name]
-        terms = [own.start + kind.names.index(term) for term in DENOMINATOR if term in kind.names]
+        terms = every[name]
         if not any(bool(free[i] > 0) for i in terms):
             continue
         R_v, t_v = R[c] @ found.local[0][0, where], found.local[1][0, where] @ R[c].T + t[c]
         _, valid = kind.unpack(found.shared[0, own], (R_v, t_v)).project(found.views.points)
-        if bool((found.used[name] & ~valid).any()):
+        folds = bool((found.used[name] & ~valid).any())
+        if not folds and (size := found.views.data[name].views.size) is not None:
+            both = kind.unpack(
+                torch.stack([found.shared[0, own], alone[name]]), (R[c].expand(2, 3, 3), t[c].expand(2, 3))
+            )
+            reached, before = border_with_rays(both, size).tolist()
+            folds = reached < before
+        if folds:
             below[name] = terms
     return below
 

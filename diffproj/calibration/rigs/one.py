@@ -108,6 +108,7 @@ def finished(task: RigTask, own: Mapping[str, Alone]) -> Refinement[RigCalibrati
         task.positions,
         chosen,
         task.known,
+        [name for name, one in own.items() if one.restrained],
     )
     if task.moved is not None:
         found = yield from with_known_points(found, task.moved, chosen)
