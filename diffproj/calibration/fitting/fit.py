@@ -16,7 +16,8 @@ from diffproj.calibration.fitting.surveyed import whitening
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.fitting.two_poses import found_again, settled
 from diffproj.calibration.least_squares.eliminated import reduced
-from diffproj.calibration.least_squares.solver import Solution, for_each, select
+from diffproj.calibration.least_squares.everyone import for_each
+from diffproj.calibration.least_squares.solver import Solution, select
 from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.results import covariance as covariances
 from diffproj.calibration.results.covariance import Covariance

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from diffproj.calibration.fitting.options import Progress
 from diffproj.calibration.fitting.own_frame import are_solid
+from diffproj.calibration.least_squares.everyone import for_each
 from diffproj.calibration.least_squares.losses import Loss
-from diffproj.calibration.least_squares.solver import Equations, Prior, Solution, for_each, solve
+from diffproj.calibration.least_squares.solver import Equations, Prior, Solution, solve
 from diffproj.calibration.problem.board_error import BoardError
 from diffproj.calibration.problem.parametrisation import POSE, Parametrisation
 from diffproj.calibration.problem.reprojection import Reprojection

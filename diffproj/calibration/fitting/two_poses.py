@@ -22,8 +22,9 @@ from torch import Tensor
 from diffproj.calibration.fitting import closed_form
 from diffproj.calibration.fitting.options import Progress
 from diffproj.calibration.fitting.task import Task, solved
+from diffproj.calibration.least_squares.everyone import for_each
 from diffproj.calibration.least_squares.losses import Cauchy
-from diffproj.calibration.least_squares.solver import Solution, for_each
+from diffproj.calibration.least_squares.solver import Solution
 from diffproj.calibration.problem.parametrisation import POSE, Pose
 from diffproj.geometry.cayley import turned
 

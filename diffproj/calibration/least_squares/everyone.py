@@ -3,9 +3,16 @@
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from diffproj.calibration.least_squares.damping import DampingControl
+
+
+def for_each(max_iterations: int | Tensor, problems: Tensor) -> Int[Tensor, " p"]:
+    """The maximum number of steps of each of the problems `(P, ...)`, where one stands for all."""
+    return torch.as_tensor(max_iterations, device=problems.device).expand(len(problems))
 
 
 def pays_to_part(control: DampingControl) -> bool:

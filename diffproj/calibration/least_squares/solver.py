@@ -41,7 +41,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from diffproj.calibration.least_squares.damping import FINAL_STEP_REDUCTION, HEAVY_DAMPING, DampingControl, Status
-from diffproj.calibration.least_squares.everyone import Everyone, pays_to_part, rows
+from diffproj.calibration.least_squares.everyone import Everyone, for_each, pays_to_part, rows
 from diffproj.calibration.least_squares.losses import Loss
 
 __all__ = ["Status"]  # which comes with the solver wherever it is needed
@@ -173,11 +173,6 @@ class Solution(NamedTuple):
     status: Int[Tensor, " p"]
     iterations: Int[Tensor, " p"]
     equations: Equations
-
-
-def for_each(max_iterations: int | Tensor, problems: Tensor) -> Int[Tensor, " p"]:
-    """The maximum number of steps of each of the problems `(P, ...)`, where one stands for all."""
-    return torch.as_tensor(max_iterations, device=problems.device).expand(len(problems))
 
 
 def equations_at(
