@@ -58,18 +58,9 @@ class Begun(NamedTuple):
     local: tuple[Tensor, ...]
     prior: Prior | None
 
-
-def minimised(
-    data: Data,
-    options: Options,
-    parameters: Parametrisation,
-    shared: Tensor,
-    local: tuple[Tensor, ...],
-    reference: Tensor,
-) -> tuple[Fit, Prior | None]:
-    """Where the solver ends from that start, and the prior with its graph: see `begun`."""
-    task, shared, local, prior = begun(data, options, parameters, shared, local, reference)
-    return fit(task, shared, local, reject=options.outlier_limit, **_steps(options)), prior
+    def minimum(self, options: Options) -> Fit:
+        """Where the solver ends."""
+        return fit(self.task, self.shared, self.local, reject=options.outlier_limit, **_steps(options))
 
 
 def begun(

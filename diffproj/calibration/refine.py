@@ -11,7 +11,7 @@ from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.free_points import with_free_points
 from diffproj.calibration.fitting.implicit import differentiated
 from diffproj.calibration.fitting.options import CalibrationOptions, calibration_options
-from diffproj.calibration.outcome import minimised, outcome
+from diffproj.calibration.outcome import begun, outcome
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.targets.target import Target
@@ -72,7 +72,8 @@ def refine(
         data = Data(views, target, chosen.weights, chosen.pixel_sigma)
         data.check_options(chosen.objective, chosen.shape, (*chosen.fixed, *(chosen.priors or ())))
         shared, local, parameters = start.from_camera(beginning, data, chosen.bow, chosen.skew)
-        found, prior = minimised(data, chosen, parameters, shared, local, shared)
+        begin = begun(data, chosen, parameters, shared, local, shared)
+        found, prior = begin.minimum(chosen), begin.prior
         found, prior = with_free_points(found, data, chosen, prior)
         if differentiable:
             found = differentiated(found, data, prior)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.fitting.data import Data
-from diffproj.calibration.fitting.fit import Fit, fit
+from diffproj.calibration.fitting.fit import Fit
 from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.fitting.positive_focal import with_positive_focal_lengths
 from diffproj.calibration.fitting.second_look import second_look
@@ -44,7 +44,7 @@ class Nested:
         parameters: which there are.
         shared: where the poorest fit starts `(P, s)`.
         local: its poses.
-        reference: what is held, as `minimised` takes it.
+        reference: what is held, as `begun` takes it.
         straight: the corners as the first estimate of the lens straightens them.
         size: of the image.
     """
@@ -102,14 +102,14 @@ class Nested:
 
     def _fit(self, options: Options, start: tuple[Tensor, Pose], inside: tuple[tuple[str, ...], ...] = ()) -> Fit:
         """The lowest fit that is found from there, with these groups."""
-        task, shared, local, _ = begun(self.data, options, self.parameters, *start, self.reference)
+        begin = begun(self.data, options, self.parameters, *start, self.reference)
         steps: dict[str, Any] = {"max_iterations": options.max_iterations, "tolerance": options.tolerance}
         limit, beside = options.outlier_limit, None
-        first: dict[str, Any] = steps | {"reject": limit, "progress": options.progress}
         if DENOMINATOR in inside:
-            found, beside = aside(task, shared, local, self.size, **first)
+            both: dict[str, Any] = steps | {"reject": limit, "progress": options.progress}
+            found, beside = aside(begin.task, begin.shared, begin.local, self.size, **both)
         else:
-            found = fit(task, shared, local, **first)
+            found = begin.minimum(options)
         # The valleys of a prism alone and of a denominator are long; many steps to a tilt may lead to a side one.
         long_valley = inside == (PRISM,) or DENOMINATOR in inside
         found = second_look(found, self.straight, reject=limit, long_valley=long_valley, **steps)
