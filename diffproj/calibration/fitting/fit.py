@@ -180,6 +180,13 @@ class Fit:
         known = self.measured_precision()
         return torch.zeros_like(self.rejected[:, 0, 0]) if known is None else (known != 0).any(-1).any(-1)
 
+    def is_restrained(self) -> Tensor:
+        """Which cameras' terms below the line are held near those of a poorer lens `(P,)`."""
+        prior = self.task.prior
+        if prior is None or prior.known is None:
+            return torch.zeros_like(self.rejected[:, 0, 0])
+        return (prior.precision != prior.known).any(-1).any(-1)
+
 
 def fit(
     task: Task,

@@ -23,8 +23,8 @@ from diffproj.calibration.fitting.second_look import lower_fit
 from diffproj.calibration.trust.reach import reach_of
 
 OPPOSITE = -2.0
-"""How many times its tilt the sensor is tilted at the start that leads to the other valley: beyond the other minimum,
-which is less far off than the saddle between them may be."""
+"""How many times its tilt the sensor is tilted at the start that leads to the other valley: beyond the other minimum.
+From the same tilt to the other side some went back over the saddle between them."""
 TERMS = ("tau_x", "tau_y", "p1", "p2", "s1", "s3")
 """What must be free for there to be two valleys."""
 

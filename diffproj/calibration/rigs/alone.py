@@ -241,6 +241,7 @@ def _calibrated(
         return [_unknown(asked[number], name) for number, name in members]
     found = outcome(first.who, together, fit, whole.size, throw=False)
     shared, rms = found.shared.detach(), found.rms.tolist()  # of all cameras, each time that they are asked for
+    restrained = fit.is_restrained().tolist()
     results: list[Alone | CalibrationError | ValueError] = []
     for row, (number, name) in enumerate(members):
         if bool(found.status[row] != Status.CONVERGED):
@@ -250,9 +251,7 @@ def _calibrated(
         R, t = found.cameras.R[row, :count].detach(), found.cameras.t[row, :count].detach()
         seen = Seen(shared[row], *data.frame.pose(R, t), found.used[row, :count])
         part = _Part(first.who, data, fit.alone(row, count))
-        prior = fit.task.prior
-        near = prior is not None and prior.known is not None and bool((prior.precision != prior.known)[row].any())
-        results.append(Alone(found.parameters, seen, rms[row], part.remark, part.others, near))
+        results.append(Alone(found.parameters, seen, rms[row], part.remark, part.others, restrained[row]))
     return results
 
 

@@ -35,10 +35,10 @@ class Rig(NamedTuple):
 
 def beyond_corners(rig: Rig, pixels: Mapping[str, Tensor], seen: Mapping[str, Tensor]) -> Tensor:
     """Points that a camera sees outside of the region that its corners covered `(N,)`."""
-    found = torch.stack([torch.zeros_like(one) for one in seen.values()]).any(0)
+    found = torch.zeros_like(next(iter(seen.values())))
     for name, uv in pixels.items():
         if (region := rig.calibrations[name].region) is not None:
-            found = found | (seen[name] & ~in_region(uv, region))
+            found |= seen[name] & ~in_region(uv, region)
     return found
 
 

@@ -66,9 +66,7 @@ def remarks(
     """
     task = found.task
     converged = status == Status.CONVERGED
-    held = torch.zeros_like(converged)
-    if task.prior is not None and task.prior.known is not None:
-        held = (task.prior.precision != task.prior.known).any(-1).any(-1)
+    held = found.is_restrained()
     said: list[list[Remark]] = [[] for _ in status]
     for p in (converged & held).nonzero().flatten().tolist():
         said[p].append(
