@@ -44,10 +44,12 @@ DEGREE = 8
 """Degree of the trigonometric polynomial: the determinant times the fourth power of the depth."""
 SAMPLES, COARSE_GRID, FINE_GRID = 20, 64, 256
 """Directions in which it is evaluated, and to which it is interpolated: in the first round and in later ones."""
+LATER_GRIDS = {"nodes": 32, "rounds": 8}
+"""How the search goes on where a circle takes that long."""
 NEWTON_STEPS = 3
 """Newton steps that refine its minimum on the fine grid."""
-CLEAR_NODES, CLEAR_MARGIN = 32, 0.1
-"""Radii of the quick look, and the least eigenvalue of the symmetric part there: between them it stays positive."""
+CIRCLE = 64
+"""Directions in which the image of a circle is looked at, where that takes no table."""
 BLOCK_LENSES = 8
 """Lenses with prism or tilt per block: intermediate results stay in the processor's cache."""
 RADIUS_POWERS = (2, 4, 1, 1, 6, 2, 4, 6, 1, 3, 1, 3)
@@ -85,8 +87,7 @@ def domain_radius(coefficients: Tensor) -> Tensor:
         plain = has_values(coefficients) and not in_forward_mode()
         library, (values,) = arrays_of(coefficients) if plain else (torch, (coefficients,))
         with np.errstate(all="ignore"):
-            scale = length_scale(values)
-            grid = radius_grid(scale, 10 * last_crossing(values))
+            scale, grid = _first_grid(values)
             found = _radius(scale, *first_failure(_ClosedForm(values), grid))
         return torch.as_tensor(found, dtype=coefficients.dtype, device=coefficients.device) if library is np else found
     if coefficients.ndim > 1:
@@ -96,9 +97,14 @@ def domain_radius(coefficients: Tensor) -> Tensor:
 
 
 def _by_circles(coefficients: Tensor) -> Tensor:
+    scale, grid = _first_grid(coefficients)
+    return _radius(scale, *first_failure(_Circles(coefficients), grid, **LATER_GRIDS))
+
+
+def _first_grid(coefficients: Any) -> tuple[Any, Any]:
+    """The length scale `(*B,)`, and the radii at which the search begins `(*B, M)`."""
     scale = length_scale(coefficients)
-    grid = radius_grid(scale, 10 * last_crossing(coefficients))
-    return _radius(scale, *first_failure(_Circles(coefficients), grid, nodes=32, rounds=8))
+    return scale, radius_grid(scale, 10 * last_crossing(coefficients))
 
 
 def _radius(scale: Any, radius: Any, failed: Any) -> Any:
@@ -108,19 +114,41 @@ def _radius(scale: Any, radius: Any, failed: Any) -> Any:
     return library.where(radius > 1e-9 * scale, radius, 0.0)
 
 
-def clearly_one_to_one(coefficients: Tensor, radius: Tensor) -> Tensor:
-    """Whether a lens of 4 or 5 coefficients `(*B, k)` is one-to-one up to a radius `(*B,)`, with a margin.
+def domain_reaches(coefficients: Tensor, radius: Tensor) -> Tensor:
+    """Whether the domains of lenses `(P, k)` in float64 reach radii `(P,)`: most are seen to in a tenth of the time.
 
-    A quick look at a few radii. False says nothing: then `domain_radius` tells.
+    The search for the domain, on no more of its first grid than is needed, and only until that is decided.
+    """
+    closed = coefficients.shape[-1] <= 8
+    if not closed and len(coefficients) > BLOCK_LENSES:
+        blocks = coefficients.split(BLOCK_LENSES), radius.split(BLOCK_LENSES)
+        return torch.cat([domain_reaches(*block) for block in zip(*blocks, strict=True)])
+    values, needed = arrays_of(coefficients, radius)[1] if closed else (coefficients, radius)
+    with np.errstate(all="ignore"):
+        scale, grid = _first_grid(values)
+        nodes = int((grid < needed[..., None]).sum(-1).max()) + 4
+        holds, later = (_ClosedForm(values), {}) if closed else (_Circles(values), LATER_GRIDS)
+        found = _radius(scale, *first_failure(holds, grid[..., :nodes], **later, needed=needed))
+    return torch.as_tensor(found >= needed, device=radius.device)
+
+
+def surely_encloses(coefficients: Tensor, radius: Tensor, distance: Tensor) -> Tensor:
+    """Whether the images of circles of radius `(P,)` about the axes of lenses `(P, k)` lie beyond distances `(P,)`.
+
+    That is where `X^2 + Y^2 > distance^2 W^2`, or 1 for `W` without tilt: the difference of the two is a trigonometric
+    polynomial of degree 4. Between n equidistant directions it is lower by at most `8 (pi / n)^2` times its largest
+    size (Bernstein), which is `1 / cos(4 pi / n)` times that in those directions at most (Ehlich and Zeller 1964).
+    False says nothing.
     """
     terms = Terms.of(coefficients)
-    fraction = torch.linspace(1 / CLEAR_NODES, 1, CLEAR_NODES, dtype=radius.dtype, device=radius.device)
-    r = radius.unsqueeze(-1) * fraction
-    s = r * r
-    factor = radial(terms, s)
-    along = factor + s * radial_slope(terms, s, factor)
-    least = torch.minimum(along, factor) - 4 * r * torch.hypot(terms.two_p1, terms.two_p2)
-    return (least > CLEAR_MARGIN).all(-1)
+    angle = torch.arange(CIRCLE, dtype=radius.dtype, device=radius.device) * (2 * math.pi / CIRCLE)
+    x, y = bend(terms, radius.unsqueeze(-1) * angle.cos(), radius.unsqueeze(-1) * angle.sin())
+    depth = torch.ones_like(x) if (tilt := terms.tilt) is None else tilt.depth(x, y)
+    if tilt is not None:
+        x, y = tilt.cos_x * x, tilt.cos_y * y - tilt.sin_x * tilt.sin_y * x
+    beyond = x.square() + y.square() - (distance.unsqueeze(-1) * depth).square()
+    lower = 8 * (math.pi / CIRCLE) ** 2 / math.cos(4 * math.pi / CIRCLE)
+    return beyond.amin(-1) > lower * beyond.abs().amax(-1)
 
 
 class _ClosedForm:

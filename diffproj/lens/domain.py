@@ -46,7 +46,9 @@ def radius_grid(scale: Any, last: Any) -> Any:
     return scale[..., None] * library.concatenate((near + library.zeros_like(end), far), -1)
 
 
-def first_failure(holds: Property, grid: Any, *, nodes: int = CELL_NODES, rounds: int = ROUNDS) -> tuple[Any, Any]:
+def first_failure(
+    holds: Property, grid: Any, *, nodes: int = CELL_NODES, rounds: int = ROUNDS, needed: Any = None
+) -> tuple[Any, Any]:
     """Find the largest radius up to which a property holds, coarse to fine. Arrays, or tensors.
 
     Args:
@@ -55,6 +57,7 @@ def first_failure(holds: Property, grid: Any, *, nodes: int = CELL_NODES, rounds
         grid: the radii of round 0, `(*B, M)`, ascending.
         nodes: radii per cell in the following rounds.
         rounds: number of rounds, the first included.
+        needed: radii `(*B,)` with which the result will be compared: no more rounds are run than that takes.
 
     Returns:
         The last radius at which the property holds `(*B,)`, and whether it fails anywhere on the grid `(*B,)`.
@@ -63,6 +66,8 @@ def first_failure(holds: Property, grid: Any, *, nodes: int = CELL_NODES, rounds
     low, high, failed = _first_bad_cell(library, holds(grid, 0), grid, library.zeros_like(grid[..., 0]))
     for number in range(1, rounds):
         below = (2 * low - high).clip(0)  # the finer grid may find an earlier failure
+        if needed is not None and bool((~failed | (below >= needed) | (high < needed)).all()):
+            break
         radii = high[..., None] - (high - below)[..., None] * short
         low, high, _ = _first_bad_cell(library, holds(radii, number), radii, below)
     return low, failed

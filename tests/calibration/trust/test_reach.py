@@ -7,8 +7,11 @@ from torch import Tensor
 import diffproj as dp
 from diffproj import synthetic
 from diffproj.calibration import outcome
-from diffproj.calibration.fitting.fit import Fit
-from diffproj.lens.brown_domain import clearly_one_to_one
+from diffproj.calibration.fitting.fit import Fit, fit
+from diffproj.calibration.fitting.task import Task
+from diffproj.calibration.results.border import border_with_rays
+from diffproj.calibration.trust.reach import reach_of
+from diffproj.lens.brown_domain import domain_reaches, surely_encloses
 
 D = torch.float64
 BOARD = dp.Chessboard()
@@ -148,16 +151,60 @@ def test_a_fold_whose_lens_loses_corners_is_infinitely_bad() -> None:
     assert f"{int(outcome.lost.sum())} held-out corners lie beyond the fold" in outcome.summary()
 
 
-@pytest.mark.parametrize("count", [4, 5])
-def test_the_quick_look_is_never_wrong(count: int) -> None:
-    draw = torch.Generator().manual_seed(0)
-    size = torch.tensor([0.5, 0.5, 0.02, 0.02, 0.5][:count], dtype=D)
-    coefficients = torch.randn(3000, count, generator=draw, dtype=D) * size
-    radius = 2 * torch.rand(3000, generator=draw, dtype=D)
-    clear = clearly_one_to_one(coefficients, radius)
+def lenses(count: int, number: int) -> torch.Tensor:
+    draw = torch.Generator().manual_seed(count)
+    size = torch.tensor([0.5, 0.5, 0.02, 0.02, 0.5, 0.5, 0.5, 0.5, 0.02, 0.02, 0.02, 0.02, 0.1, 0.1][:count], dtype=D)
+    return torch.randn(number, count, generator=draw, dtype=D) * size
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
+def test_whether_a_domain_reaches_so_far_is_what_the_domain_says(count: int) -> None:
+    number = 3000 if count <= 8 else 200
+    coefficients = lenses(count, number)
     domain = dp.BrownConrady(coefficients).domain
-    assert bool((radius <= domain)[clear].all())
-    assert int(clear.sum()) > 0.5 * int((radius <= domain).sum())
+    draw = torch.Generator().manual_seed(0)
+    factor = torch.cat([2 * torch.rand(number - 80, generator=draw, dtype=D), 1 + 1e-12 * (torch.arange(80) - 39.5)])
+    radius = torch.where(domain.isfinite(), domain, 1.0) * factor
+    assert torch.equal(domain_reaches(coefficients, radius), radius <= domain)
+    assert not bool(domain_reaches(coefficients[:2], torch.tensor([torch.nan, torch.nan], dtype=D)).any())
+
+
+@pytest.mark.parametrize("count", [5, 8, 12, 14])
+def test_what_surely_encloses_does(count: int) -> None:
+    coefficients = lenses(count, 300)
+    domain = dp.BrownConrady(coefficients).domain
+    radius = domain.clamp(max=1.5) * (1 - 1e-9)
+    angle = 2 * torch.pi * torch.arange(3600, dtype=D) / 3600
+    circle = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    least = dp.BrownConrady(coefficients).distort(radius[:, None, None] * circle)[0].norm(dim=-1).amin(-1)
+    some = radius > 0
+    assert int(some.sum()) > 200
+    assert not bool(surely_encloses(coefficients, radius, least * 1.0001)[some].any())
+    assert int(surely_encloses(coefficients, radius, least * 0.9)[some].sum()) > 0.9 * int(some.sum())
+
+
+@pytest.mark.parametrize("model", ["brown5", "brown8", "brown12", "brown14"])
+def test_how_far_a_lens_reaches_is_what_its_domain_and_its_rays_say(model: str) -> None:
+    count = int(model[5:])
+    draw = torch.Generator().manual_seed(1)
+    P = 40
+    size = torch.tensor([0.3, 0.3, 0.01, 0.01, 0.3, 0.3, 0.3, 0.3, 0.02, 0.02, 0.02, 0.02, 0.05, 0.05][:count], dtype=D)
+    own = torch.randn(P, count, generator=draw, dtype=D) * size
+    shared = torch.cat([K.new_tensor([400.0, 410, 330, 235]).expand(P, 4), own], dim=-1)
+    near = dp.calibrate(dp.example_views("left")[:3], BOARD).cameras
+    poses = near.R.expand(P, 3, 3, 3), near.t.expand(P, 3, 3)
+    used = torch.ones(P, 3, len(BOARD.points), dtype=torch.bool)
+    task = Task(BOARD.points, torch.zeros(P, 3, len(BOARD.points), 2, dtype=D), used, model)  # type: ignore[arg-type]
+    found = fit(task, shared, poses, max_iterations=0)
+    found = Fit(task, found.solution._replace(status=torch.zeros(P, dtype=torch.int64)), found.rejected)
+    lenses = dp.BrownConrady(shared[:, 4:])
+    matrix = torch.tensor([[400.0, 0, 330], [0, 410, 235], [0, 0, 1]], dtype=D).expand(P, 3, 3)
+    whole = border_with_rays(dp.Camera(matrix, distortion=lenses, size=SIZE), SIZE)
+    X = BOARD.points @ near.R.mT + near.t.unsqueeze(-2)
+    outermost = (X[..., :2] / X[..., 2:]).norm(dim=-1).max()
+    expected = torch.where(outermost <= lenses.domain, whole, -1.0)
+    assert torch.equal(reach_of(found, SIZE), expected)
+    assert len({float(part) for part in expected}) > 2
 
 
 def test_what_only_restrains_is_no_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
