@@ -64,7 +64,7 @@ class DampingControl:
         # The current step will still be applied: the criterion is the reduction of the step after it, extrapolated.
         after = expected * np.minimum(np.maximum(expected / self.previous, BEST_CONTRACTION), 1)
         self.previous = np.where(self.active, expected, self.previous)
-        converged = (after <= tolerance * self.cost) & (expected <= FINAL_STEP_REDUCTION * self.cost)
+        converged = (after <= tolerance * self.cost) & (expected <= max(FINAL_STEP_REDUCTION, tolerance) * self.cost)
         # Where the reduction is below the cost's rounding error, acceptance is random: the first failure ends it.
         rounding = ROUNDING * self.cost + RESIDUAL_ROUNDING * np.sqrt(self.negligible * self.cost)
         exhausted = (self.failed & (expected <= rounding)) | (expected <= 1e-3 * ROUNDING * self.cost)

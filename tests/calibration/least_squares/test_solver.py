@@ -278,3 +278,12 @@ def test_a_step_that_leaves_nothing_to_gain_is_the_last() -> None:
     assert control.stop(0.1 * first, tolerance).tolist() == [True, False]  # the next gain 9e-11 and 9e-10
     assert control.stop(0.01 * first, tolerance).tolist() == [False, True]
     assert control.status.tolist() == [Status.CONVERGED] * 2
+
+
+def test_a_wide_tolerance_ends_early() -> None:
+    """Also beyond the reduction up to which the last step is taken without a look at where it leads."""
+    problem, shared, local = curves()
+    near, exact = (run(problem, shared, local, tolerance=tolerance) for tolerance in (1e-3, 1e-14))
+    assert bool((near.status == Status.CONVERGED).all())
+    assert bool((near.iterations < exact.iterations).all())
+    assert bool((near.cost <= exact.cost * 1.01).all())
