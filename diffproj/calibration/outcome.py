@@ -70,22 +70,24 @@ def begun(
     shared: Tensor,
     local: tuple[Tensor, ...],
     reference: Tensor,
+    rows: Tensor | None = None,
 ) -> Begun:
     """What is to be minimised from that start.
 
     Skew that is not to be fitted is held. `reference (P, s)` is what fixed parameters keep and priors without a mean
-    are about; NaN where nothing is known.
+    are about; NaN where nothing is known. With `rows (n,)`, only of these cameras, which the start is then of.
     """
     fixed = tuple(name for name in options.fixed if not of_points(name))
     fixed = fixed if options.skew or not parameters.skew else (*fixed, SKEW)
     prior = make_prior(of_camera(options.priors), reference, parameters, data.batch, options.tied_focal)
+    model = {"bow": parameters.bow, "skew": parameters.skew, "loss": options.loss}
+    task = data.task(parameters.lens, **model, shares=data.shares)
+    if rows is not None:
+        reference, task = reference[rows], task.part(rows)
+        prior = None if prior is None else prior.part(rows)
     shared = held_at(reference, shared, parameters, fixed)
-    task = data.task(
-        parameters.lens,
-        bow=parameters.bow,
-        skew=parameters.skew,
-        loss=options.loss,
-        shares=data.shares,
+    task = replace(
+        task,
         prior=None if prior is None else Prior(prior.mean.detach(), prior.precision.detach()),
         basis=free_basis(shared, parameters, fixed, options.tied_focal),
     )

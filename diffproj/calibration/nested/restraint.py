@@ -24,11 +24,10 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.fitting.fit import Fit, fit
-from diffproj.calibration.fitting.second_look import truncated
 from diffproj.calibration.fitting.task import Task
-from diffproj.calibration.fitting.two_poses import replaced
 from diffproj.calibration.least_squares.solver import Prior
-from diffproj.calibration.nested.factors import FACTORS, data_cost, with_factor
+from diffproj.calibration.nested.compared import costs, put, unrestrained_cost
+from diffproj.calibration.nested.factors import FACTORS, with_factor
 from diffproj.calibration.problem.parametrisation import Pose
 from diffproj.calibration.trust.entangled import DENOMINATOR
 from diffproj.calibration.trust.reach import folds_at_corners, reach_of
@@ -47,7 +46,7 @@ HAIR = 1.1
 """Factor of the cost that is paid to make a lens that reaches all of its corners reach the whole image, too."""
 LOWER = 1e-9
 """Part of the cost by which another minimum must be lower to be taken."""
-PROMISING = 0.5
+PROMISING = 0.1
 """Residuals' worth of noise by which a start with a factor must be lower after a few steps to go on to its end."""
 WORTH, OPEN = 1.0, 0.05
 """Residuals' worth of noise by which one from a start with factors must be lower; and the deviation of a focal length
@@ -91,11 +90,11 @@ def restrained(
     def weighed(which: Tensor, other: Fit, allowed: Tensor, lower: Tensor | float = LOWER) -> Tensor:
         """Which of the others `(n,)` do not fold; they are kept where they are allowed, and better."""
         nonlocal best, reached
-        first, cost = _costs(found, other, which, reject)
+        first, cost = costs(found, other, which, reject)
         reach = torch.where(allowed & (lost[which] | (cost <= HAIR * first)), reach_of(other, size), -1.0)
-        lowest, cost = _costs(best, other, which, reject)
+        lowest, cost = costs(best, other, which, reject)
         better = allowed & ((reach > reached[which]) | ((reach == reached[which]) & (cost < lowest * (1 - lower))))
-        best = _put(best, which[better], other, better)
+        best = put(best, which[better], other, better)
         reached[which] = reach.maximum(reached[which])
         return reach >= 1
 
@@ -108,7 +107,7 @@ def restrained(
         weighed(which, other, _knows_focal(other), WORTH / spare[which])
 
     if aside is not None:
-        first, cost = _costs(found, aside, torch.arange(len(spare), device=spare.device), reject)
+        first, cost = costs(found, aside, torch.arange(len(spare), device=spare.device), reject)
         lower = ((spare > 0) & (reached >= 1) & (cost < first * (1 - PROMISING / spare))).nonzero().flatten()
         if len(lower) > 0:
             ended(lower, aside.part(lower))
@@ -148,8 +147,8 @@ def restrained(
         short: dict[str, Any] = steps | {"max_iterations": min(max_iterations, RUNG_STEPS)}
         near = fit(given.part(which.repeat(len(starts))), begin, local, reject=reject, **short)
         folds = folds_at_corners(near.task, near.solution.shared, near.solution.local)
-        costs = torch.where(folds, torch.inf, data_cost(near)).reshape(len(starts), -1)
-        ended(which, near.part(costs.argmin(0) * len(which) + torch.arange(len(which), device=which.device)))
+        lowest = torch.where(folds, torch.inf, unrestrained_cost(near)).reshape(len(starts), -1).argmin(0)
+        ended(which, near.part(lowest * len(which) + torch.arange(len(which), device=which.device)))
     down = which[reached[which] < 1]
     for strength in TIGHTER:
         if len(down) == 0:
@@ -176,18 +175,13 @@ def unfolded(
     poses = flat.part(rows).solution.local
     limits: dict[str, Any] = {"reject": reject, "max_iterations": max_iterations, "tolerance": tolerance}
     held = restrained(freed.part(rows), start, poses, size, **limits)
-    return _put(freed, rows, held, torch.ones_like(rows, dtype=torch.bool))
+    return put(freed, rows, held, torch.ones_like(rows, dtype=torch.bool))
 
 
 def _knows_focal(found: Fit) -> Tensor:
     """Where focal lengths and principal point are known well enough `(P,)`."""
     deviation = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, :4].sqrt()
     return (deviation <= OPEN * found.solution.shared[:, (0, 1, 0, 1)].abs()).all(-1)
-
-
-def _costs(found: Fit, other: Fit, which: Tensor, reject: float | None) -> tuple[Tensor, Tensor]:
-    """What the corners of some cameras cost `(n,)` in one fit and in the other, whichever of them each rejects."""
-    return (data_cost(found)[which], data_cost(other)) if reject is None else truncated(found, other, which, reject)
 
 
 def _unit_precision(start: Fit, below: list[int], size: tuple[int, int]) -> Tensor:
@@ -210,24 +204,3 @@ def _drawn_to(shared: Tensor, precision: Tensor, task: Task) -> Prior:
     own = given.diagonal(dim1=-2, dim2=-1)
     total = own + precision
     return Prior(torch.where(total > 0, (own * mean + precision * shared) / total, 0.0), given + more, given)
-
-
-def _put(found: Fit, which: Tensor, other: Fit, taken: Tensor) -> Fit:
-    """The fit with some cameras `(n,)` replaced by the others that are taken, their priors included."""
-    if len(which) == 0:
-        return found
-    task = found.task
-    used, rejected = task.used.clone(), found.rejected.clone()
-    used[which], rejected[which] = other.task.used[taken], other.rejected[taken]
-    new = Prior(*(a.index_put((which,), b[taken]) for a, b in zip(_prior(found), _prior(other), strict=True)))
-    solution = replaced(found.solution, which, other.solution, taken)
-    return Fit(replace(task, used=used, prior=new), solution, rejected)
-
-
-def _prior(found: Fit) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, precision and known precision of the prior, 0 where there is none."""
-    shared, prior = found.solution.shared, found.task.prior
-    if prior is None:
-        nothing = shared.new_zeros(*shared.shape, shared.shape[-1])
-        return torch.zeros_like(shared), nothing, nothing
-    return prior.mean, prior.precision, prior.precision if prior.known is None else prior.known

@@ -11,20 +11,32 @@ decentring by `p1`, `p2` and a prism by `s1`, `s3` move it by
 
 So `b -> b + d`, `q -> q + d / 2`, `s -> s - d / 2` changes nothing to that order. What tells the tilt is of higher
 order, where two tilts of different sign are much alike: there are two valleys, and either may be the lower one.
+
+Most cameras have but one: then a few steps lead back across the saddle. Only what stays on the other side, and is not
+far above, or what is lower by then goes on to its end.
 """
 
 from dataclasses import replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from diffproj.calibration.fitting.fit import Fit, fit
 from diffproj.calibration.fitting.second_look import lower_fit
+from diffproj.calibration.least_squares.solver import Status
+from diffproj.calibration.nested.compared import costs
 from diffproj.calibration.trust.reach import reach_of
 
 OPPOSITE = -2.0
 """How many times its tilt the sensor is tilted at the start that leads to the other valley: beyond the other minimum.
 From the same tilt to the other side some went back over the saddle between them."""
+FEW_STEPS = 10
+"""Steps after which it is seen who goes on."""
+LOWER, NEAR = 0.1, 3.0
+"""Residuals' worth of noise by which one must be lower then; or by which it may be above on the other side."""
+ALIKE = 1e-9
+"""Part of the cost up to which two minima are as low: then the one is taken where the solver came to its end."""
 TERMS = ("tau_x", "tau_y", "p1", "p2", "s1", "s3")
 """What must be free for there to be two valleys."""
 
@@ -46,11 +58,28 @@ def lower_valley(
     if task.basis is not None and not bool((task.basis[:, terms] != 0).any(-1).all()):
         return found
     given = replace(task, used=task.used | found.rejected)
-    limits: dict[str, Any] = {"reject": reject, "max_iterations": max_iterations, "tolerance": tolerance}
-    other = fit(given, twin(solution.shared, terms), solution.local, **limits)
+    limits: dict[str, Any] = {"reject": reject, "tolerance": tolerance}
+    begin = twin(solution.shared, terms)
+    near = fit(given, begin, solution.local, max_iterations=min(max_iterations, FEW_STEPS), **limits)
+    here, there = (state.shared[:, terms[:2]] for state in (solution, near.solution))
+    across = (here * there).sum(-1) < 0
+    every = torch.arange(len(across), device=across.device)
+    before, now = costs(found, near, every, reject)
+    worth = before / found.degrees_of_freedom().clamp(min=1)
+    goes_on = (now < before - LOWER * worth) | (across & (now < before + NEAR * worth))
+    rows = (goes_on | (solution.status != Status.CONVERGED)).nonzero().flatten()
+    if len(rows) == 0:
+        return found
+    part = near.part(rows).solution
+    other = fit(given.part(rows), part.shared, part.local, max_iterations=max_iterations, **limits)
+    before, now = costs(found, other, rows, reject)
+    low = (now <= before * (1 + ALIKE)).nonzero().flatten()
+    if len(low) == 0:
+        return found
+    rows, other = rows[low], other.part(low)
     there = reach_of(other, size)
-    which = ((there >= reach_of(found, size)) & (there >= 0)).nonzero().flatten()
-    return lower_fit(found, other.part(which), which, reject)
+    kept = ((there >= reach_of(found.part(rows), size)) & (there >= 0)).nonzero().flatten()
+    return lower_fit(found, other.part(kept), rows[kept], reject)
 
 
 def twin(shared: Tensor, terms: list[int]) -> Tensor:

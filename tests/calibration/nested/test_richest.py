@@ -6,6 +6,12 @@ import pytest
 import torch
 
 import diffproj as dp
+from diffproj.calibration.fitting.fit import Fit, fit
+from diffproj.calibration.fitting.second_look import doubtful, second_look
+from diffproj.calibration.fitting.task import Task
+from diffproj.calibration.nested import richest
+from diffproj.lens.models import LensModel
+from tests.calibration.minima.drawn import KINDS, Draw
 
 BOARD = dp.Chessboard()
 DENOMINATOR = ("k4", "k5", "k6")
@@ -31,9 +37,7 @@ def test_richer_lenses_are_not_above_poorer_ones(side: str) -> None:
     fourteen, fewer = cost(side, "brown14"), cost(side, "brown14", fixed=DENOMINATOR)
     pairs = [(twelve, eight), (twelve, without), (fourteen, twelve), (fourteen, fewer), (fewer, without)]
     if side == "right":
-        assert fourteen == pytest.approx(
-            16.306, abs=1e-3
-        )  # with its denominator held 16.331; 16.050 folds at 28 corners
+        assert fourteen < 16.2868  # with its denominator held 16.357; 16.050 folds at 28 corners
     pairs += [(cost(side, "brown12", skew=True), twelve), (cost(side, "brown14", skew=True), fourteen)]
     for richer, poorer in pairs:
         assert richer <= poorer * (1 + 1e-6)
@@ -59,8 +63,62 @@ def test_terms_that_the_corners_want_are_not_called_noise() -> None:
     assert "stand for noise" not in dp.calibrate(views, BOARD, "brown8").remarks[0]
 
 
+def doubts(views: dp.Views, model: LensModel, monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Of every second look whether the minimum was a doubtful one."""
+    doubted: list[bool] = []
+
+    def noted(found: Fit, *args: Any, long_valley: bool, **options: Any) -> Fit:
+        doubted.append(bool(doubtful(found, steps_tell=True, long_valley=long_valley).any()))
+        return second_look(found, *args, long_valley=long_valley, **options)
+
+    monkeypatch.setattr(richest, "second_look", noted)
+    dp.calibrate(views, BOARD, model, throw=False)
+    return doubted
+
+
+def test_a_poor_lens_is_looked_at_again_only_if_the_richest_one_makes_no_sense(monkeypatch: pytest.MonkeyPatch) -> None:
+    problems = KINDS["any brown8"](25, Draw(5000)).views
+    clear, held = (dp.Views(problems.pixels[i], problems.visible[i], size=problems.size) for i in (6, 1))
+    assert doubts(clear, "brown5", monkeypatch) == [True]
+    assert doubts(clear, "brown8", monkeypatch) == [False]
+    assert doubts(held, "brown8", monkeypatch) == [False, True, False]  # of the whole lens, of the poor one, again
+
+
 def test_a_needle_in_the_middle_of_the_image_is_not_taken() -> None:
     """With k4 of 1e5, by factors that left the focal lengths open: these views were refused, for an RMS 0.5 % lower."""
     chosen = torch.randperm(13, generator=torch.Generator().manual_seed(108))[:3]
     found = dp.calibrate(dp.example_views("left")[chosen.tolist()], BOARD, "brown12")
     assert abs(float(found.camera.K[0, 0]) - 533.5) < 3
+
+
+@pytest.mark.parametrize("model", ["brown8", "brown12"])
+def test_only_the_cameras_that_need_it_are_fitted_once_more(model: LensModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a batch as each by itself, with a prior that differs from camera to camera, too."""
+    problems = KINDS["any brown8"](25, Draw(5000)).views
+    views = dp.Views(problems.pixels[[6, 1, 8]], problems.visible[[6, 1, 8]], size=problems.size)
+    known = torch.tensor([[0.1], [0.2], [0.3]], dtype=torch.float64)
+    seen: list[int] = []
+    climbed = richest.Nested._climbed
+
+    def noted(self: richest.Nested, poorest: Fit, *, thorough: bool = False) -> Fit:
+        seen.append(len(poorest.rejected))
+        return climbed(self, poorest, thorough=thorough)
+
+    monkeypatch.setattr(richest.Nested, "_climbed", noted)
+    together = dp.calibrate(views, BOARD, model, throw=False, priors={"p1": (0.0, known)})
+    assert seen == [3, 1]
+    for i in range(3):
+        own = dp.Views(views.pixels[i], views.visible[i], size=views.size)
+        alone = dp.calibrate(own, BOARD, model, throw=False, priors={"p1": (0.0, known[i])})
+        torch.testing.assert_close(together.residuals[i], alone.residuals, rtol=0, atol=1e-6)
+
+
+def test_nothing_starts_from_a_lens_that_folds_before_its_corners() -> None:
+    near = dp.calibrate(dp.example_views("left"), BOARD)
+    views, poses = near.views, near.cameras
+    task = Task(BOARD.points, views.pixels.expand(2, -1, -1, -1), views.visible.expand(2, -1, -1), "brown8")
+    shared = torch.nn.functional.pad(near.shared, (0, 3)).repeat(2, 1)
+    shared[1, -3] = -5.0  # with a pole 0.45 from the axis
+    local = poses.R.expand(2, -1, 3, 3), poses.t.expand(2, -1, 3)
+    found = richest._no_start_if_folded(fit(task, shared, local, max_iterations=0))
+    assert found.solution.cost.isinf().tolist() == [False, True]
