@@ -115,9 +115,10 @@ def _radius(scale: Any, radius: Any, failed: Any) -> Any:
 
 
 def domain_reaches(coefficients: Tensor, radius: Tensor) -> Tensor:
-    """Whether the domains of lenses `(P, k)` in float64 reach radii `(P,)`: most are seen to in a tenth of the time.
+    """Whether the domains of lenses `(P, k)` in float64 reach radii `(P,)`: no for NaN.
 
-    The search for the domain, on no more of its first grid than is needed, and only until that is decided.
+    The search for the domain, on no more of its first grid than is needed, and only until that is decided: far inside
+    of it in an eighth of the time with prism or tilt, in a third without.
     """
     closed = coefficients.shape[-1] <= 8
     if not closed and len(coefficients) > BLOCK_LENSES:

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.fitting.fit import Fit, fit
+from diffproj.calibration.fitting.second_look import LOWER
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.least_squares.solver import Prior
 from diffproj.calibration.nested.compared import costs, put, unrestrained_cost
@@ -44,8 +45,6 @@ RUNG_STEPS = 100
 the lower of the starts with factors goes on."""
 HAIR = 1.1
 """Factor of the cost that is paid to make a lens that reaches all of its corners reach the whole image, too."""
-LOWER = 1e-9
-"""Part of the cost by which another minimum must be lower to be taken."""
 PROMISING = 0.1
 """Residuals' worth of noise by which a start with a factor must be lower after a few steps to go on to its end."""
 WORTH, OPEN = 1.0, 0.05

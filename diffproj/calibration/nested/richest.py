@@ -24,7 +24,7 @@ from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.fit import Fit
 from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.fitting.positive_focal import with_positive_focal_lengths
-from diffproj.calibration.fitting.second_look import doubtful, second_look
+from diffproj.calibration.fitting.second_look import LOWER, doubtful, second_look
 from diffproj.calibration.fitting.start import Straightened
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.nested.compared import costs, put
@@ -43,8 +43,6 @@ SHORT = 5
 BETWEEN = 1e-4
 """Tolerance of the fits in between: by chance alone a parameter lowers the cost of a thousand residuals by ten times
 this part of it."""
-LOWER = 1e-9
-"""Part of the cost by which another minimum must be lower to be taken."""
 PRISM, TILT = ("s1", "s2", "s3", "s4"), ("tau_x", "tau_y")
 GROUPS = ((SKEW,), PRISM, TILT, DENOMINATOR)
 """Parameters that a long lens gets one group after the other."""

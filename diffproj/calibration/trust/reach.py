@@ -4,7 +4,7 @@ The solver evaluates the lens's equations wherever it comes, also beyond the rad
 denominator vanishes: the residuals may be small there, but no pixel has one ray. A lens that folds inside the corners
 that it was fitted to is no calibration.
 
-Most lenses reach far more than is asked, which is seen in a tenth of the time that the domain and the inverse take.
+Most lenses reach far more than is asked, which is seen much sooner than the domain and the inverse are worked out.
 """
 
 import torch
