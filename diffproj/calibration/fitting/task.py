@@ -13,11 +13,12 @@ from diffproj.calibration.least_squares.everyone import for_each
 from diffproj.calibration.least_squares.losses import Loss
 from diffproj.calibration.least_squares.solver import Equations, Prior, Solution, solve
 from diffproj.calibration.problem.board_error import BoardError
-from diffproj.calibration.problem.parametrisation import POSE, Parametrisation
+from diffproj.calibration.problem.parametrisation import INTRINSICS, POSE, Parametrisation
 from diffproj.calibration.problem.reprojection import Reprojection
 from diffproj.calibration.problem.shape import Restraint, restraint_of
 from diffproj.calibration.results.calibration import Objective
-from diffproj.lens.models import LensModel
+from diffproj.lens.brown_conrady import BrownConrady
+from diffproj.lens.models import MODELS, LensModel
 
 BLOCK_CORNERS = 24_000
 """Corners per block on a CPU, about thirty cameras of 13 views: enough to hide call overhead, and few enough that a
@@ -45,6 +46,8 @@ class Task:
         loss: a robust loss, or `None` for least squares.
         prior: on the shared parameters.
         basis: of the shared parameters' free directions `(P, s, q)`, or `None` for all.
+        brief: whether coefficients of the lens that are held at 0, and come last, are left out to save time; the normal
+            equations then have zeros for them.
         pose_known: how many of the six coordinates of each pose are held, or known beforehand.
         printed: precision of the displacement of each free point `(P, N, 3, 3)`, in the unit of the weights; `None` for
             0.
@@ -69,6 +72,7 @@ class Task:
     basis: Tensor | None = None
     printed: Tensor | None = None
     surveyed: bool = False
+    brief: bool = False
     pose_known: int = 0
 
     @property
@@ -89,8 +93,16 @@ class Task:
     @property
     def problem(self) -> Reprojection:
         """Residuals and Jacobians."""
+        return self._problem(None)
+
+    def problem_from(self, shared: Tensor) -> Reprojection:
+        """The same for fits from shared parameters `(P, s)`, which may be `brief`."""
+        return self._problem(self.terms_from(shared))
+
+    def _problem(self, terms: int | None) -> Reprojection:
         kind = BoardError if self.objective == "plane" else Reprojection
-        return kind(self.points, self.pixels, self.used, self.lens, self.bow, self.skew, self.whitening, free=self.free)
+        which = self.points, self.pixels, self.used, self.lens, self.bow, self.skew, self.whitening
+        return kind(*which, free=self.free, terms=terms)
 
     @property
     def moves_points(self) -> bool:
@@ -121,6 +133,16 @@ class Task:
         if self.prior is None:
             return Prior(held.new_zeros(P, s), held, root=root)
         return Prior(self.prior.mean, self.prior.precision + held, root=root)
+
+    def terms_from(self, shared: Tensor) -> int | None:
+        """How many coefficients a fit from shared parameters `(P, s)` needs; `None` for all. See `brief`."""
+        kind = MODELS[self.lens].kind
+        if not self.brief or self.basis is None or kind is not BrownConrady:
+            return None
+        lens = slice(len(INTRINSICS), self.parameters.lens_end)
+        there = (shared[:, lens] != 0).any(0) | (self.basis[:, lens] != 0).any(-1).any(0)
+        last = max((number for number, is_there in enumerate(there.tolist(), start=1) if is_there), default=0)
+        return next(count for count in kind.counts if count >= last)
 
     def holding(self, where: list[int]) -> "Task":
         """The same with some of the shared parameters held, by their positions."""
@@ -184,7 +206,7 @@ def _solved(task: Task, shared: Tensor, local: tuple[Tensor, ...], **options: An
     if task.shares is not None:
         weights = task.shares.unsqueeze(-1).expand(task.used.shape) * (1.0 if weights is None else weights)
     solution = solve(
-        task.problem,
+        task.problem_from(shared),
         shared,
         local,
         local_size=POSE,

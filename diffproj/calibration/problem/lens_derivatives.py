@@ -9,6 +9,7 @@ The lens's domain is not checked: intermediate lenses of the solver may have a f
 those of `diffproj.lens`; the tests compare the two.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -55,67 +56,79 @@ def pinhole(coefficients: Tensor, f: Tensor, X_cam: Tensor, place: Place) -> Ten
 
 
 def brown_conrady(coefficients: Tensor, f: Tensor, X_cam: Tensor, place: Place) -> Tensor:
-    """Brown-Conrady with 4, 5, 8, 12 or 14 coefficients `(P, k)`; for the equations see `lens.brown_equations`."""
-    count, rows, k = coefficients.shape[-1], place.rows, coefficients[..., None, None].unbind(1)
-    tilted = count == 14
-    scale = torch.ones_like(f) if tilted else f  # what follows a tilt multiplies the focal lengths in
+    """Brown-Conrady with 4, 5, 8, 12 or 14 coefficients `(P, k)`; for the equations see `lens.brown_equations`.
+
+    With few views the time is that of the calls, so that there are as few as will do: what is one number for a point
+    is `(P, V, 1, N)` throughout.
+    """
+    count, rows, k = coefficients.shape[-1], place.rows, coefficients[..., None, None, None].unbind(1)
     inverse_depth = X_cam[:, :, 2:].reciprocal()
     xy = X_cam[:, :, :2] * inverse_depth
-    x, y = xy.unbind(2)
+    x, y = xy.split(1, dim=2)
     s = torch.addcmul(x.square(), y, y)
-    s_row, scaled, one = s.unsqueeze(2), scale * xy, torch.ones_like(s[:1, :1, :1])
 
-    # Radial: rows k1, k2, k3 are x s, x s^2, x s^3 over the denominator; k4, k5, k6 those times -g. Slopes are doubled.
-    above = [k[0], k[1], *k[4:5]]
-    growth, slope = _polynomial(s, above), _polynomial(s, [2 * (power + 1) * a for power, a in enumerate(above)])
-    g = torch.addcmul(one, growth, s)
-    first = scaled
+    # The radial factor g and its slope by s; the decentring and the prism; the distorted point.
+    g, slope = _one_plus(s, [k[0], k[1], *k[4:5]])
+    inverse = None
     if count >= 8:
-        below = list(k[5:8])
-        inverse = torch.addcmul(one, _polynomial(s, below), s).reciprocal_()
-        below_slope = _polynomial(s, [2 * (power + 1) * b for power, b in enumerate(below)])
+        below, below_slope = _one_plus(s, k[5:8])
+        inverse = below.reciprocal_()
         g *= inverse
         slope.addcmul_(g, below_slope, value=-1)
         slope *= inverse
-        first = scaled * inverse.unsqueeze(2)
-    torch.mul(first, s_row, out=rows[0])
-    torch.mul(rows[0], s_row, out=rows[1])
-    if count >= 5:
-        torch.mul(rows[1], s_row, out=rows[4])
-    if count >= 8:
-        minus_g = -g.unsqueeze(2)
-        for power, row in ((0, 5), (1, 6), (4, 7)):
-            torch.mul(rows[power], minus_g, out=rows[row])
-
-    # Tangential: p1 gives (2 x y, s + 2 y^2), p2 gives (s + 2 x^2, 2 x y).
-    twice = 2 * xy
-    for row, by, component in ((2, 1, 1), (3, 0, 0)):
-        torch.mul(scaled, twice[:, :, by : by + 1], out=rows[row])
-        rows[row][:, :, component].addcmul_(scale[:, :, component], s)
     tangential = coefficients[:, None, 2:4, None].flip(2)  # p2, p1
     toward = 2 * tangential
-    factor = torch.addcmul(g, toward[:, :, 0], x).addcmul_(toward[:, :, 1], y)
+    factor = torch.addcmul(g, toward[:, :, :1], x).addcmul_(toward[:, :, 1:], y)
     sideways, steep = tangential, toward
     if count >= 12:
         prism = coefficients[:, None, 8:12, None]
         along, steeper = prism[:, :, 0::2], prism[:, :, 1::2]
-        sideways = torch.addcmul(tangential + along, steeper, s_row)
-        steep = torch.addcmul(2 * sideways, 2 * steeper, s_row)
-        for row, (component, power) in enumerate(((0, s), (0, s * s), (1, s), (1, s * s)), start=8):
-            torch.mul(power, scale[:, :, component], out=rows[row][:, :, component])
-            rows[row][:, :, 1 - component].zero_()
-    distorted = (xy * factor.unsqueeze(2)).addcmul_(s_row, sideways)
+        sideways = torch.addcmul(tangential + along, steeper, s)
+        steep = torch.addcmul(2 * sideways, steeper, s, value=2)
+    distorted = (xy * factor).addcmul_(s, sideways)
+    turn = None
+    if count == 14:
+        distorted, turn = _tilt(coefficients[:, 12:], f, distorted, rows[12:])
+
+    # Radial: rows k1, k2, k3 are x s, x s^2, x s^3 over the denominator; k4, k5, k6 those times -g.
+    scaled = f * xy if turn is None else torch.addcmul(turn[0] * x, turn[1], y)
+    torch.mul(scaled if inverse is None else scaled * inverse, s, out=rows[0])
+    torch.mul(rows[0], s, out=rows[1])
+    if count >= 5:
+        torch.mul(rows[1], s, out=rows[4])
+    if count >= 8:
+        minus_g = -g
+        for power, row in ((0, 5), (1, 6), (4, 7)):
+            torch.mul(rows[power], minus_g, out=rows[row])
+
+    # Tangential: p1 gives (2 x y, s + 2 y^2), p2 gives (s + 2 x^2, 2 x y). The prism gives s and s^2 to one of the two.
+    twice = 2 * scaled
+    for row, by, component in ((2, y, 1), (3, x, 0)):
+        torch.mul(twice, by, out=rows[row])
+        if turn is None:
+            rows[row][:, :, component : component + 1].addcmul_(f[:, :, component : component + 1], s)
+        else:
+            rows[row].addcmul_(turn[component], s)
+    if count >= 12:
+        for row, component in ((8, 0), (10, 1)):
+            if turn is None:
+                torch.mul(s, f[:, :, component : component + 1], out=rows[row][:, :, component : component + 1])
+                rows[row][:, :, 1 - component].zero_()
+            else:
+                torch.mul(turn[component], s, out=rows[row])
+            torch.mul(rows[row], s, out=rows[row + 1])
 
     # d(x', y') = factor dxy + xy (2 g' xy + (2 p2, 2 p1)) . dxy + steep xy . dxy, as (P, V, by x and y, x' and y', N)
-    near = scale * inverse_depth
-    torch.mul(torch.addcmul(toward, xy, slope.unsqueeze(2)).unsqueeze(3), (xy * near).unsqueeze(2), out=place.by_xy)
+    near = f * inverse_depth if turn is None else inverse_depth
+    torch.mul(torch.addcmul(toward, xy, slope, value=2).unsqueeze(3), (xy * near).unsqueeze(2), out=place.by_xy)
     place.by_xy.addcmul_(xy.unsqueeze(3), (steep * near).unsqueeze(2))
-    place.straight.addcmul_(factor.unsqueeze(2), near)
-    if tilted:
-        distorted = _tilt(k[12], k[13], f, distorted, place)
+    place.straight.addcmul_(factor, near)
+    if turn is not None:
+        one, two = (column.unsqueeze(2) for column in turn)
+        place.by_xy.copy_(torch.addcmul(one * place.by_xy[:, :, :, :1], two, place.by_xy[:, :, :, 1:]))
     by_x, by_y, by_z = place.by_axis
-    torch.mul(by_x, -x.unsqueeze(2), out=by_z)
-    by_z.addcmul_(by_y, y.unsqueeze(2), value=-1)
+    torch.mul(by_x, -x, out=by_z)
+    by_z.addcmul_(by_y, y, value=-1)
     return distorted
 
 
@@ -156,29 +169,36 @@ def _polynomial(s: Tensor, columns: list[Tensor]) -> Tensor:
     return value
 
 
-def _tilt(tau_x: Tensor, tau_y: Tensor, f: Tensor, xy: Tensor, place: Place) -> Tensor:
-    """Apply the tilt to the point, and by the chain rule, and times f, to its derivatives."""
-    x, y = xy.unbind(2)
-    cos_x, sin_x, cos_y, sin_y = tau_x.cos(), tau_x.sin(), tau_y.cos(), tau_y.sin()
-    inverse = (sin_y * x - cos_y * sin_x * y + cos_x * cos_y).reciprocal()
-    X, Y = cos_x * x * inverse, (cos_y * y - sin_x * sin_y * x) * inverse
-    f_x, f_y = f.unbind(2)
-    across, along = f_x * inverse, f_y * inverse
-    one = ((cos_x - X * sin_y) * across).unsqueeze(2), (X * cos_y * sin_x * across).unsqueeze(2)
-    two = (-(sin_x + Y) * sin_y * along).unsqueeze(2), ((1 + Y * sin_x) * cos_y * along).unsqueeze(2)
-    for vectors in (place.by_coefficient[:, :, :12], place.by_xy):
-        u, v = vectors.unbind(3)
-        turned = (u * one[0]).addcmul_(v, one[1])
-        v.mul_(two[1]).addcmul_(u, two[0])
-        u.copy_(turned)
-    rows = place.rows
-    fall = -cos_y * (cos_x * y + sin_x)  # dW / dtau_x
-    rows[12][:, :, 0] = (-sin_x * x - X * fall) * across
-    rows[12][:, :, 1] = (-cos_x * sin_y * x - Y * fall) * along
-    fall = cos_y * x + sin_y * (sin_x * y - cos_x)  # dW / dtau_y
-    rows[13][:, :, 0] = -X * fall * across
-    rows[13][:, :, 1] = (-sin_y * y - sin_x * cos_y * x - Y * fall) * along
-    return torch.stack([X, Y], dim=2)
+def _one_plus(s: Tensor, columns: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """`1 + c_0 s + c_1 s^2 + ...` for at least two coefficients, and its derivative by s, by Horner's rule."""
+    value, slope = torch.addcmul(columns[-2], columns[-1], s), columns[-1]
+    for column in reversed(columns[:-2]):
+        value, slope = torch.addcmul(column, value, s), torch.addcmul(value, slope, s)
+    return (value * s).add_(1.0), torch.addcmul(value, slope, s)
+
+
+def _tilt(tau: Tensor, f: Tensor, xy: Tensor, rows: Sequence[Tensor]) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """The point after the tilt `(P, V, 2, N)`, and f times its derivatives by x and by y before it, as much each.
+
+    Those by the angles `(P, 2)` are written to their rows. The tilt is the homography `M (x, y, 1)`.
+    """
+    sine = tau.sin()
+    (a, b), (c, d), (minus_c, minus_d) = (part.unbind(-1) for part in (tau.cos(), sine, -sine))  # of tau_x, of tau_y
+    ab, cd, zero = a * b, c * d, torch.zeros_like(a)
+    minus_ab, minus_ad, minus_bc, minus_cd = -ab, a * minus_d, b * minus_c, c * minus_d
+    M = [a, zero, zero, minus_cd, b, zero, d, minus_bc, ab]
+    by_tau_x = [minus_c, zero, zero, minus_ad, zero, zero, zero, minus_ab, minus_bc]
+    by_tau_y = [zero, zero, zero, minus_bc, minus_d, zero, b, cd, minus_ad]
+    M = torch.stack([*M, *by_tau_x, *by_tau_y], dim=-1).unflatten(-1, (1, 9, 3))
+    points = M[..., :2] @ xy + M[..., 2:]
+    X, X_by_x, X_by_y = points.unflatten(2, (3, 3)).unbind(2)
+    inverse = X[:, :, 2:].reciprocal()
+    tilted, scale = X[:, :, :2] * inverse, f * inverse
+    for row, moved in zip(rows, (X_by_x, X_by_y), strict=True):
+        torch.mul(torch.addcmul(moved[:, :, :2], tilted, moved[:, :, 2:], value=-1), scale, out=row)
+    M = M[:, :, :3, :2].unsqueeze(-1)
+    turn = torch.addcmul(M[:, :, :2], tilted.unsqueeze(3), M[:, :, 2:], value=-1).mul_(scale.unsqueeze(3))
+    return tilted, turn.unbind(3)
 
 
 DERIVATIVES = {None: pinhole, BrownConrady: brown_conrady, KannalaBrandt: fisheye}

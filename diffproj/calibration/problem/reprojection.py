@@ -29,7 +29,7 @@ from diffproj.calibration.problem.lens_derivatives import DERIVATIVES, Place
 from diffproj.calibration.problem.parametrisation import INTRINSICS, POSE, Parametrisation, moved
 from diffproj.lens.models import MODELS, LensModel
 
-KEPT = ("_panel", "_place", "_by_focal")
+KEPT = ("_panel", "_place", "_by_focal", "_by_turn")
 """What is kept from call to call: the panel and views of it, a hundred numbers for each corner."""
 
 
@@ -46,6 +46,8 @@ class Reprojection:
         skew: whether the skew of K is.
         whitening: what the residuals and their derivatives are multiplied by `(P, V, N, 2, 2)`; `None` for 1.
         free: whether the displacements of all points are.
+        terms: how many coefficients of the lens, from the first, are not 0, or may move; `None` for all. The others'
+            rows are 0, and take no time.
     """
 
     points: Tensor
@@ -56,6 +58,7 @@ class Reprojection:
     skew: bool = False
     whitening: Tensor | None = None
     free: bool = False
+    terms: int | None = None
     parameters: Parametrisation = field(init=False, repr=False)
     _plane_points: Tensor = field(init=False, repr=False)
     _bow_shape: Tensor = field(init=False, repr=False)
@@ -74,7 +77,9 @@ class Reprojection:
         P, V, N, _ = self.pixels.shape
         rows = self.pixels.new_empty(self.parameters.few + POSE + 1, P, V, 2, N)
         rows[: len(INTRINSICS)] = 0.0
-        rows[2, :, :, 0], rows[3, :, :, 1] = 1.0, 1.0  # by c_x, c_y
+        rows[2, :, :, 0] = rows[3, :, :, 1] = self.used.to(rows)  # by c_x, c_y
+        if self.terms is not None:
+            rows[len(INTRINSICS) + self.terms : self.parameters.lens_end] = 0.0
         if self.skew:
             rows[self.parameters.lens_end] = 0.0
         return rows.permute(1, 2, 0, 3, 4)
@@ -88,6 +93,11 @@ class Reprojection:
     def _by_focal(self) -> Tensor:
         """Of the panel, u by f_x and v by f_y `(P, V, 2, N)`."""
         return self._panel[:, :, :2].diagonal(dim1=2, dim2=3).movedim(-1, 2)
+
+    @cached_property
+    def _by_turn(self) -> tuple[Tensor, ...]:
+        """Of the panel, the rows of the rotation `(P, V, 2, N)`."""
+        return self._panel[:, :, -7:-4].unbind(2)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name not in KEPT}
@@ -111,19 +121,20 @@ class Reprojection:
         model, last = MODELS[self.lens], self.parameters.lens_end
         panel, by_axis = self._panel, self._place.by_axis
         X_cam = q + t.unsqueeze(-1)
+        if self._unused is not None:  # what does not count is on the axis, where the lens does nothing
+            X_cam.masked_fill_(self._unused.unsqueeze(2), 0.0)[:, :, 2].masked_fill_(self._unused, 1.0)
         if model.perspective:
-            z = X_cam[:, :, 2]
-            if self._unused is not None:
-                z.masked_fill_(self._unused, 1.0)
-            z.clamp_(min=0)  # behind the camera there is no cost: what follows is not finite
-        elif self._unused is not None:
-            X_cam[:, :, 2].masked_fill_(self._unused, 1.0)
+            X_cam[:, :, 2].clamp_(min=0)  # behind the camera there is no cost: what follows is not finite
         f, c = shared[:, None, :2, None], shared[:, None, 2:4, None]
-        distorted = DERIVATIVES[model.kind](shared[:, len(INTRINSICS) : last], f, X_cam, self._place)
+        coefficients = shared[:, len(INTRINSICS) : last][:, : self.terms]
+        distorted = DERIVATIVES[model.kind](coefficients, f, X_cam, self._place)
         self._by_focal.copy_(distorted)
         residual = panel[:, :, -1]
         torch.sub(c, self._seen, out=residual)
         residual.addcmul_(f, distorted)
+        if self._unused is not None:
+            residual.masked_fill_(self._unused.unsqueeze(2), 0.0)
+            self._place.by_point.masked_fill_(self._unused[:, :, None, None], 0.0)
         if self.skew:  # u = f_x x + skew y + c_x, with (x, y) distorted
             skew = shared[:, last, None, None]
             shear = (skew / shared[:, 1, None, None]).unsqueeze(2)
@@ -136,13 +147,10 @@ class Reprojection:
             for row in range(2):
                 torch.mul(normal, self._bow_shape[row], out=panel[:, :, last + self.skew + row])
         across = q.unsqueeze(3).unbind(2)
-        for axis in range(3):
+        for axis, row in enumerate(self._by_turn):
             a, b = (axis + 1) % 3, (axis + 2) % 3
-            row = panel[:, :, axis - 7]
             torch.mul(across[a], by_axis[b], out=row)
             row.addcmul_(across[b], by_axis[a], value=-1)
-        if self._unused is not None:
-            panel.masked_fill_(self._unused[:, :, None, None], 0.0)
         if self.whitening is None:
             return panel
         return torch.einsum("pvnij,pvrjn->pvrin", self.whitening, panel)  # a new tensor: the panel keeps constant rows

@@ -91,6 +91,32 @@ def test_jacobians_are_autograds(kind: type[Reprojection], lens: LensModel, bow:
         torch.testing.assert_close(panel[:, :, row], finite, rtol=0, atol=2e-5 * scale)
 
 
+@pytest.mark.parametrize("lens", MODELS)
+def test_unused_corners_are_zero_wherever_they_are(lens: LensModel) -> None:
+    board, shared, (R, t) = situation(lens, bow=True, skew=True)
+    used = torch.rand(P, V, len(board)) > 0.3
+    problem = Reprojection(board.points, torch.rand(P, V, len(board), 2, dtype=D), used, lens, bow=True, skew=True)
+    every = Reprojection(board.points, problem.pixels, torch.ones_like(used), lens, bow=True, skew=True)
+    seen = used[:, :, None, None].expand(P, V, shared.shape[-1] + 7, 2, len(board))
+    panel = problem.linearise(shared, (R, t)).clone()
+    assert (panel[~seen] == 0).all()
+    assert torch.equal(panel[seen], every.linearise(shared, (R, t))[seen])
+    away = torch.where(torch.rand(P, V, 1) > 0.5, t - torch.tensor([0.0, 0, 500], dtype=D), t)  # on the camera's plane
+    assert (problem.linearise(shared, (R, away))[~seen] == 0).all()
+
+
+@pytest.mark.parametrize(("lens", "terms"), [("brown14", 12), ("brown14", 8), ("brown12", 5), ("brown8", 4)])
+def test_coefficients_that_are_left_out_are_those_of_a_shorter_lens(lens: LensModel, terms: int) -> None:
+    board, shared, poses = situation(lens, bow=False)
+    shared[:, 4 + terms :] = 0.0
+    which = board.points, torch.rand(P, V, len(board), 2, dtype=D), torch.ones(P, V, len(board), dtype=torch.bool), lens
+    whole = Reprojection(*which).linearise(shared, poses).clone()
+    part = Reprojection(*which, terms=terms).linearise(shared, poses)
+    assert (part[:, :, 4 + terms : shared.shape[-1]] == 0).all()
+    for rows in (slice(4 + terms), slice(shared.shape[-1], None)):
+        torch.testing.assert_close(part[:, :, rows], whole[:, :, rows], rtol=1e-12, atol=1e-12)
+
+
 def test_unused_corners_are_zero_and_behind_is_no_cost() -> None:
     board, shared, (R, t) = situation("brown5", bow=False)
     used = torch.rand(P, V, len(board)) > 0.3
