@@ -45,16 +45,27 @@ def answer(calibration: dp.Calibration) -> torch.Tensor:
     return torch.stack(parts)
 
 
-def check(solve: Callable[[torch.Tensor, bool], dp.Calibration], value: torch.Tensor, step: float) -> None:
-    """The directional derivative of every number against a central difference, to 1e-4 of the largest of its kind."""
+CENTRAL, FOURTH_ORDER = {1: 1 / 2}, {1: 2 / 3, 2: -1 / 12}
+"""Finite differences: weights of how much the values so many steps ahead and behind differ."""
+
+
+def check(
+    solve: Callable[[torch.Tensor, bool], dp.Calibration],
+    value: torch.Tensor,
+    step: float,
+    stencil: dict[int, float] = CENTRAL,
+) -> None:
+    """The directional derivative of every number against a finite difference, to 1e-4 of the largest of its kind."""
     direction = torch.randn_like(value)
     argument = value.clone().requires_grad_()
     found = answer(solve(argument, True))
     rows = [torch.autograd.grad(x, argument, retain_graph=True)[0] for x in found]
     got = torch.stack([(row * direction).sum() for row in rows])
     with torch.no_grad():
-        ahead, behind = (answer(solve(value + sign * step * direction, False)) for sign in (1, -1))
-    want = (ahead - behind) / (2 * step)
+        want = torch.zeros_like(got)
+        for steps, weight in stencil.items():
+            ahead, behind = (answer(solve(value + sign * steps * step * direction, False)) for sign in (1, -1))
+            want += weight * (ahead - behind) / step
     torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-5 * float(want.abs().amax()))
 
 
@@ -129,7 +140,8 @@ def test_gradient_by_priors() -> None:
         priors = {"focal": (values[:2], values[2].abs()), "k2": values[3]}
         return dp.refine(views, Target(points), camera, priors=priors, differentiable=differentiable, tolerance=1e-17)
 
-    check(solve, torch.tensor([530.0, 540, 2.0, 0.05], dtype=D), 5e-4)
+    # A step whose square does not matter leaves the noise of two minima.
+    check(solve, torch.tensor([530.0, 540, 2.0, 0.05], dtype=D), 2e-3, FOURTH_ORDER)
 
 
 def test_values_are_those_of_the_solver_and_batches_keep_apart() -> None:
