@@ -59,11 +59,15 @@ def restrained(
     size: tuple[int, int],
     aside: Fit | None = None,
     *,
+    hold: bool = True,
     reject: float | None,
     max_iterations: int,
     tolerance: float,
-) -> Fit:
+) -> tuple[Fit, Tensor]:
     """The lowest fit whose lens does not fold; `Fit.task.prior` then holds what restrains it, if anything does.
+
+    With it, for which cameras there is none `(P,)`: the lens folds before its own corners, or the solver came to no
+    end.
 
     Args:
         found: the minimum without restraint.
@@ -71,6 +75,7 @@ def restrained(
         poses: of that fit.
         size: of the image.
         aside: where a few steps from there with a factor lead.
+        hold: whether lenses that fold are to be restrained. If not, what does not reach the whole image counts as such.
         reject: robust standard deviations beyond which a corner is an outlier.
         max_iterations: of the solver.
         tolerance: of the solver.
@@ -81,7 +86,7 @@ def restrained(
         below = [i for i in below if bool(task.basis[:, i].any())]
     spare = found.degrees_of_freedom().to(found.solution.cost)
     if not below or not bool((spare > 0).any()):
-        return found
+        return found, torch.zeros_like(found.rejected[:, 0, 0])
     best, reached = found, reach_of(found, size)
     lost = reached < 0
     which = ((spare > 0) & (reached < 1)).nonzero().flatten()
@@ -110,8 +115,8 @@ def restrained(
         lower = ((spare > 0) & (reached >= 1) & (cost < first * (1 - PROMISING / spare))).nonzero().flatten()
         if len(lower) > 0:
             ended(lower, aside.part(lower))
-    if len(which) == 0:
-        return best
+    if len(which) == 0 or not hold:
+        return best, reached < 0 if hold else reached < 1
     start = fit(given, shared, poses, max_iterations=0)
     precision = _unit_precision(start, below, size)
 
@@ -154,7 +159,7 @@ def restrained(
             break
         tried(down, strength, start.part(down))
         down = down[reached[down] < 1]
-    return best
+    return best, reached < 0
 
 
 def unfolded(
@@ -173,7 +178,7 @@ def unfolded(
     start = torch.nn.functional.pad(shared, (0, freed.solution.shared.shape[-1] - shared.shape[-1]))[rows]
     poses = flat.part(rows).solution.local
     limits: dict[str, Any] = {"reject": reject, "max_iterations": max_iterations, "tolerance": tolerance}
-    held = restrained(freed.part(rows), start, poses, size, **limits)
+    held, _ = restrained(freed.part(rows), start, poses, size, **limits)
     return put(freed, rows, held, torch.ones_like(rows, dtype=torch.bool))
 
 

@@ -1,18 +1,17 @@
-"""Lenses within lenses: the fit of a rich one starts from the lowest of all the poorer ones that it contains.
+"""Lenses within lenses: the fit of a rich one starts from poorer ones that it contains.
 
 The terms of a long lens nearly cancel each other, and those of a tilted sensor, a prism and skew do much the same as a
-shifted principal point: from far off they lead into side valleys. So they come in groups, and the camera is fitted with
-none of them, then with one, with two and so on, those with as many side by side. Every fit starts from the lowest of
-those with one group fewer, and the solver only ever goes down.
+shifted principal point: from far off they lead into side valleys. So they come in groups. The camera is fitted with
+none of them, from there with all but one of them, whichever that is, side by side, and from the lowest of these with
+all. As the solver only ever goes down, none ends above what it started from.
 
-The fits in between only choose the valley, and end as soon as steps buy next to nothing; but those that a tilt is added
-to go on to their minima, for with a tilt there are many valleys.
-
-That is done once more, thoroughly, where it ends in a lens that has to be restrained: then all in between go on to
-their minima, some of them from factors, too. And where the poorest fit was doubtful, from a second look at that; but
-only if the fit with all groups leaves more than noise. Through a poor lens the residuals are no noise anyway.
+Those fits in between only choose the valley, and end as soon as steps buy next to nothing. So some ends are no good:
+the lens folds, or it fits badly where that with none of the groups came about in a doubtful way. Then all is done once
+more, thoroughly: with one group, with two and so on, each from the lowest of those with one fewer, to their minima, the
+rational ones from factors, too, and none that folds; and from there with all groups, from each of those with one fewer.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -40,9 +39,9 @@ from diffproj.lens.models import MODELS
 
 SHORT = 5
 """Coefficients up to which a lens is fitted at once."""
-BETWEEN = 1e-4
-"""Tolerance of the fits in between: by chance alone a parameter lowers the cost of a thousand residuals by ten times
-this part of it."""
+BETWEEN, BEFORE_TILT, NEARLY = 1e-4, 1e-6, 1e-8
+"""Tolerance of the fits in between, by ten times which a parameter lowers the cost of a thousand residuals by chance;
+where the next has a tilt, with which there are many valleys; and where all go on to their minima."""
 PRISM, TILT = ("s1", "s2", "s3", "s4"), ("tau_x", "tau_y")
 GROUPS = ((SKEW,), PRISM, TILT, DENOMINATOR)
 """Parameters that a long lens gets one group after the other."""
@@ -80,27 +79,74 @@ class Nested:
         if not self._groups:
             found = self._begun(self.chosen, self.shared, self.local).minimum(self.chosen)
             return self._looked_at(found, self.chosen)
-        options = self._early(loose=False)
-        options = options.but(fixed=(*options.fixed, *(name for group in self._groups for name in group)))
+        options = self._poorest_options()
         poorest = self._begun(options, self.shared, self.local).minimum(options)
-        found = self._climbed(with_positive_focal_lengths(poorest, **_steps(options)))
-        rows = self._unclear(found, poorest).nonzero().flatten()
+        return self._lowest_from(with_positive_focal_lengths(poorest, **_steps(options)))
+
+    def _poorest_options(self) -> Options:
+        """The options of the fit with none of the groups."""
+        options = self._early(NEARLY)
+        return options.but(fixed=(*options.fixed, *(name for group in self._groups for name in group)))
+
+    def _lowest_from(self, poorest: Fit) -> Fit:
+        """The fit with all groups, from the one with none."""
+        in_between = len(self._groups) > 1
+        found, lost = self._quickly(poorest) if in_between else self._thoroughly(poorest)
+        again = doubtful(poorest, steps_tell=True)
+        if bool(again.any()):
+            again &= lost | found.is_restrained() | doubtful(found, steps_tell=False)
+        rows = (again | lost if in_between else again).nonzero().flatten()
         if len(rows) == 0:
             return found
-        some = replace(self, straight=self.straight.part(rows), rows=rows)
-        other = some._climbed(some._looked_at(poorest.part(rows), options), thorough=True)
+        own = rows if self.rows is None else self.rows[rows]
+        some = replace(self, straight=self.straight.part(rows), rows=own)
+        other, _ = some._thoroughly(some._looked_at(poorest.part(rows), self._poorest_options()))
+        return self._better(found, rows, other)
+
+    def _quickly(self, poorest: Fit) -> tuple[Fit, Tensor]:
+        """The fit with all groups from the lowest with one fewer; and whether its lens folds `(P,)`."""
+        fits = {(): poorest}
+        fits |= self._between([*self._with(len(self._groups) - 1)], fits, thorough=False)
+        return self._whole(self._lowest(fits, self._groups), thorough=False)
+
+    def _thoroughly(self, poorest: Fit) -> tuple[Fit, Tensor]:
+        """The lowest fit with all groups, from each with one fewer; and whether it folds even if restrained `(P,)`."""
+        fits: dict[Groups, Fit] = {(): poorest}
+        for count in range(1, len(self._groups)):
+            some = [inside for inside in self._with(count) if inside != self._upright]
+            fits |= self._between(some, fits, thorough=True) if some else {}
+        if TILT in self._groups and self._upright:  # as they are fitted on their own
+            upright = replace(self, chosen=self._early(NEARLY).but(fixed=(*self.chosen.fixed, *TILT)))
+            fits[self._upright] = upright._lowest_from(poorest)
+        ends = [
+            self._whole((start.shared, start.local), thorough=True)
+            for start in (fits[inside].solution for inside in self._with(len(self._groups) - 1))
+        ]
+        found, folds = ends[0]
+        every = torch.arange(len(folds), device=folds.device)
+        for other, also in ends[1:]:
+            found, folds = self._better(found, every, other), folds & also
+        return self._held_near_another(found, folds, [fits[inside] for inside in reversed(fits)])
+
+    def _better(self, found: Fit, rows: Tensor, other: Fit) -> Fit:
+        """The fit with some cameras `(n,)` replaced whose other one reaches farther, or as far and is lower."""
         before, now = costs(found, other, rows, self.chosen.outlier_limit)
         reached, reaches = reach_of(found.part(rows), self.size), reach_of(other, self.size)
         better = (reaches > reached) | ((reaches == reached) & (now < before * (1 - LOWER)))
         return put(found, rows[better], other, better)
 
-    def _unclear(self, found: Fit, poorest: Fit) -> Tensor:
-        """Which cameras are fitted once more, thoroughly `(P,)`."""
-        held = found.is_restrained()
-        unclear = doubtful(poorest, steps_tell=True)
-        if bool(unclear.any()):
-            unclear &= held | doubtful(found, steps_tell=False)
-        return unclear if len(self._groups) == 1 else unclear | held
+    def _held_near_another(self, found: Fit, folds: Tensor, others: list[Fit]) -> tuple[Fit, Tensor]:
+        """The fit with lenses that fold `(P,)` restrained near the first of the poorer ones with which that helps."""
+        limits = {"reject": self.chosen.outlier_limit, **_steps(self.chosen)}
+        rows = folds.nonzero().flatten()
+        for poorer in others:
+            if len(rows) == 0:
+                break
+            near = poorer.part(rows).solution
+            held, still = restrained(found.part(rows), near.shared, near.local, self.size, **limits)
+            found = put(found, rows[~still], held, ~still)
+            rows = rows[still]
+        return found, torch.zeros_like(folds).index_fill(0, rows, True)
 
     @property
     def _groups(self) -> Groups:
@@ -115,18 +161,19 @@ class Nested:
         """The groups without the tilt."""
         return tuple(group for group in self._groups if group != TILT)
 
-    def _early(self, *, loose: bool) -> Options:
+    def _early(self, tolerance: float) -> Options:
         """The options of fits that others start from."""
         return self.chosen.but(
             objective="image",
             reject_outliers=False,
             loss=None if self.chosen.objective == "plane" else self.chosen.loss,  # its scale is in world units
             progress=None,
-            tolerance=max(BETWEEN, self.chosen.tolerance) if loose else self.chosen.tolerance,
+            tolerance=max(tolerance, self.chosen.tolerance),
         )
 
     def _begun(self, options: Options, shared: Tensor, local: Pose) -> Begun:
-        return begun(self.data, options, self.parameters, shared, local, self.reference, self.rows)
+        begin = begun(self.data, options, self.parameters, shared, local, self.reference, self.rows)
+        return begin if options is self.chosen else begin._replace(task=replace(begin.task, brief=True))
 
     def _looked_at(self, found: Fit, options: Options, long_valley: bool = False) -> Fit:
         """The fit after a second look, with focal lengths that make sense."""
@@ -134,65 +181,62 @@ class Nested:
         found = second_look(found, self.straight, reject=options.outlier_limit, long_valley=long_valley, **steps)
         return with_positive_focal_lengths(found, **steps)
 
-    def _climbed(self, poorest: Fit, *, thorough: bool = False) -> Fit:
-        """The fit with all groups, from the one with none; thoroughly if those in between go on to their minima."""
-        fits: dict[Groups, Fit] = {(): poorest}
-        for count in range(1, len(self._upright)):
-            fits |= self._between(list(combinations(self._upright, count)), fits, thorough=thorough)
-        if self._upright:
-            fits[self._upright] = self._whole(self._upright, fits)
-        if TILT not in self._groups:
-            return fits[self._groups]
-        both = {PRISM, TILT} & set(self._groups)  # no lens has a tilt without a prism
-        for count in range(len(both), len(self._groups)):
-            some = [inside for inside in combinations(self._groups, count) if both <= set(inside)]
-            fits |= self._between(some, fits, thorough=thorough)
-        return self._whole(self._groups, fits)
+    def _with(self, count: int) -> Iterator[Groups]:
+        """The sets of as many groups; none has a tilt without a prism if there is one."""
+        for inside in combinations(self._groups, count):
+            if TILT not in inside or PRISM in inside or PRISM not in self._groups:
+                yield inside
 
     def _between(self, some: list[Groups], fits: dict[Groups, Fit], *, thorough: bool) -> dict[Groups, Fit]:
         """The fits with as many of the groups, each from the lowest poorer one."""
-        options = self._early(loose=TILT not in some[0] and not thorough)
+        options = self._early(NEARLY if thorough else BEFORE_TILT if TILT in self._groups else BETWEEN)
         starts = {inside: self._lowest(fits, inside) for inside in some}
         begin = self._begun(options, *starts[some[0]])
+        lanes = {inside: Lane(*start, options.max_iterations, self._held(inside)) for inside, start in starts.items()}
+        found, beside = self._side_by_side(
+            begin.task, lanes, [inside for inside in some if thorough and TILT not in inside], options
+        )
         ends = {}
-        for inside, (found, beside) in self._side_by_side(begin.task, starts, options, factors=thorough).items():
-            end = with_positive_focal_lengths(found, **_steps(options))
+        for inside in some:
+            end = with_positive_focal_lengths(found[inside], **_steps(options))
             if DENOMINATOR in inside and thorough:
-                end = restrained(end, *starts[inside], self.size, beside, reject=None, **_steps(options))
+                end, _ = restrained(end, *starts[inside], self.size, beside.get(inside), reject=None, **_steps(options))
             elif DENOMINATOR in inside:
                 end = _no_start_if_folded(end)
             ends[inside] = end
         return ends
 
-    def _whole(self, inside: Groups, fits: dict[Groups, Fit]) -> Fit:
-        """The fit with all groups, or all but the tilt."""
-        options = self.chosen if inside == self._groups else self._early(loose=False)
+    def _whole(self, start: tuple[Tensor, Pose], *, thorough: bool) -> tuple[Fit, Tensor]:
+        """The fit with all groups; and whether its lens folds `(P,)`, which is mended where it can be if thorough."""
+        options, inside = self.chosen, self._groups
         steps, limit = _steps(options), options.outlier_limit
-        start = self._lowest(fits, inside)
         begin = self._begun(options, *start)
-        starts = {inside: (begin.shared, begin.local)}
-        found, beside = self._side_by_side(begin.task, starts, options, factors=True)[inside]
+        lanes = {inside: Lane(begin.shared, begin.local, options.max_iterations)}
+        ends, beside = self._side_by_side(begin.task, lanes, [inside], options)
         # The valleys of a prism alone and of a denominator are long; many steps to a tilt may lead to a side one.
-        found = self._looked_at(found, options, inside == (PRISM,) or DENOMINATOR in inside)
+        found = self._looked_at(ends[inside], options, inside == (PRISM,) or DENOMINATOR in inside)
+        folds = torch.zeros_like(found.rejected[:, 0, 0])
         if DENOMINATOR in inside:
-            found = restrained(found, *start, self.size, beside, reject=limit, **steps)
-        return lower_valley(found, self.size, reject=limit, **steps) if TILT in inside else found
+            found, folds = restrained(
+                found, *start, self.size, beside.get(inside), hold=thorough, reject=limit, **steps
+            )
+        if TILT in inside:
+            found = lower_valley(found, self.size, reject=limit, **steps)
+        return found, folds
 
     def _side_by_side(
-        self, task: Task, starts: dict[Groups, tuple[Tensor, Pose]], options: Options, *, factors: bool
-    ) -> dict[Groups, tuple[Fit, Fit | None]]:
-        """The minima with some of the groups; and where a few steps with a factor lead, where that is asked for."""
-        most, few = options.max_iterations, min(options.max_iterations, FEW_STEPS)
-        lanes = {(inside, False): Lane(*start, most, self._held(inside)) for inside, start in starts.items()}
-        for inside, (shared, local) in starts.items():
-            if factors and DENOMINATOR in inside and TILT not in inside:
-                factor = with_factor(task, shared, self.size, FACTORS[0])
-                if factor is not None:
-                    lanes[inside, True] = Lane(factor, local, few, self._held(inside))
+        self, task: Task, lanes: dict[Groups, Lane], through: list[Groups], options: Options
+    ) -> tuple[dict[Groups, Fit], dict[Groups, Fit]]:
+        """Where the lanes end; and where a few steps from a start with a factor lead, of those that are to have one."""
+        few = min(options.max_iterations, FEW_STEPS)
+        factors = {}
+        for inside in through:
+            factor = with_factor(task, lanes[inside].shared, self.size, FACTORS[0]) if DENOMINATOR in inside else None
+            if factor is not None:
+                factors[inside] = replace(lanes[inside], shared=factor, max_iterations=few)
         limits: dict[str, Any] = {"reject": options.outlier_limit, "tolerance": options.tolerance}
-        found = side_by_side(task, list(lanes.values()), progress=options.progress, **limits)
-        ends = dict(zip(lanes, found, strict=True))
-        return {inside: (ends[inside, False], ends.get((inside, True))) for inside in starts}
+        ends = side_by_side(task, [*lanes.values(), *factors.values()], progress=options.progress, **limits)
+        return dict(zip(lanes, ends, strict=False)), dict(zip(factors, ends[len(lanes) :], strict=True))
 
     def _held(self, inside: Groups) -> tuple[int, ...]:
         """Positions of the parameters of the other groups."""
@@ -200,9 +244,9 @@ class Nested:
         return tuple(i for i, name in enumerate(self.parameters.names) if name in others)
 
     def _lowest(self, fits: dict[Groups, Fit], inside: Groups) -> tuple[Tensor, Pose]:
-        """Shared parameters and poses of the lowest fit with one group fewer, of each camera."""
-        poorer = (tuple(g for g in inside if g != left) for left in inside)
-        fewer = [fits[groups].solution for groups in poorer if groups in fits]
+        """Shared parameters and poses of the lowest fit with one group fewer, of each camera; or of that with none."""
+        poorer = [tuple(g for g in inside if g != left) for left in inside]
+        fewer = [fits[groups].solution for groups in poorer if groups in fits] or [fits[()].solution]
         costs = torch.stack([solution.cost.nan_to_num(torch.inf) for solution in fewer])
         best = costs.argmin(0), torch.arange(costs.shape[1], device=costs.device)
         shared = torch.stack([solution.shared for solution in fewer])[best]
