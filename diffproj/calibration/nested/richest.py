@@ -247,8 +247,8 @@ class Nested:
         """Shared parameters and poses of the lowest fit with one group fewer, of each camera; or of that with none."""
         poorer = [tuple(g for g in inside if g != left) for left in inside]
         fewer = [fits[groups].solution for groups in poorer if groups in fits] or [fits[()].solution]
-        costs = torch.stack([solution.cost.nan_to_num(torch.inf) for solution in fewer])
-        best = costs.argmin(0), torch.arange(costs.shape[1], device=costs.device)
+        each = torch.stack([solution.cost.nan_to_num(torch.inf) for solution in fewer])
+        best = each.argmin(0), torch.arange(each.shape[1], device=each.device)
         shared = torch.stack([solution.shared for solution in fewer])[best]
         local = zip(*(solution.local for solution in fewer), strict=True)
         return shared, tuple(torch.stack(parts)[best] for parts in local)
