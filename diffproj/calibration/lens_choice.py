@@ -21,7 +21,7 @@ from diffproj.calibration.problem.constraints import of_points
 from diffproj.calibration.problem.parametrisation import BOW, INTRINSICS
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
 from diffproj.calibration.results.comparison import LensComparison
-from diffproj.calibration.results.remark import OF_THE_CAMERA
+from diffproj.calibration.results.remark import OF_THE_CAMERA, Kind
 from diffproj.calibration.trust.verdict import LacksViews
 from diffproj.lens.models import MODELS, LensModel
 from diffproj.targets.target import Target
@@ -150,8 +150,15 @@ def _simplest(candidates: list[_Candidate]) -> _Candidate | None:
             continue
         worse, deviation = _difference(candidate, best)
         if worse <= max(ALLOWED * deviation, ALIKE * float(best.squares.nanmean())):
-            return candidate
+            return _without_needless_terms(candidate, judged)
     return best
+
+
+def _without_needless_terms(candidate: _Candidate, judged: list[_Candidate]) -> _Candidate:
+    """The lens, or of `"brown8"` whose denominator stands for noise the one without, whatever that leaves over."""
+    needless = any(remark.kind == Kind.NEEDLESS for remark in candidate.fit.findings[0])
+    shorter = [c for c in judged if c.model == "brown5"]
+    return shorter[0] if candidate.model == "brown8" and needless and shorter else candidate
 
 
 def _lacks_views(candidate: _Candidate) -> bool:

@@ -54,16 +54,12 @@ def test_a_lens_of_180_degrees() -> None:
     assert found.rms < 0.3
 
 
-@pytest.mark.parametrize(
-    ("views", "simplest"),
-    # The residuals of two are smooth with brown5, and with brown12 that hangs by a hair.
-    [pytest.param(2, ("brown5", "brown8"), marks=pytest.mark.slow), (3, ("brown5",))],
-)
-def test_few_views_are_judged_by_their_corners(views: int, simplest: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("views", [pytest.param(2, marks=pytest.mark.slow), 3])
+def test_few_views_are_judged_by_their_corners(views: int) -> None:
     found = dp.calibrate(dp.example_views("left")[2 : 2 + views], BOARD, "auto")
     assert found.comparison is not None
     assert found.comparison.held_out == "corners"
-    assert found.comparison.chosen in simplest
+    assert found.comparison.chosen == "brown5"
 
 
 def test_the_table_tells_what_was_compared() -> None:

@@ -11,6 +11,8 @@ class Kind(StrEnum):
     OTHER = "other"
     OTHER_LENS = "other lens"
     """The residuals are those of another lens."""
+    NEEDLESS = "needless"
+    """Some of the lens's terms stand for noise: the lens without them fits as well."""
     SKEW = "skew"
     """The residuals are those of a K with skew, which was held."""
     TWO_CAMERAS = "two cameras"

@@ -79,7 +79,8 @@ def remarks(
             said[p].append(
                 Remark(
                     f"k4, k5 and k6 stand for noise, without them the residuals are {100 * growth:.1f} % larger: "
-                    f"{NO_DENOMINATOR[task.lens]} fits as well"
+                    f"{NO_DENOMINATOR[task.lens]} fits as well",
+                    Kind.NEEDLESS,
                 )
             )
     for p, other in doubt.simpler.items():
