@@ -46,8 +46,8 @@ class Task:
         loss: a robust loss, or `None` for least squares.
         prior: on the shared parameters.
         basis: of the shared parameters' free directions `(P, s, q)`, or `None` for all.
-        brief: whether coefficients of the lens that are held at 0, and come last, are left out to save time; the normal
-            equations then have zeros for them.
+        brief: whether coefficients of the lens that are held at 0, and come last, are left out to save time, so that a
+            shorter lens is fitted; the normal equations then have zeros for them.
         pose_known: how many of the six coordinates of each pose are held, or known beforehand.
         printed: precision of the displacement of each free point `(P, N, 3, 3)`, in the unit of the weights; `None` for
             0.
@@ -93,16 +93,9 @@ class Task:
     @property
     def problem(self) -> Reprojection:
         """Residuals and Jacobians."""
-        return self._problem(None)
-
-    def problem_from(self, shared: Tensor) -> Reprojection:
-        """The same for fits from shared parameters `(P, s)`, which may be `brief`."""
-        return self._problem(self.terms_from(shared))
-
-    def _problem(self, terms: int | None) -> Reprojection:
         kind = BoardError if self.objective == "plane" else Reprojection
         which = self.points, self.pixels, self.used, self.lens, self.bow, self.skew, self.whitening
-        return kind(*which, free=self.free, terms=terms)
+        return kind(*which, free=self.free)
 
     @property
     def moves_points(self) -> bool:
@@ -134,15 +127,24 @@ class Task:
             return Prior(held.new_zeros(P, s), held, root=root)
         return Prior(self.prior.mean, self.prior.precision + held, root=root)
 
-    def terms_from(self, shared: Tensor) -> int | None:
-        """How many coefficients a fit from shared parameters `(P, s)` needs; `None` for all. See `brief`."""
+    def lens_from(self, shared: Tensor) -> LensModel:
+        """The lens that a fit from shared parameters `(P, s)` needs: a shorter one where it may be `brief`."""
         kind = MODELS[self.lens].kind
         if not self.brief or self.basis is None or kind is not BrownConrady:
-            return None
+            return self.lens
         lens = slice(len(INTRINSICS), self.parameters.lens_end)
         there = (shared[:, lens] != 0).any(0) | (self.basis[:, lens] != 0).any(-1).any(0)
+        there = there if self.prior is None else there | (self.prior.whole[:, lens] != 0).any(-1).any(0)
         last = max((number for number, is_there in enumerate(there.tolist(), start=1) if is_there), default=0)
-        return next(count for count in kind.counts if count >= last)
+        return next(name for name, model in MODELS.items() if model.kind is kind and model.count >= last)
+
+    def with_shorter_lens(self, lens: LensModel) -> tuple["Task", list[int]]:
+        """The same with a shorter lens, the others' coefficients being 0; and where its parameters are among all."""
+        short = replace(self, lens=lens)
+        where = [self.names.index(name) for name in short.names]
+        basis = None if self.basis is None else self.basis[:, where]
+        prior = None if self.prior is None else self.prior.among(where)
+        return replace(short, basis=basis, prior=prior), where
 
     def holding(self, where: list[int]) -> "Task":
         """The same with some of the shared parameters held, by their positions."""
@@ -200,13 +202,17 @@ def _scale(task: Task, unit: float) -> float:
 
 
 def _solved(task: Task, shared: Tensor, local: tuple[Tensor, ...], **options: Any) -> Solution:
+    lens = task.lens_from(shared)
+    if lens != task.lens:
+        short, where = task.with_shorter_lens(lens)
+        return _lengthened(_solved(short, shared[:, where], local, **options), shared, where)
     size = task.used.sum((-2, -1)).amax().clamp(min=1).item()
     unit = NEGLIGIBLE_PX if task.objective == "image" else 1e-13 * float(task.points.abs().amax())
     weights = task.weights
     if task.shares is not None:
         weights = task.shares.unsqueeze(-1).expand(task.used.shape) * (1.0 if weights is None else weights)
     solution = solve(
-        task.problem_from(shared),
+        task.problem,
         shared,
         local,
         local_size=POSE,
@@ -226,6 +232,19 @@ def _solved(task: Task, shared: Tensor, local: tuple[Tensor, ...], **options: An
             **{name: block / shaped_like(task.shares, block) for name, block in whole.items()}
         )
     )
+
+
+def _lengthened(solution: Solution, shared: Tensor, where: list[int]) -> Solution:
+    """The solution for a shorter lens, among all parameters `(P, s)`."""
+    at, s = torch.tensor(where, device=shared.device), shared.shape[-1]
+    U, E, *_ = equations = solution.equations
+    P, V, _, size = E.shape
+    equations = equations._replace(
+        U=U.new_zeros(P, s, s).index_copy(1, at, U.new_zeros(P, len(where), s).index_copy(2, at, U)),
+        E=E.new_zeros(P, V, s, size).index_copy(2, at, E),
+        g=equations.g.new_zeros(P, s).index_copy(1, at, equations.g),
+    )
+    return solution._replace(shared=shared.index_copy(1, at, solution.shared), equations=equations)
 
 
 def shaped_like(shares: Tensor, block: Tensor) -> Tensor:

@@ -63,13 +63,15 @@ class DampingControl:
         self.active &= self.iterations < self.limit
         # The current step will still be applied: the criterion is the reduction of the step after it, extrapolated.
         after = expected * np.minimum(np.maximum(expected / self.previous, BEST_CONTRACTION), 1)
-        self.previous = np.where(self.active, expected, self.previous)
-        converged = (after <= tolerance * self.cost) & (expected <= max(FINAL_STEP_REDUCTION, tolerance) * self.cost)
+        self.previous = expected
+        done = (after <= tolerance * self.cost) & (expected <= max(FINAL_STEP_REDUCTION, tolerance) * self.cost)
         # Where the reduction is below the cost's rounding error, acceptance is random: the first failure ends it.
         rounding = ROUNDING * self.cost + RESIDUAL_ROUNDING * np.sqrt(self.negligible * self.cost)
-        exhausted = (self.failed & (expected <= rounding)) | (expected <= 1e-3 * ROUNDING * self.cost)
-        done = self.active & (converged | exhausted | (self.cost <= self.negligible))
-        stuck = self.active & ~done & (self.damping > MAX_DAMPING)
+        done |= (expected <= np.where(self.failed, rounding, 1e-3 * ROUNDING * self.cost)) | (
+            self.cost <= self.negligible
+        )
+        done &= self.active
+        stuck = self.active & (self.damping > MAX_DAMPING) & ~done
         self.status[done], self.status[stuck] = Status.CONVERGED, Status.DIVERGED
         self.active &= ~(done | stuck)
         self.iterations += self.active

@@ -46,6 +46,8 @@ from diffproj.calibration.least_squares.losses import Loss
 
 __all__ = ["Status"]  # which comes with the solver wherever it is needed
 
+HAIR = 1e-150
+"""What the diagonal of the damped matrices has at least."""
 LocalState = tuple[Tensor, ...]
 """Tensors `(P, V, ...)` with the state of the local blocks, which only the problem interprets."""
 
@@ -130,6 +132,13 @@ class Prior(NamedTuple):
         known, root = (None if part is None else part[where] for part in (self.known, self.root))
         return Prior(self.mean[where], self.precision[where], known, root)
 
+    def among(self, unknowns: list[int]) -> "Prior":
+        """That of some of the unknowns, on which alone it says something."""
+        square = (slice(None), torch.tensor(unknowns).unsqueeze(-1), unknowns)
+        known = None if self.known is None else self.known[square]
+        root = None if self.root is None else self.root[:, unknowns]
+        return Prior(self.mean[:, unknowns], self.precision[square], known, root)
+
 
 class Equations(NamedTuple):
     """The undamped normal equations at a point, in all shared unknowns: U `(P, s, s)`, E, W, g and h as above.
@@ -143,16 +152,6 @@ class Equations(NamedTuple):
     g: Tensor
     h: Tensor
     c: Tensor
-
-    def along(self, basis: Tensor | None) -> "Equations":
-        """The same equations for shared unknowns restricted to a basis `(P, s, q)`."""
-        if basis is None:
-            return self
-        if basis.shape[-1] == 0:
-            U, E, g = self.U[:, :0, :0], self.E[:, :, :0], self.g[:, :0]
-            return Equations(U, E, self.W, g, self.h, self.c)
-        T = basis.mT
-        return Equations(T @ self.U @ basis, T.unsqueeze(1) @ self.E, self.W, _times(T, self.g), self.h, self.c)
 
 
 class Solution(NamedTuple):
@@ -231,15 +230,15 @@ def solve(
     limits = for_each(max_iterations, cost).numpy(force=True)
     control = DampingControl(_array(cost), _array(negligible), limits)
     everyone = Everyone(state, control)
+    parts = isinstance(problem, Parted)
     for iteration in range(1, int(limits.max(initial=0)) + 1):
-        along = state.equations.along(basis)
-        q, dz, reduction = damped_step(along, torch.from_numpy(control.damping).to(cost))
+        dx, dz, reduction = damped_step(state.equations, torch.from_numpy(control.damping).to(cost), basis)
         predicted = _array(reduction)
-        dx = q if basis is None else _times(basis, q)
         trial: tuple[Tensor, LocalState] = (state.shared + dx, problem.retract(state.local, dz))
         # Heavy damping makes every predicted reduction small: convergence is then judged by the gradient.
-        heavy = control.damping > HEAVY_DAMPING
-        expected = np.where(heavy, _array(_decoupled_reduction(along)), predicted) if heavy.any() else predicted
+        heavy, expected = control.damping > HEAVY_DAMPING, predicted
+        if heavy.any():
+            expected = np.where(heavy, _array(_decoupled_reduction(state.equations, basis)), predicted)
         done = control.stop(expected, tolerance)
         if done.any():
             # The final step still improves the unknowns, but its reduction is negligible: apply without evaluating it.
@@ -248,11 +247,11 @@ def solve(
             state = state._replace(shared=x, local=z)
         if not control.active.any():
             break
-        if pays_to_part(control) and isinstance(problem, Parted):
+        if parts and pays_to_part(control):
             which = torch.from_numpy(np.flatnonzero(control.active)).to(cost.device)
             everyone.keep(state, control, which)
             state, trial = rows(state, which), rows(trial, which)
-            problem, basis = problem.part(which), None if basis is None else basis[which]
+            problem, basis = problem.part(which), None if basis is None else basis[which]  # type: ignore[union-attr]
             weights, prior = None if weights is None else weights[which], None if prior is None else prior.part(which)
             predicted, control = predicted[control.active], control.part(control.active)
             terms = _Terms(problem, local_size, weights, loss, prior, every)
@@ -275,33 +274,51 @@ class _State(NamedTuple):
     equations: Equations
 
 
-def damped_step(equations: Equations, damping: Float[Tensor, " p"]) -> tuple[Tensor, Tensor, Tensor]:
+def damped_step(
+    equations: Equations, damping: Float[Tensor, " p"], basis: Float[Tensor, "p s q"] | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Solve the damped normal equations by the Schur complement.
 
+    The step lowers the quadratic model by
+
+        1/2 (sum |y_v|^2 + |L^-1 (g - sum Y_v^T y_v)|^2) + lambda/2 (dx . diag(U) dx + sum dz_v . diag(W_v) dz_v)
+
+    with `L L^T = S`. With few views the calls take the time, so that there are as few as will do.
+
     Args:
-        equations: along the basis.
+        equations: undamped.
         damping: lambda `(P,)`.
+        basis: of the directions in which x may move; all if left out.
 
     Returns:
-        `(dx, dz, reduction)`: the step, `(P, q)` and `(P, V, l)`, and the cost reduction predicted by the quadratic
+        `(dx, dz, reduction)`: the step, `(P, s)` and `(P, V, l)`, and the cost reduction predicted by the quadratic
         model, `(P,)`. Zero, zero and infinite where the matrices are not positive definite.
     """
     U, E, W, g, h, _ = equations
-    lam = damping.unsqueeze(-1)
-    D = lam * _damping_scale(U.diagonal(dim1=-2, dim2=-1))
-    D_local = lam.unsqueeze(-1) * _damping_scale(W.diagonal(dim1=-2, dim2=-1))
-    L, local_failed = torch.linalg.cholesky_ex(_with_diagonal(W, D_local))
-    Y = torch.linalg.solve_triangular(L, torch.cat([E.mT, h.unsqueeze(-1)], dim=-1), upper=False).flatten(1, 2)
-    eliminated = Y.mT @ Y
-    L_shared, failed = torch.linalg.cholesky_ex(_with_diagonal(U - eliminated[:, :-1, :-1], D))
-    dx = torch.cholesky_solve((eliminated[:, :-1, -1] - g).unsqueeze(-1), L_shared)
-    y = (Y @ torch.nn.functional.pad(dx, (0, 0, 0, 1), value=1.0)).unflatten(1, h.shape[1:])
-    dx, dz = dx.squeeze(-1), -torch.linalg.solve_triangular(L.mT, y, upper=True).squeeze(-1)
-    slope, local_slope = torch.addcmul(g, D, dx, value=-1), torch.addcmul(h, D_local, dz, value=-1)
-    reduction = ((slope * dx).sum(-1) + (local_slope * dz).sum((-2, -1))) / -2
+    P, V, size = h.shape
+    E_T, g, h = E.mT.reshape(P, V * size, E.shape[2]), g.unsqueeze(-1), h.reshape(P, V * size, 1)
+    if basis is not None and basis.shape[-1] > 0:
+        E_T, U, g = E_T.bmm(basis), basis.mT.bmm(U).bmm(basis), basis.mT.bmm(g)
+    elif basis is not None:
+        E_T, U, g = E_T[:, :, :0], U[:, :0, :0], g[:, :0]
+    q = U.shape[-1]
+    L_local, local_failed = torch.linalg.cholesky_ex(_damped(W, damping.view(P, 1, 1)))
+    panel = torch.cat([E_T, h], dim=-1).view(P, V, size, q + 1)
+    Y = torch.linalg.solve_triangular(L_local, panel, upper=False).reshape(P, V * size, q + 1)
+    eliminated = Y.mT.bmm(Y)
+    L, failed = torch.linalg.cholesky_ex(_damped(U, damping.view(P, 1)) - eliminated[:, :q, :q])
+    pull = eliminated[:, :q, q:] - g
+    dx = torch.cholesky_solve(pull, L)
+    y = torch.baddbmm(Y[:, :, q:], Y[:, :, :q], dx).view(P, V, size, 1)
+    dz = torch.linalg.solve_triangular(L_local.mT, y, upper=True).neg_()
+    gain = eliminated[:, q, q] + (pull * dx).sum((1, 2))
+    held = (U.diagonal(dim1=1, dim2=2).unsqueeze(-1) * dx.square()).sum((1, 2))
+    held += (W.diagonal(dim1=2, dim2=3).unsqueeze(-1) * dz.square()).sum((1, 2, 3))
+    reduction = torch.addcmul(gain, damping, held).div_(2)
+    dx, dz = (dx if basis is None else basis.bmm(dx)).squeeze(-1), dz.squeeze(-1)
+    if not bool(failed.any()) and not bool(local_failed.any()):
+        return dx, dz, reduction.nan_to_num_(torch.inf, torch.inf, torch.inf)
     sound = (failed == 0) & (local_failed == 0).all(-1) & reduction.isfinite()
-    if bool(sound.all()):
-        return dx, dz, reduction
     return (
         torch.where(sound.unsqueeze(-1), dx, 0.0),
         torch.where(sound[:, None, None], dz, 0.0),
@@ -309,11 +326,29 @@ def damped_step(equations: Equations, damping: Float[Tensor, " p"]) -> tuple[Ten
     )
 
 
-def _decoupled_reduction(equations: Equations) -> Tensor:
+def _damped(matrix: Tensor, damping: Tensor) -> Tensor:
+    """The matrix with its diagonal times `1 + damping`.
+
+    Of an unknown without effect on the residuals, row and column are 0: a hair on the diagonal makes its step 0.
+    """
+    sum_ = matrix.clone()
+    diagonal = sum_.diagonal(dim1=-2, dim2=-1)
+    diagonal.addcmul_(diagonal, damping).clamp_(min=HAIR)
+    return sum_
+
+
+def _decoupled_reduction(equations: Equations, basis: Tensor | None) -> Tensor:
     """Reduction predicted if each unknown moved alone, `(P,)`: a norm of the gradient that no damping reduces."""
     U, _, W, g, h, _ = equations
-    D, D_local = (_damping_scale(M.diagonal(dim1=-2, dim2=-1)) for M in (U, W))
-    return ((g.square() / D).sum(-1) + (h.square() / D_local).sum((-2, -1))) / 2
+    if basis is not None and basis.shape[-1] > 0:
+        U, g = basis.mT @ U @ basis, _times(basis.mT, g)
+    elif basis is not None:
+        U, g = U[:, :0, :0], g[:, :0]
+    size, local_size = (M.diagonal(dim1=-2, dim2=-1) for M in (U, W))
+    alone, local_alone = (
+        torch.where(scale > 0, slope.square() / scale, 0.0) for scale, slope in ((size, g), (local_size, h))
+    )
+    return (alone.sum(-1) + local_alone.sum((-2, -1))) / 2
 
 
 class _Terms:
@@ -356,8 +391,8 @@ class _Terms:
                 robust = (weights * self.loss.value(squared)).sum((-2, -1)) / 2
                 weights = weights * self.loss.weight(squared)
             panel = panel * weights.sqrt()[:, :, None, None]
-        rows = panel.flatten(-2)
-        gram = rows @ rows.mT
+        rows = panel.flatten(0, 1).flatten(-2)
+        gram = rows.bmm(rows.mT).unflatten(0, panel.shape[:2])
         s = rows.shape[-2] - self.local_size - 1
         totals = gram[..., :s, :].sum(1)
         c = gram[..., -1, -1] / 2
@@ -368,23 +403,12 @@ class _Terms:
         return cost, Equations(U, E, gram[..., s:-1, s:-1], g, gram[..., s:-1, -1], c)
 
 
-def _with_diagonal(matrix: Tensor, addition: Tensor) -> Tensor:
-    sum_ = matrix.clone()
-    sum_.diagonal(dim1=-2, dim2=-1).add_(addition)
-    return sum_
-
-
-def _damping_scale(diagonal: Tensor) -> Tensor:
-    """The diagonal that scales the damping; 1 for an unknown without effect on the residuals, whose step is then 0."""
-    return torch.where(diagonal > 0, diagonal, 1.0)
-
-
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
 def _array(values: Tensor) -> np.ndarray:
-    return values.detach().to("cpu", torch.float64).numpy().copy()
+    return values.numpy(force=True).astype(np.float64)
 
 
 def select(mask: np.ndarray, new: Any, old: Any) -> Any:
@@ -393,8 +417,14 @@ def select(mask: np.ndarray, new: Any, old: Any) -> Any:
         return new
     if not mask.any():
         return old
+    first = new
+    while not isinstance(first, Tensor):
+        first = first[0]
+    return _chosen(torch.from_numpy(mask).to(first.device), new, old)
+
+
+def _chosen(mask: Tensor, new: Any, old: Any) -> Any:
     if isinstance(new, Tensor):
-        where = torch.from_numpy(mask).to(new.device).reshape(-1, *(1,) * (new.ndim - 1))
-        return torch.where(where, new, old)
-    parts = [select(mask, a, b) for a, b in zip(new, old, strict=True)]
+        return torch.where(mask.view(-1, *(1,) * (new.ndim - 1)), new, old)
+    parts = [_chosen(mask, a, b) for a, b in zip(new, old, strict=True)]
     return type(new)(*parts) if hasattr(new, "_fields") else tuple(parts)

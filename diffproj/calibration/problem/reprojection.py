@@ -46,8 +46,6 @@ class Reprojection:
         skew: whether the skew of K is.
         whitening: what the residuals and their derivatives are multiplied by `(P, V, N, 2, 2)`; `None` for 1.
         free: whether the displacements of all points are.
-        terms: how many coefficients of the lens, from the first, are not 0, or may move; `None` for all. The others'
-            rows are 0, and take no time.
     """
 
     points: Tensor
@@ -58,7 +56,6 @@ class Reprojection:
     skew: bool = False
     whitening: Tensor | None = None
     free: bool = False
-    terms: int | None = None
     parameters: Parametrisation = field(init=False, repr=False)
     _plane_points: Tensor = field(init=False, repr=False)
     _bow_shape: Tensor = field(init=False, repr=False)
@@ -78,8 +75,6 @@ class Reprojection:
         rows = self.pixels.new_empty(self.parameters.few + POSE + 1, P, V, 2, N)
         rows[: len(INTRINSICS)] = 0.0
         rows[2, :, :, 0] = rows[3, :, :, 1] = self.used.to(rows)  # by c_x, c_y
-        if self.terms is not None:
-            rows[len(INTRINSICS) + self.terms : self.parameters.lens_end] = 0.0
         if self.skew:
             rows[self.parameters.lens_end] = 0.0
         return rows.permute(1, 2, 0, 3, 4)
@@ -126,8 +121,7 @@ class Reprojection:
         if model.perspective:
             X_cam[:, :, 2].clamp_(min=0)  # behind the camera there is no cost: what follows is not finite
         f, c = shared[:, None, :2, None], shared[:, None, 2:4, None]
-        coefficients = shared[:, len(INTRINSICS) : last][:, : self.terms]
-        distorted = DERIVATIVES[model.kind](coefficients, f, X_cam, self._place)
+        distorted = DERIVATIVES[model.kind](shared[:, len(INTRINSICS) : last], f, X_cam, self._place)
         self._by_focal.copy_(distorted)
         residual = panel[:, :, -1]
         torch.sub(c, self._seen, out=residual)

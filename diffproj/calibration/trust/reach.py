@@ -79,7 +79,7 @@ def _surely_reaches(task: Task, shared: Tensor, poses: Pose, size: tuple[int, in
 
 
 def _coefficients(task: Task, shared: Tensor) -> Tensor:
-    return shared.detach()[:, 4 : 4 + MODELS[task.lens].count][:, : task.terms_from(shared)]
+    return shared.detach()[:, 4 : 4 + MODELS[task.lens_from(shared)].count]
 
 
 def _outermost(task: Task, poses: Pose) -> Tensor:

@@ -105,18 +105,6 @@ def test_unused_corners_are_zero_wherever_they_are(lens: LensModel) -> None:
     assert (problem.linearise(shared, (R, away))[~seen] == 0).all()
 
 
-@pytest.mark.parametrize(("lens", "terms"), [("brown14", 12), ("brown14", 8), ("brown12", 5), ("brown8", 4)])
-def test_coefficients_that_are_left_out_are_those_of_a_shorter_lens(lens: LensModel, terms: int) -> None:
-    board, shared, poses = situation(lens, bow=False)
-    shared[:, 4 + terms :] = 0.0
-    which = board.points, torch.rand(P, V, len(board), 2, dtype=D), torch.ones(P, V, len(board), dtype=torch.bool), lens
-    whole = Reprojection(*which).linearise(shared, poses).clone()
-    part = Reprojection(*which, terms=terms).linearise(shared, poses)
-    assert (part[:, :, 4 + terms : shared.shape[-1]] == 0).all()
-    for rows in (slice(4 + terms), slice(shared.shape[-1], None)):
-        torch.testing.assert_close(part[:, :, rows], whole[:, :, rows], rtol=1e-12, atol=1e-12)
-
-
 def test_unused_corners_are_zero_and_behind_is_no_cost() -> None:
     board, shared, (R, t) = situation("brown5", bow=False)
     used = torch.rand(P, V, len(board)) > 0.3
