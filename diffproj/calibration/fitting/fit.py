@@ -148,17 +148,19 @@ class Fit:
         part = torch.cholesky_solve(told * scale * scale.mT, L).diagonal(dim1=-2, dim2=-1).sum(-1)
         return torch.where(failed == 0, part, 0.0)
 
+    @cached_property
     def plain_covariance(self) -> Covariance:
-        """The covariance for least squares, whatever the loss and the objective: what verdicts go by."""
-        return covariances.covariance(
-            self.solution.equations,
-            self.task.names,
-            self.residual_variance(),
-            basis=self.task.basis,
-            precision=self.measured_precision(),
-            shares=self.task.shares,
-            **self.frame(),
-        )
+        """The covariance for least squares, whatever the loss and the objective, without graph: what verdicts go by."""
+        with torch.inference_mode(False), torch.no_grad():  # kept, also where verdicts run without
+            return covariances.covariance(
+                self.solution.equations,
+                self.task.names,
+                self.residual_variance(),
+                basis=self.task.basis,
+                precision=self.measured_precision(),
+                shares=self.task.shares,
+                **self.frame(),
+            )
 
     def frame(self) -> dict[str, Any]:
         """What `covariance` is to know of free points: what fixes their frame, and which of them nothing tells."""
@@ -182,10 +184,14 @@ class Fit:
 
     def is_restrained(self) -> Tensor:
         """Which cameras' terms below the line are held near those of a poorer lens `(P,)`."""
+        return self.restrained_parameters().any(-1)
+
+    def restrained_parameters(self) -> Tensor:
+        """Which of the shared parameters are `(P, s)`."""
         prior = self.task.prior
         if prior is None or prior.known is None:
-            return torch.zeros_like(self.rejected[:, 0, 0])
-        return (prior.precision != prior.known).any(-1).any(-1)
+            return torch.zeros_like(self.solution.shared, dtype=torch.bool)
+        return (prior.precision != prior.known).any(-1)
 
 
 def fit(

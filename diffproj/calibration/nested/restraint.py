@@ -4,7 +4,8 @@ The six radial terms of a rational lens nearly cancel each other, so that its un
 fold where corners were seen: the terms above and below the line go to zero together, a hair apart, and buy a
 fraction of the noise. Then the terms below the line, k4 to k6, are drawn towards those of the poorer lens that the fit
 starts from, 0 if it has none, as little as makes the lens one-to-one over its corners and the image. As the start costs
-nothing by this, a restrained lens does not end above the poorer one either.
+nothing by this, a restrained lens does not end above the poorer one either; but where only another one reaches the
+whole image, it may. Then what the poorer lens lacks, a prism or a tilt, is held at 0, too.
 
 Of several minima without restraint one may make sense. The solver starts again from the poorer lens with factors
 (`factors.py`), which lead away from the poles. And the terms are held: then the valley is short, and its lowest place
@@ -29,9 +30,10 @@ from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.least_squares.solver import Prior
 from diffproj.calibration.nested.compared import costs, put, unrestrained_cost
 from diffproj.calibration.nested.factors import FACTORS, with_factor
-from diffproj.calibration.problem.parametrisation import Pose
+from diffproj.calibration.problem.parametrisation import INTRINSICS, Pose
 from diffproj.calibration.trust.entangled import DENOMINATOR
 from diffproj.calibration.trust.reach import folds_at_corners, reach_of
+from diffproj.lens.brown_domain import RADIUS_POWERS
 
 FIRST = 1.0
 """Deviation to which the terms below the line are held at first: what each adds to the denominator half an image's
@@ -40,6 +42,8 @@ TIGHTER = (0.3, 0.1, 0.03, 0.01)
 """Then these, one after the other until the lens does not fold."""
 LOOSER = (3.0, 10.0, 30.0, math.inf)
 """Or these, as long as it does not."""
+HELD = 1e-6
+"""Deviation to which all that a poorer lens lacks is held that the fit would else end above: as good as 0."""
 RUNG_STEPS = 100
 """Steps of the solver at one of these, where with the terms held most take ten to twenty; and steps after which only
 the lower of the starts with factors goes on."""
@@ -67,7 +71,7 @@ def restrained(
     """The lowest fit whose lens does not fold; `Fit.task.prior` then holds what restrains it, if anything does.
 
     With it, for which cameras there is none `(P,)`: the lens folds before its own corners, or the solver came to no
-    end.
+    end, or the corners do not determine the lens, as where its terms go to infinity.
 
     Args:
         found: the minimum without restraint.
@@ -87,7 +91,7 @@ def restrained(
     spare = found.degrees_of_freedom().to(found.solution.cost)
     if not below or not bool((spare > 0).any()):
         return found, torch.zeros_like(found.rejected[:, 0, 0])
-    best, reached = found, reach_of(found, size)
+    best, reached = found, reach_of(found, size).masked_fill(~_is_determined(found), -1.0)
     lost = reached < 0
     which = ((spare > 0) & (reached < 1)).nonzero().flatten()
 
@@ -108,7 +112,7 @@ def restrained(
     def ended(which: Tensor, near: Fit) -> None:
         """Some cameras `(n,)` from near the end of a start with a factor."""
         other = fit(given.part(which), near.solution.shared, near.solution.local, reject=reject, **steps)
-        weighed(which, other, _knows_focal(other), WORTH / spare[which])
+        weighed(which, other, knows_focal(other), WORTH / spare[which])
 
     if aside is not None:
         first, cost = costs(found, aside, torch.arange(len(spare), device=spare.device), reject)
@@ -129,7 +133,7 @@ def restrained(
             steps if strength == math.inf else steps | {"max_iterations": min(max_iterations, RUNG_STEPS)}
         )
         other = fit(part, near.solution.shared, near.solution.local, reject=reject, **limits)
-        return other, weighed(which, other, torch.ones_like(which, dtype=torch.bool))
+        return other, weighed(which, other, _is_determined(other))
 
     first, sound = tried(which, FIRST, start.part(which))
     up, near = which[sound], first.part(sound.nonzero().flatten())
@@ -162,6 +166,46 @@ def restrained(
     return best, reached < 0
 
 
+def not_above(
+    found: Fit,
+    poorer: Fit,
+    task: Task,
+    size: tuple[int, int],
+    *,
+    reject: float | None,
+    max_iterations: int,
+    tolerance: float,
+) -> Fit:
+    """The fit, with cameras held to a poorer lens that is lower there, and reaches as far.
+
+    Args:
+        found: the lowest fit whose lens does not fold.
+        poorer: that of a poorer lens.
+        task: what is minimised without restraint.
+        size: of the image.
+        reject: robust standard deviations beyond which a corner is an outlier.
+        max_iterations: of the solver.
+        tolerance: of the solver.
+    """
+    every = torch.arange(len(found.rejected), device=found.rejected.device)
+    before, now = costs(found, poorer, every, reject)
+    rows = (now < before * (1 - LOWER)).nonzero().flatten()
+    if len(rows) > 0:
+        reached, reaches = (reach_of(one.part(rows), size) for one in (found, poorer))
+        rows = rows[reaches >= reached]
+    if len(rows) == 0:
+        return found
+    near = poorer.part(rows)
+    shared, lens = near.solution.shared, range(len(INTRINSICS), task.parameters.lens_end)
+    drawn = [i for i in lens if task.names[i] in DENOMINATOR or bool((shared[:, i] == 0).all())]
+    part = task.part(rows)
+    part = replace(part, prior=_drawn_to(shared, _unit_precision(near, drawn, size) / HELD**2, part))
+    limits: dict[str, Any] = {"max_iterations": max_iterations, "tolerance": tolerance}
+    other = fit(part, shared, near.solution.local, reject=reject, **limits)
+    before, now = costs(found, other, rows, reject)
+    return put(found, rows, other, (now < before) & (reach_of(other, size) >= reach_of(near, size)))
+
+
 def unfolded(
     freed: Fit, flat: Fit, size: tuple[int, int], *, reject: float | None, max_iterations: int, tolerance: float
 ) -> Fit:
@@ -182,20 +226,27 @@ def unfolded(
     return put(freed, rows, held, torch.ones_like(rows, dtype=torch.bool))
 
 
-def _knows_focal(found: Fit) -> Tensor:
-    """Where focal lengths and principal point are known well enough `(P,)`."""
-    deviation = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, :4].sqrt()
-    return (deviation <= OPEN * found.solution.shared[:, (0, 1, 0, 1)].abs()).all(-1)
+def knows_focal(found: Fit) -> Tensor:
+    """Where focal lengths and principal point are known well enough, and all that is free is determined `(P,)`."""
+    deviation = found.plain_covariance.shared.diagonal(dim1=-2, dim2=-1)[:, :4].sqrt()
+    known = (deviation <= OPEN * found.solution.shared[:, (0, 1, 0, 1)].abs()).all(-1)
+    return known & _is_determined(found)
 
 
-def _unit_precision(start: Fit, below: list[int], size: tuple[int, int]) -> Tensor:
+def _is_determined(found: Fit) -> Tensor:
+    """Where all that is free is determined `(P,)`; else the camera is refused."""
+    return ~found.plain_covariance.undetermined.any(-1)
+
+
+def _unit_precision(start: Fit, drawn: list[int], size: tuple[int, int]) -> Tensor:
     """Precisions `(P, s)` at which a term of 1 half a diagonal from the axis costs what one residual does."""
     shared = start.solution.shared
     variance = 2 * start.solution.cost / start.degrees_of_freedom().clamp(min=1)
-    squared = (0.5 * math.hypot(*size) / shared[:, :2].mean(-1)).square()
+    radius = 0.5 * math.hypot(*size) / shared[:, :2].mean(-1)
     precision = torch.zeros_like(shared)
-    for i in below:
-        precision[:, i] = variance * squared ** (2 * (1 + DENOMINATOR.index(start.task.names[i])))
+    for i in drawn:
+        power = (*RADIUS_POWERS, 1, 1)[i - len(INTRINSICS)]  # of a tilt, that of a decentring
+        precision[:, i] = variance * radius ** (2 * power)
     return precision
 
 

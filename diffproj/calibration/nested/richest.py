@@ -20,15 +20,15 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.fitting.data import Data
-from diffproj.calibration.fitting.fit import Fit
+from diffproj.calibration.fitting.fit import Fit, fit
 from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.fitting.positive_focal import with_positive_focal_lengths
-from diffproj.calibration.fitting.second_look import LOWER, doubtful, second_look
+from diffproj.calibration.fitting.second_look import LOWER, doubtful, lower_fit, second_look
 from diffproj.calibration.fitting.start import Straightened
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.nested.compared import costs, put
 from diffproj.calibration.nested.factors import FACTORS, FEW_STEPS, with_factor
-from diffproj.calibration.nested.restraint import restrained
+from diffproj.calibration.nested.restraint import PROMISING, knows_focal, not_above, restrained
 from diffproj.calibration.nested.side_by_side import Lane, side_by_side
 from diffproj.calibration.nested.tilt_twin import lower_valley
 from diffproj.calibration.outcome import Begun, begun
@@ -126,7 +126,12 @@ class Nested:
         every = torch.arange(len(folds), device=folds.device)
         for other, also in ends[1:]:
             found, folds = self._better(found, every, other), folds & also
-        return self._held_near_another(found, folds, [fits[inside] for inside in reversed(fits)])
+        found, folds = self._held_near_another(found, folds, [fits[inside] for inside in reversed(fits)])
+        task = self._begun(self.chosen, *found.solution[:2]).task
+        for inside in self._with(len(self._groups) - 1):
+            limits = {"reject": self.chosen.outlier_limit, **_steps(self.chosen)}
+            found = not_above(found, fits[inside], task, self.size, **limits)
+        return found, folds
 
     def _better(self, found: Fit, rows: Tensor, other: Fit) -> Fit:
         """The fit with some cameras `(n,)` replaced whose other one reaches farther, or as far and is lower."""
@@ -193,16 +198,15 @@ class Nested:
         starts = {inside: self._lowest(fits, inside) for inside in some}
         begin = self._begun(options, *starts[some[0]])
         lanes = {inside: Lane(*start, options.max_iterations, self._held(inside)) for inside, start in starts.items()}
-        found, beside = self._side_by_side(
-            begin.task, lanes, [inside for inside in some if thorough and TILT not in inside], options
-        )
+        through = [inside for inside in some if TILT not in inside] if thorough or TILT in self._groups else []
+        found, beside = self._side_by_side(begin.task, lanes, through, options)
         ends = {}
         for inside in some:
             end = with_positive_focal_lengths(found[inside], **_steps(options))
             if DENOMINATOR in inside and thorough:
                 end, _ = restrained(end, *starts[inside], self.size, beside.get(inside), reject=None, **_steps(options))
             elif DENOMINATOR in inside:
-                end = _no_start_if_folded(end)
+                end = _lower_by_factor(_no_start_if_folded(end), beside.get(inside), options)
             ends[inside] = end
         return ends
 
@@ -254,11 +258,28 @@ class Nested:
         return shared, tuple(torch.stack(parts)[best] for parts in local)
 
 
+def _lower_by_factor(found: Fit, aside: Fit | None, options: Options) -> Fit:
+    """The fit, or where a few steps from a start with a factor are lower, the end of these if that is."""
+    if aside is None:
+        return found
+    worth = found.solution.cost / found.degrees_of_freedom().clamp(min=1)
+    rows = (aside.solution.cost < found.solution.cost - PROMISING * worth.nan_to_num(0.0)).nonzero().flatten()
+    if len(rows) == 0:
+        return found
+    near = aside.part(rows)
+    end = fit(near.task, near.solution.shared, near.solution.local, **_steps(options))
+    end = _no_start_if_folded(with_positive_focal_lengths(end, **_steps(options)))
+    return lower_fit(found, _no_start(end, ~knows_focal(end)), rows, None)
+
+
 def _no_start_if_folded(found: Fit) -> Fit:
     """The same at infinite cost where the lens folds before its corners, so that no richer one starts from there."""
+    return _no_start(found, folds_at_corners(found.task, found.solution.shared, found.solution.local))
+
+
+def _no_start(found: Fit, where: Tensor) -> Fit:
     solution = found.solution
-    folds = folds_at_corners(found.task, solution.shared, solution.local)
-    return Fit(found.task, solution._replace(cost=solution.cost.masked_fill(folds, torch.inf)), found.rejected)
+    return Fit(found.task, solution._replace(cost=solution.cost.masked_fill(where, torch.inf)), found.rejected)
 
 
 def _steps(options: Options) -> dict[str, Any]:

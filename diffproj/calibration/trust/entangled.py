@@ -209,7 +209,7 @@ def _adrift(found: Fit) -> Tensor:
     """Which cameras hardly know their principal point, or have so long a lens that they may only seem to `(P,)`."""
     seen = torch.where(found.task.used.unsqueeze(-1), found.task.pixels, torch.nan).flatten(1, 2)
     spread = (seen - seen.nanmean(1, keepdim=True)).square().nanmean(1).sqrt()
-    deviations = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, 2:4].sqrt()
+    deviations = found.plain_covariance.shared.diagonal(dim1=-2, dim2=-1)[:, 2:4].sqrt()
     adrift = (deviations > ADRIFT * spread).any(-1) | (found.solution.shared[:, :2].abs() > LONG * spread).any(-1)
     return adrift & (found.task.used.any(-1).sum(-1) >= TELLING_VIEWS)
 

@@ -25,7 +25,7 @@ from diffproj.calibration.trust.adequacy import (
     poses_only,
     wants_skew,
 )
-from diffproj.calibration.trust.entangled import Entangled, Simpler
+from diffproj.calibration.trust.entangled import DENOMINATOR, Entangled, Simpler
 from diffproj.calibration.trust.leftover import Leftover, leftover
 from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
 from diffproj.calibration.trust.prior_weight import Elsewhere, weighed_anew
@@ -69,11 +69,7 @@ def remarks(
     held = found.is_restrained()
     said: list[list[Remark]] = [[] for _ in status]
     for p in (converged & held).nonzero().flatten().tolist():
-        said[p].append(
-            Remark(
-                "k4, k5 and k6 are held near those of a poorer lens, for without that the lens folds inside the image"
-            )
-        )
+        said[p].append(Remark(_restrained(found, p)))
     for p, growth in doubt.needless.items():
         if not bool(held[p]):
             said[p].append(
@@ -126,6 +122,15 @@ def remarks(
     return tuple(map(tuple, said))
 
 
+def _restrained(found: Fit, p: int) -> str:
+    """That terms of the lens are held, and which."""
+    drawn = zip(found.task.names, found.restrained_parameters()[p].tolist(), strict=True)
+    others = [name for name, is_drawn in drawn if is_drawn and name not in DENOMINATOR]
+    held = "k4, k5 and k6 are held near those of a poorer lens"
+    held += f", and {', '.join(others[:-1])} and {others[-1]} at 0" if others else ""
+    return f"{held}, for without that the lens folds inside the image"
+
+
 def _otherwise(left: Leftover, i: int) -> float:
     """The part of the sum of squares that a lens of another kind, skew, a bent or a stretched board explains alone."""
     effects = (left.radial, left.skew, left.bow, left.print)
@@ -145,12 +150,12 @@ def _of_the_prior(wrong: PriorContradiction) -> Remark:
 
 def _unsure_focal(found: Fit) -> Tensor:
     """Which cameras have a focal length that is known roughly `(P,)`, as one view may leave it."""
-    variance = found.plain_covariance().shared.diagonal(dim1=-2, dim2=-1)[:, :2]
+    variance = found.plain_covariance.shared.diagonal(dim1=-2, dim2=-1)[:, :2]
     return (variance.sqrt() > UNSURE * found.solution.shared[:, :2].detach().abs()).any(-1)
 
 
 def _unsure(found: Fit, p: int) -> str:
-    variance = found.plain_covariance().shared[p].diagonal()[:2]
+    variance = found.plain_covariance.shared[p].diagonal()[:2]
     part = 100 * float((variance.sqrt() / found.solution.shared[p, :2].abs()).amax())
     return (
         f"the focal length is known only to {part:.0f} %: points put back near the target are as good as their error "

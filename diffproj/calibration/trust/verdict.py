@@ -80,7 +80,7 @@ def _verdicts(found: Fit, names: tuple[str, ...], board: object) -> tuple[Tensor
     task, solution = found.task, found.solution
     used = task.used.any(-1)
     R, t = solution.local
-    known = found.plain_covariance()
+    known = found.plain_covariance
     no_pose = used & known.undetermined_views
     mirrored = ~no_pose & _mirrored(R, t, task.points, used, board)
     error = _relative_error(found)

@@ -2,13 +2,16 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 import diffproj as dp
 from diffproj.calibration.fitting.fit import Fit, fit
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.least_squares.solver import Prior
+from diffproj.calibration.nested import restraint
 from diffproj.calibration.nested.compared import costs, unrestrained_cost
+from diffproj.calibration.trust.remarks import _restrained
 
 BOARD = dp.Chessboard()
 
@@ -44,3 +47,52 @@ def test_what_restrains_costs_nothing_and_what_is_known_does() -> None:
         found = fit(replace(task, prior=prior), shared, local, max_iterations=0)
         torch.testing.assert_close(found.solution.cost, corners + 4e4)
         torch.testing.assert_close(unrestrained_cost(found), corners + part * 4e4)
+
+
+@pytest.mark.parametrize("reaches", [True, False])
+def test_what_ends_above_a_poorer_lens_is_held_to_it(reaches: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not where that reaches less of the image."""
+    views = dp.example_views("left")[:8]
+    poorer = dp.calibrate(views, BOARD, "brown8")
+    task = Task(BOARD.points, views.pixels.unsqueeze(0), views.visible.unsqueeze(0), "brown12")
+    start = torch.nn.functional.pad(poorer.shared, (0, 4)).unsqueeze(0)
+    poses = poorer.cameras.R.unsqueeze(0), poorer.cameras.t.unsqueeze(0)
+    prism = [task.names.index(name) for name in ("s1", "s2", "s3", "s4")]
+    without = fit(task.holding(prism), start, poses)
+    off = without.solution.shared.clone()
+    off[:, prism] = 1e-3
+    above = fit(task, off, poses, max_iterations=0)
+
+    def reach(found: Fit, _size: tuple[int, int]) -> torch.Tensor:
+        upright = found.solution.shared[:, prism].abs().amax(-1) < 1e-6
+        return torch.where(upright, 1.0 if reaches else 0.5, 0.9)
+
+    monkeypatch.setattr(restraint, "reach_of", reach)
+    limits = {"reject": None, "max_iterations": 300, "tolerance": 3e-14}
+    held = restraint.not_above(above, without, task, (640, 480), **limits)  # type: ignore[arg-type]
+    if not reaches:
+        assert held is above or torch.equal(held.solution.shared, above.solution.shared)
+        return
+    assert float(unrestrained_cost(held)) <= float(without.solution.cost) * (1 + 1e-9)
+    assert float(held.solution.shared[:, prism].abs().amax()) < 1e-6
+    assert "a poorer lens, and s1, s2, s3 and s4 at 0, for" in _restrained(held, 0)
+    assert restraint.not_above(without, above, task, (640, 480), **limits) is without  # type: ignore[arg-type]
+
+
+def test_a_lens_that_the_corners_do_not_determine_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if its terms went to infinity: it reaches the whole image, and would be refused."""
+    views = dp.example_views("left")
+    poorer = dp.calibrate(views, BOARD, "brown5")
+    task = Task(BOARD.points, views.pixels.unsqueeze(0), views.visible.unsqueeze(0), "brown8")
+    start = torch.nn.functional.pad(poorer.shared, (0, 3)).unsqueeze(0)
+    poses = poorer.cameras.R.unsqueeze(0), poorer.cameras.t.unsqueeze(0)
+    found = fit(task, start, poses)
+    limits = {"reject": None, "max_iterations": 300, "tolerance": 3e-14}
+    kept, _ = restraint.restrained(found, start, poses, (640, 480), **limits)  # type: ignore[arg-type]
+    assert not bool(kept.is_restrained())
+    monkeypatch.setattr(restraint, "_is_determined", Fit.is_restrained)
+    held, folds = restraint.restrained(found, start, poses, (640, 480), **limits)  # type: ignore[arg-type]
+    assert bool(held.is_restrained())
+    assert not bool(folds)
+    _, folds = restraint.restrained(found, start, poses, (640, 480), hold=False, **limits)  # type: ignore[arg-type]
+    assert bool(folds)
