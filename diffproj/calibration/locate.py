@@ -19,7 +19,8 @@ from diffproj.calibration.fitting.fit import Fit, fit
 from diffproj.calibration.fitting.options import LocateOptions, Options, locate_options
 from diffproj.calibration.fitting.second_look import lower_fit
 from diffproj.calibration.known_poses import known_poses
-from diffproj.calibration.least_squares.solver import Equations, Solution, Status, equations_at
+from diffproj.calibration.least_squares.normal_equations import Equations
+from diffproj.calibration.least_squares.solver import Solution, Status, equations_at
 from diffproj.calibration.outcome import outcome
 from diffproj.calibration.problem.constraints import Priors
 from diffproj.calibration.problem.parametrisation import POSE, Parametrisation

@@ -11,7 +11,8 @@ from diffproj.calibration.fitting.options import Progress
 from diffproj.calibration.fitting.own_frame import are_solid
 from diffproj.calibration.least_squares.everyone import for_each
 from diffproj.calibration.least_squares.losses import Loss
-from diffproj.calibration.least_squares.solver import Equations, Prior, Solution, solve
+from diffproj.calibration.least_squares.normal_equations import Equations
+from diffproj.calibration.least_squares.solver import Prior, Solution, solve
 from diffproj.calibration.problem.board_error import BoardError
 from diffproj.calibration.problem.parametrisation import INTRINSICS, POSE, Parametrisation
 from diffproj.calibration.problem.reprojection import Reprojection

@@ -6,7 +6,7 @@ In the blocks of `solver.py`: `S = U - sum E_v W_v^-1 E_v^T`.
 import torch
 from torch import Tensor
 
-from diffproj.calibration.least_squares.solver import Equations
+from diffproj.calibration.least_squares.normal_equations import Equations
 
 SINGULAR = 2e-15
 """Eigenvalue of S, scaled by the diagonal of U, at and below which it is rounding error."""

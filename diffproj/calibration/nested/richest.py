@@ -5,10 +5,12 @@ shifted principal point: from far off they lead into side valleys. So they come 
 none of them, from there with all but one of them, whichever that is, side by side, and from the lowest of these with
 all. As the solver only ever goes down, none ends above what it started from.
 
-Those fits in between only choose the valley, and end as soon as steps buy next to nothing. So some ends are no good:
-the lens folds, or it fits badly where that with none of the groups came about in a doubtful way. Then all is done once
+Those fits in between only choose the valley, and end as soon as steps buy next to nothing; before a tilt is added, with
+which there are many valleys, a rational lens also starts from a factor (`factors.py`). So some ends are no good: the
+lens folds, or it fits badly where that with none of the groups came about in a doubtful way. Then all is done once
 more, thoroughly: with one group, with two and so on, each from the lowest of those with one fewer, to their minima, the
 rational ones from factors, too, and none that folds; and from there with all groups, from each of those with one fewer.
+What ends above one of these all the same is held to it.
 """
 
 from collections.abc import Iterator

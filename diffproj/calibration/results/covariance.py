@@ -33,7 +33,7 @@ from diffproj._core.copying import Copied
 from diffproj._core.numerics import broadcast_batches
 from diffproj._core.shown import Shown, counted, number
 from diffproj.calibration.least_squares.eliminated import inverse, reduced
-from diffproj.calibration.least_squares.solver import Equations
+from diffproj.calibration.least_squares.normal_equations import Equations
 from diffproj.calibration.problem.shape import AXES, names_of
 from diffproj.calibration.results.fields import mask, tensor
 

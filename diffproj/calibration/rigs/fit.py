@@ -11,7 +11,8 @@ from diffproj.calibration.fitting.fit import MAX_REJECTION_ROUNDS, normal_tensor
 from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.fitting.task import NEGLIGIBLE_PX
 from diffproj.calibration.least_squares.losses import Loss
-from diffproj.calibration.least_squares.solver import Equations, Prior
+from diffproj.calibration.least_squares.normal_equations import Equations
+from diffproj.calibration.least_squares.solver import Prior
 from diffproj.calibration.problem.shape import Restraint
 from diffproj.calibration.results.border import border_with_rays
 from diffproj.calibration.rigs.knowledge import RigKnowledge

@@ -25,7 +25,8 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.least_squares.losses import Loss
-from diffproj.calibration.least_squares.solver import Equations, LocalState
+from diffproj.calibration.least_squares.normal_equations import Equations
+from diffproj.calibration.least_squares.solver import LocalState
 from diffproj.calibration.problem.parametrisation import POSE, Parametrisation, Pose, moved
 from diffproj.calibration.problem.reprojection import Reprojection
 from diffproj.calibration.problem.shape import by_displacement

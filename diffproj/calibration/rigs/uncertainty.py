@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffproj.calibration.least_squares.eliminated import local_inverse, reduced
 from diffproj.calibration.least_squares.losses import slope_and_bend
-from diffproj.calibration.least_squares.solver import Equations
+from diffproj.calibration.least_squares.normal_equations import Equations
 from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.results.covariance import Covariance, Scores, covariance, points_turned, reshaped
 from diffproj.calibration.rigs.fit import RigFit

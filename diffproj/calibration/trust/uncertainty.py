@@ -20,7 +20,7 @@ from torch import Tensor
 
 from diffproj.calibration.fitting.fit import Fit
 from diffproj.calibration.least_squares.losses import slope_and_bend
-from diffproj.calibration.least_squares.solver import Equations
+from diffproj.calibration.least_squares.normal_equations import Equations
 from diffproj.calibration.results import covariance as covariances
 from diffproj.calibration.results.covariance import Covariance, Scores
 from diffproj.calibration.trust.dispersion import dispersion

@@ -8,7 +8,8 @@ import torch
 
 from diffproj.calibration.least_squares.damping import DampingControl
 from diffproj.calibration.least_squares.losses import Cauchy, Huber, SoftL1
-from diffproj.calibration.least_squares.solver import Prior, Status, damped_step, solve
+from diffproj.calibration.least_squares.normal_equations import damped_step
+from diffproj.calibration.least_squares.solver import Prior, Status, solve
 
 D = torch.float64
 
