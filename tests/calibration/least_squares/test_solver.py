@@ -49,8 +49,10 @@ def run(problem: Curves, shared: torch.Tensor, local: torch.Tensor, **options: o
     return solve(problem, *rough(shared, local), local_size=2, **options)  # type: ignore[arg-type]
 
 
-def dense_step(panel: torch.Tensor, damping: float, prior: Prior | None, off: torch.Tensor) -> torch.Tensor:
-    """The damped normal equations of one problem, assembled whole."""
+def dense_step(
+    panel: torch.Tensor, damping: float, prior: Prior | None, off: torch.Tensor, basis: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The damped step of one problem, and what the quadratic model falls by, of the normal equations as a whole."""
     V, rows = panel.shape[:2]
     s = rows - 3
     J = torch.zeros(V, *panel.shape[2:], s + 2 * V, dtype=D)
@@ -62,24 +64,55 @@ def dense_step(panel: torch.Tensor, damping: float, prior: Prior | None, off: to
     if prior is not None:
         H[:s, :s] += prior.precision[0]
         g[:s] += prior.precision[0] @ off
-    return -torch.linalg.solve(H + damping * torch.diag(H.diagonal()), g)
+    T = torch.block_diag(basis, torch.eye(2 * V, dtype=D))
+    H, g = T.mT @ H @ T, T.mT @ g
+    step = -torch.linalg.solve(H + damping * torch.diag(H.diagonal()), g)
+    return T @ step, -(g @ step + step @ H @ step / 2)
 
 
 @pytest.mark.parametrize("damping", [1e-9, 1e-6, 1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("with_prior", [False, True])
-def test_a_step_is_that_of_the_dense_normal_equations(damping: float, with_prior: bool) -> None:
+@pytest.mark.parametrize("columns", [[[1.0, 0.0], [0.0, 1.0]], [[0.0], [1.0]], [[0.6], [0.8]], [[], []]])
+def test_a_step_is_that_of_the_dense_normal_equations(
+    damping: float, with_prior: bool, columns: list[list[float]]
+) -> None:
     from diffproj.calibration.least_squares.solver import _Terms
 
     problem, shared, local = curves(P=1)
+    basis = torch.tensor(columns, dtype=D)
     prior = Prior(shared + 1, torch.diag_embed(torch.full_like(shared, 7.0))) if with_prior else None
     x, z = rough(shared, local)
     _, equations = _Terms(problem, 2, None, None, prior).at(x, z)
-    dx, dz, reduction = damped_step(equations, torch.tensor([damping], dtype=D))
     off = x[0] - prior.mean[0] if prior is not None else torch.zeros(2, dtype=D)
-    want = dense_step(problem.linearise(x, z)[0], damping, prior, off)
-    got = torch.cat([dx[0], dz[0].reshape(-1)])
-    torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-12 * float(want.abs().amax()))
-    assert reduction > 0
+    want, gain = dense_step(problem.linearise(x, z)[0], damping, prior, off, basis)
+    for given in (basis.unsqueeze(0), *([None] if basis.shape[1] == 2 else [])):
+        dx, dz, reduction = damped_step(equations, torch.tensor([damping], dtype=D), given)
+        got = torch.cat([dx[0], dz[0].reshape(-1)])
+        torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-12 * float(want.abs().amax()))
+        torch.testing.assert_close(reduction[0], gain, rtol=1e-9, atol=0)
+
+
+def test_a_step_that_cannot_be_found_is_none_and_changes_no_other() -> None:
+    """Of a problem whose equations are not finite, or not positive definite; one that sees nothing stays there."""
+    from diffproj.calibration.least_squares.solver import _Terms
+
+    problem, shared, local = curves(P=4)
+    _, equations = _Terms(problem, 2, None, None, None).at(*rough(shared, local))
+    damping = torch.full((4,), 1e-3, dtype=D)
+    good = damped_step(equations, damping)
+    broken = equations._replace(U=equations.U.clone(), W=equations.W.clone(), E=equations.E.clone())
+    broken.U[0, 0, 0] = -1e6
+    broken.W[1, 3] = torch.nan
+    broken.W[2, 3], broken.E[2, 3], broken.h[2, 3] = 0.0, 0.0, 0.0  # nothing seen of one block
+    dx, dz, reduction = damped_step(broken, damping)
+    assert (dx[:2] == 0).all()
+    assert (dz[:2] == 0).all()
+    assert reduction[:2].tolist() == [torch.inf] * 2
+    assert (dz[2, 3] == 0).all()
+    assert dz[2].isfinite().all()
+    assert reduction[2].isfinite()
+    for now, before in zip((dx, dz, reduction), good, strict=True):
+        assert torch.equal(now[3], before[3])
 
 
 def test_finds_the_minimum() -> None:
