@@ -208,8 +208,11 @@ class Nested:
             if DENOMINATOR in inside and thorough:
                 end, _ = restrained(end, *starts[inside], self.size, beside.get(inside), reject=None, **_steps(options))
             elif DENOMINATOR in inside:
-                end = _lower_by_factor(_no_start_if_folded(end), beside.get(inside), options)
+                end = _no_start_if_folded(end)
             ends[inside] = end
+        if not thorough:
+            lowest = torch.stack([end.solution.cost.nan_to_num(torch.inf) for end in ends.values()]).amin(0)
+            ends |= {inside: _lower_by_factor(ends[inside], lowest, near, options) for inside, near in beside.items()}
         return ends
 
     def _whole(self, start: tuple[Tensor, Pose], *, thorough: bool) -> tuple[Fit, Tensor]:
@@ -260,15 +263,13 @@ class Nested:
         return shared, tuple(torch.stack(parts)[best] for parts in local)
 
 
-def _lower_by_factor(found: Fit, aside: Fit | None, options: Options) -> Fit:
-    """The fit, or where a few steps from a start with a factor are lower, the end of these if that is."""
-    if aside is None:
-        return found
-    worth = found.solution.cost / found.degrees_of_freedom().clamp(min=1)
-    rows = (aside.solution.cost < found.solution.cost - PROMISING * worth.nan_to_num(0.0)).nonzero().flatten()
+def _lower_by_factor(found: Fit, lowest: Tensor, near: Fit, options: Options) -> Fit:
+    """The fit, or the end of a start with a factor if that is lower: it goes on where it is below the lowest `(P,)`."""
+    worth = near.solution.cost / near.degrees_of_freedom().clamp(min=1)
+    rows = (near.solution.cost < lowest - PROMISING * worth).nonzero().flatten()
     if len(rows) == 0:
         return found
-    near = aside.part(rows)
+    near = near.part(rows)
     end = fit(near.task, near.solution.shared, near.solution.local, **_steps(options))
     end = _no_start_if_folded(with_positive_focal_lengths(end, **_steps(options)))
     return lower_fit(found, _no_start(end, ~knows_focal(end)), rows, None)
