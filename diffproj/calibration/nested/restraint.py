@@ -227,15 +227,15 @@ def unfolded(
 
 
 def knows_focal(found: Fit) -> Tensor:
-    """Where focal lengths and principal point are known well enough, and all that is free is determined `(P,)`."""
+    """Where focal lengths and principal point are known well enough, and all else is determined `(P,)`."""
     deviation = found.plain_covariance.shared.diagonal(dim1=-2, dim2=-1)[:, :4].sqrt()
     known = (deviation <= OPEN * found.solution.shared[:, (0, 1, 0, 1)].abs()).all(-1)
     return known & _is_determined(found)
 
 
 def _is_determined(found: Fit) -> Tensor:
-    """Where all that is free is determined `(P,)`; else the camera is refused."""
-    return ~found.plain_covariance.undetermined.any(-1)
+    """Where all of the camera that is free is determined `(P,)`; else it is refused."""
+    return ~found.plain_covariance.undetermined[:, : found.task.parameters.few].any(-1)
 
 
 def _unit_precision(start: Fit, drawn: list[int], size: tuple[int, int]) -> Tensor:
