@@ -29,7 +29,7 @@ from diffproj.calibration.fitting.second_look import LOWER, doubtful, lower_fit,
 from diffproj.calibration.fitting.start import Straightened
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.nested.compared import costs, put
-from diffproj.calibration.nested.factors import FACTORS, FEW_STEPS, with_factor
+from diffproj.calibration.nested.factors import FACTORS, FEW_STEPS, FEWER_STEPS, with_factor
 from diffproj.calibration.nested.restraint import PROMISING, knows_focal, not_above, restrained
 from diffproj.calibration.nested.side_by_side import Lane, side_by_side
 from diffproj.calibration.nested.tilt_twin import lower_valley
@@ -201,7 +201,8 @@ class Nested:
         begin = self._begun(options, *starts[some[0]])
         lanes = {inside: Lane(*start, options.max_iterations, self._held(inside)) for inside, start in starts.items()}
         through = [inside for inside in some if TILT not in inside] if thorough or TILT in self._groups else []
-        found, beside = self._side_by_side(begin.task, lanes, through, options)
+        few = FEW_STEPS if thorough else FEWER_STEPS
+        found, beside = self._side_by_side(begin.task, lanes, through, options, few)
         ends = {}
         for inside in some:
             end = with_positive_focal_lengths(found[inside], **_steps(options))
@@ -221,7 +222,7 @@ class Nested:
         steps, limit = _steps(options), options.outlier_limit
         begin = self._begun(options, *start)
         lanes = {inside: Lane(begin.shared, begin.local, options.max_iterations)}
-        ends, beside = self._side_by_side(begin.task, lanes, [inside], options)
+        ends, beside = self._side_by_side(begin.task, lanes, [inside], options, FEW_STEPS)
         # The valleys of a prism alone and of a denominator are long; many steps to a tilt may lead to a side one.
         found = self._looked_at(ends[inside], options, inside == (PRISM,) or DENOMINATOR in inside)
         folds = torch.zeros_like(found.rejected[:, 0, 0])
@@ -234,10 +235,10 @@ class Nested:
         return found, folds
 
     def _side_by_side(
-        self, task: Task, lanes: dict[Groups, Lane], through: list[Groups], options: Options
+        self, task: Task, lanes: dict[Groups, Lane], through: list[Groups], options: Options, few: int
     ) -> tuple[dict[Groups, Fit], dict[Groups, Fit]]:
         """Where the lanes end; and where a few steps from a start with a factor lead, of those that are to have one."""
-        few = min(options.max_iterations, FEW_STEPS)
+        few = min(options.max_iterations, few)
         factors = {}
         for inside in through:
             factor = with_factor(task, lanes[inside].shared, self.size, FACTORS[0]) if DENOMINATOR in inside else None
