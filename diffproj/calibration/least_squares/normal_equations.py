@@ -9,9 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-HAIR = 1e-150
-"""What the diagonal of the damped matrices has at least."""
-
 
 class Equations(NamedTuple):
     """The undamped normal equations at a point, in all shared unknowns: U `(P, s, s)`, E, W, g and h.
@@ -86,7 +83,7 @@ def _damped(matrix: Tensor, damping: Tensor) -> Tensor:
     """
     sum_ = matrix.clone()
     diagonal = sum_.diagonal(dim1=-2, dim2=-1)
-    diagonal.addcmul_(diagonal, damping).clamp_(min=HAIR)
+    diagonal.addcmul_(diagonal, damping).clamp_(min=torch.finfo(matrix.dtype).tiny ** 0.5)
     return sum_
 
 

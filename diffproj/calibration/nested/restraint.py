@@ -169,7 +169,7 @@ def restrained(
 def not_above(
     found: Fit,
     poorer: Fit,
-    task: Task,
+    prior: Prior | None,
     size: tuple[int, int],
     *,
     reject: float | None,
@@ -181,7 +181,7 @@ def not_above(
     Args:
         found: the lowest fit whose lens does not fold.
         poorer: that of a poorer lens.
-        task: what is minimised without restraint.
+        prior: what is known beforehand, without restraint.
         size: of the image.
         reject: robust standard deviations beyond which a corner is an outlier.
         max_iterations: of the solver.
@@ -196,14 +196,17 @@ def not_above(
     if len(rows) == 0:
         return found
     near = poorer.part(rows)
+    task = replace(found.task, used=found.task.used | found.rejected, prior=prior)
     shared, lens = near.solution.shared, range(len(INTRINSICS), task.parameters.lens_end)
-    drawn = [i for i in lens if task.names[i] in DENOMINATOR or bool((shared[:, i] == 0).all())]
+    free = [i for i in lens if task.basis is None or bool(task.basis[:, i].any())]
+    drawn = [i for i in free if task.names[i] in DENOMINATOR or bool((shared[:, i] == 0).all())]
     part = task.part(rows)
     part = replace(part, prior=_drawn_to(shared, _unit_precision(near, drawn, size) / HELD**2, part))
     limits: dict[str, Any] = {"max_iterations": max_iterations, "tolerance": tolerance}
     other = fit(part, shared, near.solution.local, reject=reject, **limits)
     before, now = costs(found, other, rows, reject)
-    return put(found, rows, other, (now < before) & (reach_of(other, size) >= reach_of(near, size)))
+    taken = (now < before) & (reach_of(other, size) >= reach_of(near, size)) & _is_determined(other)
+    return put(found, rows, other, taken)
 
 
 def unfolded(

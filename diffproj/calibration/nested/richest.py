@@ -129,10 +129,10 @@ class Nested:
         for other, also in ends[1:]:
             found, folds = self._better(found, every, other), folds & also
         found, folds = self._held_near_another(found, folds, [fits[inside] for inside in reversed(fits)])
-        task = self._begun(self.chosen, *found.solution[:2]).task
+        prior = self._begun(self._early(NEARLY), *found.solution[:2]).task.prior
+        limits = {"reject": self.chosen.outlier_limit, **_steps(self.chosen)}
         for inside in self._with(len(self._groups) - 1):
-            limits = {"reject": self.chosen.outlier_limit, **_steps(self.chosen)}
-            found = not_above(found, fits[inside], task, self.size, **limits)
+            found = not_above(found, fits[inside], prior, self.size, **limits)
         return found, folds
 
     def _better(self, found: Fit, rows: Tensor, other: Fit) -> Fit:

@@ -127,7 +127,7 @@ def _restrained(found: Fit, p: int) -> str:
     drawn = zip(found.task.names, found.restrained_parameters()[p].tolist(), strict=True)
     others = [name for name, is_drawn in drawn if is_drawn and name not in DENOMINATOR]
     held = "k4, k5 and k6 are held near those of a poorer lens"
-    held += f", and {', '.join(others[:-1])} and {others[-1]} at 0" if others else ""
+    held += f", and {_joined(others)} at 0" if others else ""
     return f"{held}, for without that the lens folds inside the image"
 
 
@@ -195,7 +195,11 @@ def _turned(names: Sequence[str], turned: Turned) -> Remark:
 def _named(names: Sequence[str], views: Sequence[int]) -> str:
     named = [names[view] for view in views]
     named = named if len(named) <= MOST_NAMED else [*named[:MOST_NAMED], f"{len(named) - MOST_NAMED} more"]
-    return f"{', '.join(named[:-1])} and {named[-1]}" if len(named) > 1 else named[0]
+    return _joined(named)
+
+
+def _joined(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else names[0]
 
 
 def _not_told(other: Simpler) -> str:

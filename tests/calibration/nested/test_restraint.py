@@ -69,14 +69,14 @@ def test_what_ends_above_a_poorer_lens_is_held_to_it(reaches: bool, monkeypatch:
 
     monkeypatch.setattr(restraint, "reach_of", reach)
     limits = {"reject": None, "max_iterations": 300, "tolerance": 3e-14}
-    held = restraint.not_above(above, without, task, (640, 480), **limits)  # type: ignore[arg-type]
+    held = restraint.not_above(above, without, None, (640, 480), **limits)  # type: ignore[arg-type]
     if not reaches:
         assert held is above or torch.equal(held.solution.shared, above.solution.shared)
         return
     assert float(unrestrained_cost(held)) <= float(without.solution.cost) * (1 + 1e-9)
     assert float(held.solution.shared[:, prism].abs().amax()) < 1e-6
     assert "a poorer lens, and s1, s2, s3 and s4 at 0, for" in _restrained(held, 0)
-    assert restraint.not_above(without, above, task, (640, 480), **limits) is without  # type: ignore[arg-type]
+    assert restraint.not_above(without, above, None, (640, 480), **limits) is without  # type: ignore[arg-type]
 
 
 def test_a_lens_that_the_corners_do_not_determine_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
