@@ -11,7 +11,7 @@ from diffproj._core.numerics import check_tensor
 from diffproj._core.warn import warn_caller
 from diffproj.calibration.evidence.adjustment import Adjustment
 from diffproj.calibration.problem.parametrisation import POSE
-from diffproj.calibration.results import ambiguity, mismatch
+from diffproj.calibration.results import ambiguity, left_out, mismatch
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.results.mismatch import CameraMismatchWarning
 
@@ -100,8 +100,11 @@ def doubts(calibration: Calibration, view: int) -> str:
     if misfit:
         warn_caller(f"measure: {misfit}", CameraMismatchWarning)
     two = ambiguity.described(calibration.ambiguous[..., only], name) if calibration.has_alternatives else ""
-    evidence = calibration.doubts if isinstance(calibration, Adjustment) else calibration.contradiction
-    return "; ".join(filter(None, [misfit, two, evidence]))
+    if isinstance(calibration, Adjustment):
+        return "; ".join(filter(None, [misfit, two, calibration.doubts]))
+    points = "corners" if calibration.landmarks is None else "landmarks"
+    few = left_out.described(calibration.used[..., only, :], calibration.rejected[..., only, :], name, points)
+    return "; ".join(filter(None, [misfit, two, few, calibration.contradiction]))
 
 
 def _are_corners(pixels: Tensor, corners: Tensor) -> bool:

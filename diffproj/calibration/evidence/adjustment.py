@@ -17,6 +17,7 @@ from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.results.account import SENTENCES
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.results.covariance import Covariance
+from diffproj.calibration.results.indexed import numbers, some_of
 from diffproj.calibration.results.remark import Kind, Remark, Remarks, text_of
 from diffproj.geometry.cayley import turned
 from diffproj.geometry.mounting import Mounting, mounting_from_rotation
@@ -58,6 +59,15 @@ class Adjustment(Calibration):
     spare: Int[Tensor, "*batch"] | None = None
     cost: Float[Tensor, "*batch"] | None = None
     unknown: tuple[tuple[str, ...], ...] = ()
+
+    def _chosen(self, shape: torch.Size, index: Any) -> dict[str, Any]:
+        """What it was found from is known of all: `observations` stay as they are."""
+        return {
+            "parts": tuple(some_of(part, shape, index, 2) for part in self.parts),
+            "spare": some_of(self.spare, shape, index, 0),
+            "cost": some_of(self.cost, shape, index, 0),
+            "unknown": tuple(self.unknown[i] for i in numbers(shape, index)) if self.unknown else (),
+        }
 
     @property
     def mounting(self) -> Mounting:

@@ -259,21 +259,21 @@ def _with_other_principal_points(
     may be reached from the middle itself.
     """
     part = found.part(which)
-    solution = part.solution
+    solution, task = part.solution, replace(part.task, used=part.task.used | part.rejected)
     both = ~((solution.shared[:, 2:4] - middle).abs().amin(-1) <= ASIDE * 2 * middle.amax(-1))
     every = torch.arange(len(which), device=which.device)
     starts = [every, every, every[both], every[both]]
     sides = middle.new_tensor([(1.0, 1.0), (0.5, 0.5), (1.0, 0.0), (0.0, 1.0)])
     counts = torch.tensor([len(some) for some in starts], device=which.device)
     rows, sides = torch.cat(starts), sides.repeat_interleave(counts, dim=0)
-    start = _elsewhere(part.task.parameters, solution.shared[rows], part.part(rows).solution.local, middle[rows], sides)
-    tried = fit(part.task.part(rows), *start, reject=reject, **short)
+    start = _elsewhere(task.parameters, solution.shared[rows], part.part(rows).solution.local, middle[rows], sides)
+    tried = fit(task.part(rows), *start, reject=reject, **short)
     best = tried.part(every)
     for some, numbers in zip(
         starts[1:], torch.arange(len(rows), device=rows.device).split(counts.tolist())[1:], strict=True
     ):
         best = lower_fit(best, tried.part(numbers), some, reject)
-    last = fit(part.task, best.solution.shared, best.solution.local, reject=reject, **steps)
+    last = fit(task, best.solution.shared, best.solution.local, reject=reject, **steps)
     return lower_fit(found, last, which, reject)
 
 

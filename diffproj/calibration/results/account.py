@@ -18,6 +18,7 @@ from diffproj.calibration.results.ambiguity import SURE
 from diffproj.calibration.results.border import border_with_rays
 from diffproj.calibration.results.covariance import Covariance
 from diffproj.calibration.results.distinct import alike, described
+from diffproj.calibration.results.left_out import mostly_left_out
 from diffproj.calibration.results.remark import Remarks
 from diffproj.geometry.camera import Camera
 from diffproj.targets.views import Views
@@ -175,6 +176,7 @@ class Account(Shown):
                 unsure,
                 self._scatter,
                 self.view_rms,
+                mostly_left_out(self.used, self.rejected),
                 self.views.names,
                 self.findings[0],
             )

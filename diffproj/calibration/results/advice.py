@@ -52,6 +52,7 @@ class Evidence:
             where it is not known.
         sigma: of a corner's coordinate in px.
         view_rms: `(V,)` in px.
+        left_out: of which views most corners were left out as outliers `(V,)`.
         names: of the views.
         remarks: what the residuals leave over.
     """
@@ -63,6 +64,7 @@ class Evidence:
     unsure: float | None
     sigma: float
     view_rms: Float[Tensor, " v"]
+    left_out: Bool[Tensor, " v"]
     names: tuple[str, ...]
     remarks: Remarks
 
@@ -252,9 +254,10 @@ def _bare(covered: Tensor) -> list[str]:
 
 
 def _odd(seen: Evidence) -> list[str]:
-    """Views whose corners fit far worse than the others'."""
+    """Views whose corners fit far worse than the others', those that were left out among them."""
     usual = float(seen.view_rms.nanmedian())
-    return [name for name, rms in zip(seen.names, seen.view_rms.tolist(), strict=True) if rms > ODD * usual > 0]
+    odd = (seen.view_rms > ODD * usual) & (usual > 0) | seen.left_out
+    return [name for name, is_odd in zip(seen.names, odd.tolist(), strict=True) if is_odd]
 
 
 def _second_spread(normals: Tensor) -> float:

@@ -16,6 +16,7 @@ from diffproj.calibration.problem.bow import bow_deviation, bowed
 from diffproj.calibration.problem.parametrisation import Parametrisation
 from diffproj.calibration.problem.shape_names import Shape
 from diffproj.calibration.results import ambiguity as ambiguities
+from diffproj.calibration.results import left_out
 from diffproj.calibration.results import mismatch as mismatches
 from diffproj.calibration.results.account import Account, told_of
 from diffproj.calibration.results.ambiguity import SURE, OtherPoses, widened
@@ -202,19 +203,23 @@ class Calibration(Account, Copied, Recorded, Indexed):
     def doubts(self) -> str:
         """What makes the poses doubtful, in words; empty where nothing does, or where it is not known.
 
-        Views that are `ambiguous`; of what `locate` found, views that the calibration or the camera does not fit: see
-        `mismatch`; and where poses alone were found, residuals that the `pixel_sigma` that was said does not
-        explain.
+        Views that are `ambiguous`; views most of whose corners were left out as outliers; of what `locate` found, views
+        that the calibration or the camera does not fit: see `mismatch`; and where poses alone were found, residuals
+        that the `pixel_sigma` that was said does not explain.
         """
         misfit = mismatches.described(self.mismatch, self.views.names, self.lens_region is not None)
-        return "; ".join(filter(None, [self.ambiguity, misfit, self.contradiction]))
+        points = "corners" if self.landmarks is None else "landmarks"
+        few = left_out.described(self.used, self.rejected, self.views.names, points)
+        return "; ".join(filter(None, [self.ambiguity, misfit, few, self.contradiction]))
 
     @property
     def contradiction(self) -> str:
         """Where poses alone were found, what residuals say against the `pixel_sigma`, in words; empty where nothing."""
         if not (self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics)):
             return ""
-        said = [text_of(one for one in remarks if one.kind != Kind.BELOW) for remarks in self.findings]
+        said = [
+            text_of(one for one in remarks if one.kind not in (Kind.BELOW, Kind.LEFT_OUT)) for remarks in self.findings
+        ]
         if not self.views.batch_shape:
             return said[0]
         many = [camera for camera, text in enumerate(said) if text]

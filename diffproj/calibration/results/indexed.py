@@ -53,8 +53,8 @@ class Indexed:
         many: Any = self
         check_index(index)
         shape = self._shape_of_many("index")
-        causes = [many.causes[i] for i in _numbers(shape, index)] if many.causes else ()
-        some = {name: _some(getattr(many, name), shape, index, behind) for name, behind in BEHIND.items()}
+        causes = [many.causes[i] for i in numbers(shape, index)] if many.causes else ()
+        some = {name: some_of(getattr(many, name), shape, index, behind) for name, behind in BEHIND.items()}
         late = {
             "_covariance": many.has_covariance,
             "_others": many.has_alternatives,
@@ -71,6 +71,7 @@ class Indexed:
             ),
             causes=tuple(causes),
             **some,
+            **self._chosen(shape, index),
             **{name: partial(LATE[name], many, index) if known else None for name, known in late.items()},
         )
 
@@ -82,6 +83,10 @@ class Indexed:
         """
         return (self[number] for number in range(self._shape_of_many("calibration")[0]))
 
+    def _chosen(self, shape: torch.Size, index: Any) -> dict[str, Any]:  # noqa: ARG002
+        """What a kind of calibration has besides, of those that are chosen."""
+        return {}
+
     def _shape_of_many(self, name: str) -> torch.Size:
         shape: torch.Size = cast(Any, self).views.batch_shape
         if not shape:
@@ -92,7 +97,7 @@ class Indexed:
         return shape
 
 
-def _numbers(shape: torch.Size, index: Any) -> list[int]:
+def numbers(shape: torch.Size, index: Any) -> list[int]:
     """Which of all, one after the other."""
     return index_batch(torch.arange(shape.numel(), device="cpu").reshape(shape), index, 0).flatten().tolist()
 
@@ -103,7 +108,8 @@ def _before_views(index: Any) -> Any:
     return (*parts, slice(None)) if any(part is Ellipsis for part in parts) else index
 
 
-def _some(tensor: Tensor | None, shape: torch.Size, index: Any, behind: int) -> Tensor | None:
+def some_of(tensor: Tensor | None, shape: torch.Size, index: Any, behind: int) -> Tensor | None:
+    """Some of a tensor with so many axes behind those of the batch."""
     if tensor is None:
         return None
     return index_batch(tensor.expand(*shape, *tensor.shape[tensor.ndim - behind :]), index, behind)
@@ -112,7 +118,7 @@ def _some(tensor: Tensor | None, shape: torch.Size, index: Any, behind: int) -> 
 def _covariance(many: Any, index: Any) -> Covariance:
     whole: Covariance = many.covariance_of_kept_poses
     shape = many.views.batch_shape
-    parts = {name: _some(getattr(whole, name), shape, index, n) for name, n in BEHIND_OF_COVARIANCE.items()}
+    parts = {name: some_of(getattr(whole, name), shape, index, n) for name, n in BEHIND_OF_COVARIANCE.items()}
     return replace(whole, **parts)
 
 
@@ -124,7 +130,7 @@ def _others(many: Any, index: Any) -> OtherPoses:
 
 
 def _remarks(many: Any, index: Any) -> tuple[Remarks, ...]:
-    return tuple(many.findings[i] for i in _numbers(many.views.batch_shape, index))
+    return tuple(many.findings[i] for i in numbers(many.views.batch_shape, index))
 
 
 def _mismatch(many: Any, index: Any) -> Mismatch:

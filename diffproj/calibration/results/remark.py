@@ -27,6 +27,8 @@ class Kind(StrEnum):
     """The residuals contradict the deviations that were given."""
     BELOW = "below"
     """Landmarks on a level plane are seen from below, by a camera that is upside down if z is up."""
+    LEFT_OUT = "left out"
+    """Most corners of some views were left out as outliers."""
     WRONG_PRIOR = "wrong prior"
     """The views contradict what was said beforehand of a parameter."""
 

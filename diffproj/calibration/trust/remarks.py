@@ -8,6 +8,8 @@ from torch import Tensor
 from diffproj.calibration.fitting.fit import Fit
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.least_squares.solver import Status
+from diffproj.calibration.results import left_out
+from diffproj.calibration.results.left_out import mostly_left_out
 from diffproj.calibration.results.remark import OF_THE_CAMERA, Kind, Remark, Remarks
 from diffproj.calibration.trust.adequacy import (
     BOW_PART,
@@ -93,6 +95,9 @@ def remarks(
             "or give a larger pixel_sigma"
         )
         said[p].append(Remark(sentence, Kind.CONTRADICTION, reason))
+    for p in (converged & mostly_left_out(task.used, found.rejected).any(-1)).nonzero().flatten().tolist():
+        points = "landmarks" if of_landmarks else "corners"
+        said[p].append(Remark(left_out.described(task.used[p], found.rejected[p], names[p], points), Kind.LEFT_OUT))
     sigma = found.pixel_sigma().detach()
     which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
     if len(which):

@@ -10,7 +10,8 @@ With J the derivatives of a corner's residual e by all parameters, n corners and
 
 and the covariance is `phi H^-1 M H^-1`, phi the dispersion. Variances are pooled over all corners of a camera. A
 sandwich summed over the scores of the few corners of each view is right on average too, but for the pose in a view it
-is as noisy as a covariance in six dimensions from so few: its inverse is far too large.
+is as noisy as a covariance in six dimensions from so few: its inverse is far too large. Of a view whose corners err
+clearly more than the others', the pose gets a variance of its own (`noisy_views.py`).
 """
 
 from dataclasses import replace
@@ -25,6 +26,7 @@ from diffproj.calibration.results import covariance as covariances
 from diffproj.calibration.results.covariance import Covariance, Scores
 from diffproj.calibration.trust.dispersion import dispersion
 from diffproj.calibration.trust.noise import Noise, pooled
+from diffproj.calibration.trust.noisy_views import widened_poses
 
 
 def covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = None) -> Covariance:
@@ -53,14 +55,17 @@ def covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = N
             # What only restrains is as uncertain as the residuals say.
             scale = found.residual_variance().nan_to_num(0.0)[:, None, None]
             common["precision"] = precision + scale * (task.prior.precision - precision)
-        return covariances.covariance(equations, variance=torch.ones_like(phi), scores=scores, **common)
+        whole = covariances.covariance(equations, variance=torch.ones_like(phi), scores=scores, **common)
+        # With a robust loss each view's scores are its own.
+        return whole if task.loss is not None else widened_poses(whole, found, found.pixel_sigma().square())
     if task.loss is None:
         equations, factor, variance = found.solution.equations, 1.0, found.residual_variance()
     else:
         equations, factor, variance = _robust(found)
     if known is not None and task.weights is None:
         variance = pooled(Noise(variance, found.degrees_of_freedom().to(variance)), known).variance
-    return covariances.covariance(equations, variance=factor * variance, **common)
+    whole = covariances.covariance(equations, variance=factor * variance, **common)
+    return widened_poses(whole, found, variance)
 
 
 def _robust(found: Fit) -> tuple[Equations, Tensor, Tensor]:

@@ -601,3 +601,19 @@ def test_a_facade_in_an_upright_photograph_of_a_camera_on_its_side(roll: float) 
     found = dp.adjust(street, dp.Seen(facade, seen(street, facade)))
     assert float(found.mounting.height) < float(facade[:, 2].min())
     assert found.remarks == ("",)
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [1, 0, 2]])
+def test_one_of_many_knows_what_speaks_against_it(order: list[int]) -> None:
+    """And nothing that speaks against another."""
+    noise = torch.randn(3, len(LANDMARKS), 2, generator=torch.Generator().manual_seed(0), dtype=D)
+    pixels = (seen() + noise * torch.tensor([1.0, 30.0, 1.0], dtype=D)[:, None, None])[order]
+    many = dp.adjust(START, dp.Seen(LANDMARKS, pixels, pixel_sigma=1.0), throw=False)
+    for i, one in enumerate(many):
+        alone = dp.adjust(START, dp.Seen(LANDMARKS, pixels[i], pixel_sigma=1.0), throw=False)
+        assert bool(one.doubts) == (order[i] == 1)
+        assert one.verdict == alone.verdict
+        assert one.unknown == alone.unknown
+        assert one.parts[0].shape == alone.parts[0].shape
+        assert one.summary() == alone.summary()
+        assert one.to_dict() == pytest.approx(alone.to_dict())
