@@ -1,7 +1,5 @@
 """Views most of whose corners were left out as outliers: those that are left are the few that happen to agree."""
 
-from collections.abc import Sequence
-
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -15,7 +13,7 @@ def mostly_left_out(used: Bool[Tensor, "*b v n"], rejected: Bool[Tensor, "*b v n
 
 
 def described(
-    used: Bool[Tensor, "*b v n"], rejected: Bool[Tensor, "*b v n"], names: Sequence[str], points: str = "corners"
+    used: Bool[Tensor, "*b v n"], rejected: Bool[Tensor, "*b v n"], names: tuple[str, ...], points: str = "corners"
 ) -> str:
     """What is to be said of these views, in a sentence; empty where there are none."""
     which = mostly_left_out(used, rejected).nonzero().tolist()

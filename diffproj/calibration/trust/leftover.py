@@ -40,16 +40,20 @@ class Effect:
         share: part of the residuals' sum of squares `(n,)`.
         least_share: the same, or less where the board's shape could explain a part of it.
         deviations: how improbable that is if the residuals are noise, as standard deviations of a normal variable.
+        moved: by how much the shared parameters would move if these unknowns were free, to first order `(n, s)`;
+            `None` where that is not known.
     """
 
     share: Tensor
     least_share: Tensor
     deviations: Tensor
+    moved: Tensor | None = None
 
     def besides(self, apart: "Effect", where: Tensor) -> "Effect":
         """The lesser of this effect and of what is left of it when another is taken out, where there is one."""
         share = torch.where(where, self.least_share.minimum(apart.least_share), self.least_share)
-        return Effect(self.share, share, torch.where(where, self.deviations.minimum(apart.deviations), self.deviations))
+        deviations = torch.where(where, self.deviations.minimum(apart.deviations), self.deviations)
+        return Effect(self.share, share, deviations, self.moved)
 
 
 @dataclass(frozen=True)
@@ -102,14 +106,17 @@ class _Scores:
         weight = task.used.to(squared) if task.weights is None else torch.where(task.used, task.weights, 0.0)
         if task.loss is not None:
             weight = weight * task.loss.weight(squared)
-        self.root = weight.sqrt()[:, :, None, None]
+        # Views that are alike count as one.
+        share = torch.ones_like(weight[..., 0]) if task.shares is None else task.shares
+        self.root = (weight * share.unsqueeze(-1)).sqrt()[:, :, None, None]
         panel = panel * self.root
         s = len(task.names)
         self.shared, self.poses, self.residual = panel[:, :, :s], panel[:, :, s:-1], panel[:, :, -1]
         self.by_point = torch.einsum("pvikn,pvij->pvjkn", panel[:, :, -4:-1], poses[0])  # the board's, in its frame
         if task.basis is not None:
             self.shared = torch.einsum("psq,pvskn->pvqkn", task.basis, self.shared)
-        self.count = 2 * task.used.sum((1, 2)) - self.shared.shape[2] - POSE * task.used.any(-1).sum(-1)
+        told = share * (2 * task.used.sum(-1) - POSE * task.used.any(-1))
+        self.count = told.sum(-1) - self.shared.shape[2]
         if task.restraint is not None:
             self.count = self.count + found.restrained[which]
         # Fields are those of the projected corners: of the seen ones they would know the noise.
@@ -191,14 +198,19 @@ class _Scores:
             S = S + torch.nn.functional.pad(precision, (0, k - first, 0, k - first))
         scale = U.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt().unsqueeze(-1)
         S, g = S * scale * scale.mT, g * scale
-        X, y = S[:, first:, first:], g[:, first:]
-        if first:
-            follow = _inverse(S[:, :first, :first], 1e-13) @ S[:, :first, first:]
-            X, y = X - S[:, first:, :first] @ follow, y - follow.mT @ g[:, :first]
+        follow = _inverse(S[:, :first, :first], 1e-13) @ S[:, :first, first:]
+        X, y = S[:, first:, first:] - S[:, first:, :first] @ follow, g[:, first:] - follow.mT @ g[:, :first]
         size, turn = torch.linalg.eigh(X.nan_to_num(0.0, 0.0, 0.0))
         free = size > FREE
-        explained = torch.where(free, (turn.mT @ y).squeeze(-1).square() / torch.where(free, size, 1.0), 0.0).sum(-1)
-        return effect(explained, free.sum(-1), _total(residual), count)
+        along, size = (turn.mT @ y).squeeze(-1), torch.where(free, size, 1.0)
+        explained = torch.where(free, along.square() / size, 0.0).sum(-1)
+        found = effect(explained, free.sum(-1), _total(residual), count)
+        # The residuals are `projected - seen`, so that the added unknowns step by -X^-1 y, and the others follow.
+        step = turn @ torch.where(free, along / size, 0.0).unsqueeze(-1)
+        moved = (follow @ step * scale[:, :first]).squeeze(-1)
+        if self.task.basis is not None:
+            moved = (self.task.basis @ moved.unsqueeze(-1)).squeeze(-1)
+        return replace(found, moved=moved)
 
     def _moved_points(self) -> tuple[Tensor, Tensor, Tensor]:
         """What points that move explain `(n,)`, how many unknowns that takes, and the moves `(n, N, 3)`.
@@ -224,6 +236,8 @@ def _joined(parts: list[Leftover]) -> Leftover:
     def join(values: list[Any]) -> Any:
         if isinstance(values[0], Tensor):
             return torch.cat(values)
+        if values[0] is None:
+            return None
         kind = type(values[0])
         return kind(*(join([getattr(value, field.name) for value in values]) for field in fields(kind)))
 

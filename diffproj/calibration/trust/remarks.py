@@ -31,6 +31,7 @@ from diffproj.calibration.trust.entangled import DENOMINATOR, Entangled, Simpler
 from diffproj.calibration.trust.leftover import Leftover, leftover
 from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
 from diffproj.calibration.trust.prior_weight import Elsewhere, weighed_anew
+from diffproj.calibration.trust.small_effects import SmallEffects
 from diffproj.calibration.trust.turned_photographs import Turned, turned_photographs
 from diffproj.calibration.trust.two_groups import TwoGroups, two_groups
 
@@ -95,9 +96,12 @@ def remarks(
             "or give a larger pixel_sigma"
         )
         said[p].append(Remark(sentence, Kind.CONTRADICTION, reason))
-    for p in (converged & mostly_left_out(task.used, found.rejected).any(-1)).nonzero().flatten().tolist():
+    few = converged & mostly_left_out(task.used, found.rejected).any(-1)
+    for p in map(int, few.nonzero().flatten().tolist()):
         points = "landmarks" if of_landmarks else "corners"
-        said[p].append(Remark(left_out.described(task.used[p], found.rejected[p], names[p], points), Kind.LEFT_OUT))
+        said[p].append(
+            Remark(left_out.described(task.used[p], found.rejected[p], tuple(names[p]), points), Kind.LEFT_OUT)
+        )
     sigma = found.pixel_sigma().detach()
     which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
     if len(which):
@@ -105,6 +109,7 @@ def remarks(
         wrong = prior_contradictions(found, which)
         # What is known beforehand and does not fit holds the camera where turned photographs would fit better.
         turned = turned_photographs(found, which[~found.has_prior()[which]], sizes)
+        small = SmallEffects(found, which, left, of_landmarks)
         for i, p in enumerate(map(int, which.tolist())):
             saved = groups[p].saved if p in groups else 0.0
             if p in turned and turned[p].saved > max(
@@ -123,6 +128,8 @@ def remarks(
             if p in groups and saved > BETTER * float(left.smooth.share[i]):
                 said[p].append(_two_cameras(names[p], groups[p]))
                 remark = None if remark is not None and remark.kind in OF_THE_CAMERA else remark
+            elif remark is None and p not in wrong:
+                remark = small.of(i)
             said[p] += [] if remark is None else [remark]
     return tuple(map(tuple, said))
 
