@@ -81,16 +81,15 @@ def run(options: argparse.Namespace) -> int:
         height, width = photograph.source.shape[:2]  # type: ignore[union-attr]
         check_size(scene.camera, (width, height), options)
     plane = plane_of(scene, options)
-    _, along_x, along_y = plane_axes(plane)
-    level = along_x.tolist() == [1, 0, 0] and along_y.tolist() == [0, 1, 0]
-    if options.world_file and not level:
+    origin, along_x, along_y = plane_axes(plane)
+    if options.world_file and not _is_level(plane):
         raise ValueError("--world-file: want a plane z = const, whose x and y are the map's, got another; leave it out")
     view = _view(options, scene, plane)
     top, shown = _top_view(np.asarray(photograph.source), scene, plane, view)
     if not shown:
         raise ValueError(
-            f"--extent: want a part of the plane that the photograph shows, got {_in_words(view.extent)} of which it "
-            "shows nothing"
+            f"--extent: want a part of the plane that the photograph shows, got {_in_words(view.extent, plane)}, of "
+            "which it shows nothing"
         )
     with writing("--output", options.output):
         write_whole(options.output, cv2.imencode(options.output.suffix.lower(), top)[1].tobytes())
@@ -106,6 +105,8 @@ def run(options: argparse.Namespace) -> int:
         "unit": scene.square.unit,
         "plane": [*plane.normal.tolist(), float(plane.offset)],
         "extent": list(view.extent),
+        "origin": origin.tolist(),
+        "axes": [along_x.tolist(), along_y.tolist()],
         "resolution": view.resolution,
         "size": [view.columns, view.rows],
         "north_up": view.north_up,
@@ -185,8 +186,8 @@ def _resolution(
     covered, valid = ground_resolution(pixels, scene.camera, plane)
     if not bool(seen & valid):
         raise ValueError(
-            f"--extent: want a part of the plane that the photograph shows, got {_in_words(extent)}, whose middle it "
-            "does not show; give another, or --resolution"
+            f"--extent: want a part of the plane that the photograph shows, got {_in_words(extent, plane)}, whose "
+            "middle it does not show; give another, or --resolution"
         )
     power = 10.0 ** math.floor(math.log10(float(covered)))
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= float(covered) * (1 + 1e-9))
@@ -216,12 +217,22 @@ def _say(told: dict[str, Any], scene: Scene, plane: Plane) -> None:
     columns, rows = told["size"]
     result(f"{scene.title}\n")
     result(f"The plane {described(plane, height, scene.square.unit)}")
-    result(f"{_in_words(told['extent'])}{unit}: {columns} x {rows} px of {told['resolution']:g}{unit}")
+    result(f"{_in_words(told['extent'], plane, unit)}: {columns} x {rows} px of {told['resolution']:g}{unit}")
     if told["shown"] < 1:
         result(f"The photograph shows {100 * told['shown']:.0f} % of it; the rest is transparent")
     result(f"Written to {' and '.join(str(told[key]) for key in ('output', 'world_file') if told[key])}")
 
 
-def _in_words(extent: tuple[float, ...] | list[float]) -> str:
+def _is_level(plane: Plane) -> bool:
+    """Whether the plane's axes are the world's x and y."""
+    _, along_x, along_y = plane_axes(plane)
+    return along_x.tolist() == [1, 0, 0] and along_y.tolist() == [0, 1, 0]
+
+
+def _in_words(extent: tuple[float, ...] | list[float], plane: Plane, unit: str = "") -> str:
+    """The extent for people; of a plane that is not z = const along which axes, and from where."""
     x0, y0, x1, y1 = (f"{number:.10g}" for number in extent)
-    return f"x from {x0} to {x1} and y from {y0} to {y1}"
+    if _is_level(plane):
+        return f"x from {x0} to {x1} and y from {y0} to {y1}{unit}"
+    origin, *axes = (f"({', '.join(f'{z + 0.0:.4g}' for z in part.tolist())})" for part in plane_axes(plane))
+    return f"From {origin}, {x0} to {x1}{unit} along {axes[0]} and {y0} to {y1}{unit} along {axes[1]}"

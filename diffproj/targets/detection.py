@@ -195,7 +195,7 @@ def searched(
     broken = [photograph for photograph, one in zip(listing, results, strict=True) if one is None]
     if len(broken) == len(listing):
         path = Path(broken[0].label)
-        raise NotAnImageError(path, path.stat().st_size)
+        raise NotAnImageError(path, f"{path.stat().st_size} bytes that OpenCV cannot read as one")
     pairs = [(photograph, one) for photograph, one in zip(listing, results, strict=True) if one is not None]
     listing, found = [photograph for photograph, _ in pairs], [one for _, one in pairs]
     size = _common_size(listing, [one.size for one in found])

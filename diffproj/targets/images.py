@@ -141,18 +141,18 @@ def as_8_bit(image: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
 
 
 class NotAnImageError(ValueError):
-    """A file that is no image, or a damaged one.
+    """A file that is no image, or a damaged one, or one whose values are no grey levels.
 
     Attributes:
         path: the file.
     """
 
-    def __init__(self, path: Path, size: int) -> None:
-        super().__init__(path, size)  # so that it can travel from process to process
+    def __init__(self, path: Path, found: str) -> None:
+        super().__init__(path, found)  # so that it can travel from process to process
         self.path = path
 
     def __str__(self) -> str:
-        return f"{self.path}: want an image, got {self.args[1]} bytes that OpenCV cannot read as one"
+        return f"{self.path}: want an image, got {self.args[1]}"
 
 
 def decoded(path: Path, orientation: Orientation, colour: bool = False) -> np.ndarray:
@@ -169,7 +169,11 @@ def decoded(path: Path, orientation: Orientation, colour: bool = False) -> np.nd
         flags |= cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(data, flags) if data.size else None
     if image is None:
-        raise NotAnImageError(path, data.size)
+        raise NotAnImageError(path, f"{data.size} bytes that OpenCV cannot read as one")
+    if image.dtype not in (np.uint8, np.uint16, np.int16) and not np.issubdtype(image.dtype, np.floating):
+        raise NotAnImageError(path, f"one of {image.dtype}; save it with 8 or 16 bits")
+    if np.issubdtype(image.dtype, np.floating) and not (image.min() >= 0 and image.max() <= 1):  # NaN neither
+        raise NotAnImageError(path, "one of floats that are not all from 0 to 1; save it with 8 or 16 bits")
     return image
 
 

@@ -246,6 +246,7 @@ def test_what_is_no_photograph_in_a_folder_is_left_out_and_told(
     whole = (folder / "1.png").read_bytes()
     shutil.copy(folder / "2.png", folder / "copy of 2.png")
     (folder / "half.png").write_bytes(whole[:100])
+    cv2.imwrite(str(folder / "heights.tif"), np.zeros((48, 64), np.int32))
     (folder / "empty.jpg").touch()
     for name in ("._1.png", ".DS_Store", "film.mp4", "a.HEIC", "b.heic", "c.cr2"):
         (folder / name).write_bytes(b"something")
@@ -266,6 +267,7 @@ def test_what_is_no_photograph_in_a_folder_is_left_out_and_told(
     assert told[6:] == [
         "empty.jpg: cannot be read as an image; skipped",
         "half.png: cannot be read as an image; skipped",
+        "heights.tif: cannot be read as an image; skipped",
     ]
 
 

@@ -155,3 +155,16 @@ def test_a_plane_of_any_tilt(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = run(capsys, *GIVEN, "--plane", "0,0.1,1,0", "--json")
     assert code == 0
     assert json.loads(out)["north_up"] is False
+
+
+def test_a_tilted_plane_names_the_axes_that_its_extent_is_along(capsys: pytest.CaptureFixture[str]) -> None:
+    """They are none of the world's, and neither words nor numbers may say so."""
+    options = (*GIVEN, "--plane", "0,0.6,0.8,60", "--extent", "0,-20,100,40", "--resolution", "1")
+    found = parsed(capsys, *options)
+    assert found["origin"] == pytest.approx([0, 36, 48])
+    assert found["axes"] == [pytest.approx([1, 0, 0]), pytest.approx([0, 0.8, -0.6])]
+    code, text, _ = run(capsys, *options)
+    assert code == 0
+    assert "From (0, 36, 48), 0 to 100 mm along (1, 0, 0) and -20 to 40 mm along (0, 0.8, -0.6): 100 x 60 px" in text
+    level = parsed(capsys, *GIVEN, "--extent", "0,0,100,60", "--resolution", "1")
+    assert (level["origin"], level["axes"]) == ([0, 0, 0], [[1, 0, 0], [0, 1, 0]])

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from diffproj._core.arguments import called, flag, listing, whole_number, words
 from diffproj.calibration.evidence.adjusted_covariance import covariance_of
-from diffproj.calibration.evidence.adjustment import Adjustment
+from diffproj.calibration.evidence.adjustment import Adjustment, Rivals
 from diffproj.calibration.evidence.descent import Found, Task, best, differentiated, spare
 from diffproj.calibration.evidence.knowledge import Knowledge, knowledge, prior_shapes
 from diffproj.calibration.evidence.observation import Observation
@@ -191,6 +191,7 @@ def _outcome(
         spare=shaped(left),
         cost=shaped(found.cost),
         unknown=tuple(each.names for each in names),
+        rivals=None if found.rival is None else Rivals.of(*found.rival, batch),
         _remarks=partial(_from_below, posed, task.pieces, shaped(status)),
     )
     if throw and bool((status != Status.CONVERGED).any()):

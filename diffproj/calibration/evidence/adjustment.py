@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from diffproj._core.batched import index_batch
 from diffproj._core.shown import counted, number
 from diffproj.calibration.evidence.observation import Observation
 from diffproj.calibration.evidence.pose_parameters import MOUNTING
@@ -32,10 +33,37 @@ VERTICAL = 3.0
 VERTICAL_WORDS = (
     "the axis may be vertical: beyond it, tilt folds back, and roll and heading are told half a turn further"
 )
+NEARLY = 100.0
+"""Likelihood ratio below which another pose may be the true one."""
 ANY_ANGLE = 180 / 3**0.5
 """Deviation of an angle in degrees of which nothing is known."""
 ROUNDED = 1e-7
 """The same relative to the largest deviation of the pose, whose covariance it was computed from."""
+
+
+class Rivals(NamedTuple):
+    """The pose of each camera that explains its evidence second best, with batch shape `*B`.
+
+    Attributes:
+        ratio: how many times more likely the pose is that was kept; infinite where there is no other.
+        height: of the camera in the other pose.
+        tilt: there, in degrees.
+        roll: there, in degrees.
+        heading: there, in degrees.
+    """
+
+    ratio: Float[Tensor, "*batch"]
+    height: Float[Tensor, "*batch"]
+    tilt: Float[Tensor, "*batch"]
+    roll: Float[Tensor, "*batch"]
+    heading: Float[Tensor, "*batch"]
+
+    @classmethod
+    def of(cls, above: Tensor, R: Tensor, place: Tensor, batch: tuple[int, ...]) -> "Rivals":
+        """Of poses `(P, 3, 3)` at places `(P, 3)` that cost so much more `(P,)`."""
+        tilt, roll, heading = mounting_from_rotation(R.detach())
+        parts = above.detach().exp(), place[:, 2].detach(), tilt, roll, heading
+        return cls(*(part.reshape(batch) for part in parts))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,6 +80,7 @@ class Adjustment(Calibration):
         cost: half the sum of squares of residuals and priors over their deviations, under robust losses what these make
             of it.
         unknown: for each camera the names that nothing tells, `*B` flattened.
+        rivals: the pose that explains the evidence second best; `None` where it was not looked for.
     """
 
     observations: tuple[Observation, ...] = ()
@@ -59,6 +88,7 @@ class Adjustment(Calibration):
     spare: Int[Tensor, "*batch"] | None = None
     cost: Float[Tensor, "*batch"] | None = None
     unknown: tuple[tuple[str, ...], ...] = ()
+    rivals: Rivals | None = None
 
     def _chosen(self, shape: torch.Size, index: Any) -> dict[str, Any]:
         """What it was found from is known of all: `observations` stay as they are."""
@@ -66,6 +96,7 @@ class Adjustment(Calibration):
             "parts": tuple(some_of(part, shape, index, 2) for part in self.parts),
             "spare": some_of(self.spare, shape, index, 0),
             "cost": some_of(self.cost, shape, index, 0),
+            "rivals": None if self.rivals is None else Rivals(*(index_batch(part, index, 0) for part in self.rivals)),
             "unknown": tuple(self.unknown[i] for i in numbers(shape, index)) if self.unknown else (),
         }
 
@@ -132,12 +163,37 @@ class Adjustment(Calibration):
 
     @property
     def doubts(self) -> str:
-        """What makes the pose doubtful, in words; empty where nothing does."""
+        """What makes the pose doubtful, in words; empty where nothing does.
+
+        Residuals that are larger than their deviations say; and another pose that explains the evidence nearly as well:
+        see `rivals`.
+        """
         if not self.views.batch_shape:
-            return self.contradicted[0]
+            return "; ".join(filter(None, [self.contradicted[0], self._rival]))
         many = [i for i, text in enumerate(self.contradicted) if text]
+        said = (
+            [f"the residuals of cameras {', '.join(map(str, many))} are larger than the deviations say"] if many else []
+        )
+        near = [] if self.rivals is None else (self._is_near(self.rivals)).flatten().nonzero().flatten().tolist()
+        if near:
+            said.append(f"another pose explains the evidence of cameras {', '.join(map(str, near))} nearly as well")
+        return "; ".join(said)
+
+    def _is_near(self, rivals: Rivals) -> Tensor:
+        return (rivals.ratio < NEARLY) & (self.status == Status.CONVERGED)
+
+    @property
+    def _rival(self) -> str:
+        """What is said of the other pose of one camera."""
+        other = self.rivals
+        if other is None or not bool(self._is_near(other)):
+            return ""
+        unit = f" {self.unit}" if self.unit else ""
         return (
-            f"the residuals of cameras {', '.join(map(str, many))} are larger than the deviations say" if many else ""
+            f"another pose explains the evidence nearly as well, {float(1 / other.ratio):.2g} times as likely: height "
+            f"{float(other.height):.4g}{unit}, tilt {float(other.tilt):.1f}, roll {float(other.roll):.1f}, heading "
+            f"{float(other.heading):.1f} degrees; a prior on one of these, or landmarks off the plane of the others, "
+            "tell them apart"
         )
 
     @property

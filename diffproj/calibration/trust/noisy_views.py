@@ -4,7 +4,7 @@ The noise of a corner is pooled over all views, for of a few corners it is hardl
 blurred, or the board have moved in it: then its pose is known less well than that noise says. With `s_v^2` the variance
 of a view's own residuals, and `m_v` its degrees of freedom, the variance of its pose is as many times larger as
 
-    s_v^2 / s^2     where it stands out of its own chance, sqrt(2 / m_v), and less where it does not
+    s_v^2 / s^2     where it stands out of its own chance, sqrt(2 / m_v), and no larger where it does not
 
 and with a robust loss the same of the sandwich, `q_v / a_v^2`. Where corners are left out as outliers those that are
 left may be the ones that happen to agree: where these scatter evenly up to the limit, or are the fewer, the median of
@@ -24,7 +24,7 @@ from diffproj.calibration.results.covariance import Covariance
 from diffproj.calibration.results.left_out import mostly_left_out
 
 CHANCE = 3.0
-"""Deviations of chance at which half of a view's excess noise counts."""
+"""Deviations of chance that count as nothing, for one of many views has them; half of the excess counts at one more."""
 FLAT = 0.3
 """Mean square of the residuals that are left, in times the largest, from which on they scatter evenly up to the limit:
 0.5 if they are spread evenly over a disc, 0.16 if they are normal and the limit is 3.5 deviations."""
@@ -67,8 +67,8 @@ def noise_factor(found: Fit, variance: Tensor) -> Tensor:
     known = (spare >= 1) & (pooled > 0)
     ratio = _squares(found, weight, squared, used) / spare.clamp(min=1) / pooled
     excess = torch.where(known & ratio.isfinite(), ratio - 1, 0.0).clamp(min=0)
-    stands_out = excess.square() * spare.clamp(min=1) / (2 * CHANCE**2)
-    believed = stands_out / (1 + stands_out)
+    beyond = (excess / (2 / spare.clamp(min=1)).sqrt() - CHANCE).clamp(min=0).square()
+    believed = beyond / (1 + beyond)
     if not bool(found.rejected.any()):
         return 1 + excess * believed
     # What is behind the camera is as far off as can be.

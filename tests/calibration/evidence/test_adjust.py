@@ -617,3 +617,43 @@ def test_one_of_many_knows_what_speaks_against_it(order: list[int]) -> None:
         assert one.parts[0].shape == alone.parts[0].shape
         assert one.summary() == alone.summary()
         assert one.to_dict() == pytest.approx(alone.to_dict())
+
+
+# ------------------------------------------------------------------------------------------------- the other pose
+
+
+def from_afar(count: int = 60) -> tuple[dp.Camera, torch.Tensor, torch.Tensor]:
+    """A camera far from four landmarks on the ground, which it sees nearly without perspective; and noisy pixels."""
+    camera = made(height=78.3, tilt_deg=51.5, roll_deg=0.0, heading_deg=0.0, position=[0.0, -62.3], focal=2500.0)
+    points = torch.tensor([[13.5, -4.1, 0], [-0.9, 4.3, 0], [-5.0, -1.2, 0], [-7.2, -0.4, 0]], dtype=D)
+    noise = torch.randn(count, 4, 2, generator=torch.Generator().manual_seed(0), dtype=D)
+    return camera, points, seen(camera, points) + noise
+
+
+@pytest.mark.parametrize("heading", [0.0, 180.0])
+def test_the_mirrored_pose_is_told_or_taken_wherever_the_start_is(heading: float) -> None:
+    """What is said to be known lies within its deviations; else the other pose is said, and it is the true one."""
+    camera, points, pixels = from_afar()
+    start = camera if heading == 0 else made(height=60, tilt_deg=50, heading_deg=heading, position=[0, 80], focal=2500)
+    found = dp.adjust(start, dp.Seen(points, pixels, pixel_sigma=1.0), throw=False)
+    other = found.rivals
+    assert other is not None
+    off = (found.mounting.heading + 90) % 360 - 90
+    wrong = off.abs() > 90
+    doubtful = other.ratio < 100
+    assert bool((doubtful | ~wrong)[found.converged].all())
+    assert int((~doubtful).sum()) > 5
+    there = (other.heading[wrong] + 90) % 360 - 90
+    assert bool((there.abs() < 30).all())
+    for one in (found[i] for i in range(10)):
+        assert ("another pose explains the evidence nearly as well" in one.doubts) == bool(one.rivals.ratio < 100)
+    named = [str(i) for i in doubtful.nonzero().flatten().tolist()]
+    assert f"of cameras {', '.join(named)} nearly as well" in found.doubts
+
+
+def test_landmarks_with_relief_have_one_pose() -> None:
+    found = dp.adjust(START, dp.Seen(LANDMARKS, seen() + 0.5, pixel_sigma=1.0))
+    assert found.rivals is not None
+    assert bool(found.rivals.ratio.isinf())
+    assert not found.doubts
+    assert dp.adjust(START, dp.Horizon(torch.tensor([[100.0, 120.0], [900.0, 130.0]])), throw=False).rivals is None
