@@ -13,6 +13,8 @@ from diffproj.lens.protocol import Lens
 LONGEST_SIDE = 1_000_000
 """Pixels along a side of an image, at most."""
 
+HUGE = 1e100
+"""Entries of a matrix whose squares are still numbers."""
 ROUNDED, WRONG = 1e-6, 1e-3
 """How far a file's `R^T R` may be from the identity, entry by entry: up to the first, it is taken as it is; up to the
 second, it was rounded, and the nearest rotation is taken; beyond, it is no rotation."""
@@ -156,8 +158,12 @@ def rotation(name: str, R: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: it is none.
     """
-    far = np.abs(R.T @ R - np.eye(3)).max() if np.abs(R).max() < 2 else math.inf
+    size = np.abs(R).max()
+    far = np.abs(R.T @ R - np.eye(3)).max() if size < HUGE else math.inf
     if far > WRONG:
+        scale = math.sqrt(np.trace(R.T @ R) / 3) if 1 / HUGE < size < HUGE else 0.0
+        if scale and np.abs(R.T @ R / scale**2 - np.eye(3)).max() < WRONG:
+            raise ValueError(f"{name}: want a rotation, got one times {scale:.6g}: take the scale out of the pose")
         raise ValueError(f"{name}: want a rotation, got a matrix whose R^T R is {far:.2g} off the identity")
     if np.linalg.det(R) < 0:
         raise ValueError(f"{name}: want a rotation, got a mirror image of one: the frame is left-handed")

@@ -186,6 +186,8 @@ def check_intrinsics(K: Tensor) -> None:
     if not bool(library.isfinite(K).all()):
         raise ValueError("K: want finite values, got NaN or infinity")
     if bool(((abs(K[..., 2, 0]) > 1e-5) | (abs(K[..., 2, 1]) > 1e-5) | (abs(K[..., 2, 2] - 1) > 1e-5)).any()):
+        if bool(((abs(K[..., 0, 2]) < 1e-5) & (abs(K[..., 1, 2]) < 1e-5) & (abs(K[..., 2, 2] - 1) < 1e-5)).any()):
+            raise ValueError("K: want the last row (0, 0, 1), got it as the last column; transpose K")
         raise ValueError("K: want the last row (0, 0, 1), got another; divide by K[..., 2, 2]")
     with np.errstate(over="ignore", invalid="ignore"):
         a, b, c, d = (K[..., row, column] for row in (0, 1) for column in (0, 1))

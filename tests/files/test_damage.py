@@ -270,6 +270,13 @@ def test_what_nerfstudio_has_and_we_do_not(tmp_path: Path, change: tuple[str, st
     refuse(tmp_path, "transforms.json", NERFSTUDIO.replace(*change), message)
 
 
+def test_a_pose_with_a_scale_is_named_as_one(tmp_path: Path) -> None:
+    fields = json.loads(NERFSTUDIO)
+    for row in fields["frames"][0]["transform_matrix"][:3]:
+        row[:3] = [2 * x for x in row[:3]]
+    refuse(tmp_path, "transforms.json", json.dumps(fields), "want a rotation, got one times 2: take the scale out")
+
+
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
