@@ -266,6 +266,8 @@ class RigProblem:
     ) -> tuple[Tensor, Equations]:
         """Those of the corners, with the share of each camera `(C,)` scaled, and U and g by moment `(1, M, ...)`.
 
+        Or with that of each camera at each moment, `(C, M)`.
+
         Scaled, or by moment, they are those of one rig.
         """
         s, M, P, new = self.parameters.size, self.moments, len(shared), shared.new_zeros
@@ -279,7 +281,8 @@ class RigProblem:
                 squared = panel[:, -1].square().sum(1)
                 weights = torch.ones_like(squared) if group.weights is None else group.weights
                 if scale is not None:
-                    weights = weights * scale[group.camera].unsqueeze(-1)
+                    own_scale = scale[group.camera] if scale.ndim == 1 else scale[group.camera, group.at]
+                    weights = weights * own_scale.unsqueeze(-1)
                 if loss is not None and robust is not None:
                     robust.index_add_(0, group.at, (weights * loss.value(squared)).sum(-1) / 2)
                     weights = weights * loss.weight(squared)

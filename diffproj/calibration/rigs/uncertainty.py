@@ -6,7 +6,8 @@ each camera's share. With s_c the noise of camera c, and all views of a moment o
 
     H = sum_c sum w J^T J       M = sum_c s_c^2 sum w J^T J       covariance = phi H^-1 M H^-1
 
-phi the dispersion (`dispersion.py`): how much the moments contradict each other.
+where the corners of a camera clearly scatter more at a moment than at others, their own noise stands for s_c there
+(`noisy_views.py`); phi is the dispersion (`dispersion.py`): how much the moments contradict each other.
 """
 
 from dataclasses import replace
@@ -22,6 +23,7 @@ from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.results.covariance import Covariance, Scores, covariance, points_turned, reshaped
 from diffproj.calibration.rigs.fit import RigFit
 from diffproj.calibration.trust.dispersion import FEW_VIEWS, FEW_VIEWS_OF_A_SHAPE, believed, contradiction
+from diffproj.calibration.trust.noisy_views import beyond_chance
 from diffproj.geometry.cayley import cross_matrix
 
 
@@ -163,8 +165,12 @@ def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
         H = H._replace(U=H.U + known)
     if found.prior is not None:
         H = H._replace(U=H.U + found.prior.whole)
-    _, M = problem.totals(*state, scale=(noise.variance * noise.inflation).nan_to_num(0.0), by_moment=True)
+    scale = (noise.variance * noise.inflation).nan_to_num(0.0)
+    _, M = problem.totals(*state, scale=scale, by_moment=True)
     phi = _dispersion(found, H, M)
+    noisy = _noisy_moments(found, noise)
+    if bool((noisy > 1).any()):
+        _, M = problem.totals(*state, scale=scale.unsqueeze(-1) * noisy, by_moment=True)
     scores = Scores(M.U, M.E, M.W)
     precision = (
         None if known is None else found.prior_variance * known
@@ -188,6 +194,32 @@ def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
         found_one = points_turned(found_one, axes.mT, found.parameters.few + 2 * found.parameters.bow)
     R, _ = found.views.frame.world_pose(found.local[0][0], found.local[1][0])
     return replace(reshaped(found_one, ()), middle=middle, _arm=R @ middle)
+
+
+def _noisy_moments(found: RigFit, noise: CameraNoise) -> Tensor:
+    """The factor on the variance of each camera's corners at each moment `(C, M)`: see `noisy_views.py`."""
+    views, names = found.views, found.views.names
+    count = torch.zeros(len(names), len(views.moments), dtype=torch.float64, device=found.shared.device)
+    squares = torch.zeros_like(count)
+    for c, (name, residual) in enumerate(found.by_camera.items()):
+        used, squared = found.used[name], residual.square().sum(-1)
+        weights = views.data[name].weights
+        weight = used.to(squared) if weights is None else weights[0] * used
+        if found.loss is None:
+            total = (weight * squared).sum(-1)
+        else:
+            slope, bend = slope_and_bend(found.loss, squared)
+            mean = ((slope + bend * squared) * used).sum(-1) / used.sum(-1).clamp(min=1)
+            total = (weight * slope.square() * squared).sum(-1) * (noise.bend[c] / mean.clamp(min=1e-3)).square()
+        count[c, views.where[name]], squares[c, views.where[name]] = used.sum(-1).to(count), total
+    # The pose of a moment takes from each of its cameras by its corners, and all else by all.
+    spare = 2 * count - POSE * count / count.sum(0).clamp(min=1)
+    spare = spare * (noise.freedom / spare.sum(-1).clamp(min=1)).clamp(0, 1).unsqueeze(-1)
+    level = noise.variance.unsqueeze(-1)
+    known = (level > 0) & (spare >= 1)
+    ratio = torch.where(known, squares / spare.clamp(min=1) / torch.where(known, level, 1.0), 1.0)
+    excess, believed = beyond_chance(ratio, spare)
+    return 1 + excess * believed
 
 
 def _dispersion(found: RigFit, H: Equations, M: Equations) -> Tensor:

@@ -66,9 +66,7 @@ def noise_factor(found: Fit, variance: Tensor) -> Tensor:
     pooled = variance.unsqueeze(-1)
     known = (spare >= 1) & (pooled > 0)
     ratio = _squares(found, weight, squared, used) / spare.clamp(min=1) / pooled
-    excess = torch.where(known & ratio.isfinite(), ratio - 1, 0.0).clamp(min=0)
-    beyond = (excess / (2 / spare.clamp(min=1)).sqrt() - CHANCE).clamp(min=0).square()
-    believed = beyond / (1 + beyond)
+    excess, believed = beyond_chance(torch.where(known, ratio, 1.0), spare)
     if not bool(found.rejected.any()):
         return 1 + excess * believed
     # What is behind the camera is as far off as can be.
@@ -80,6 +78,16 @@ def noise_factor(found: Fit, variance: Tensor) -> Tensor:
     furthest = (weight * squared).amax(-1)
     cut_off = found.rejected.any(-1) & ((weight * squared).sum(-1) > FLAT * furthest * count)
     return 1 + torch.where(lost, of_all, torch.where(cut_off, of_all, excess) * believed)
+
+
+def beyond_chance(ratio: Tensor, spare: Tensor) -> tuple[Tensor, Tensor]:
+    """By how much ratios to the pooled variance exceed 1, and how much of that is believed, from 0 to 1.
+
+    Each is of residuals with so many degrees of freedom, of which there is at least one where it counts.
+    """
+    excess = torch.where((spare >= 1) & ratio.isfinite(), ratio - 1, 0.0).clamp(min=0)
+    beyond = (excess / (2 / spare.clamp(min=1)).sqrt() - CHANCE).clamp(min=0).square()
+    return excess, beyond / (1 + beyond)
 
 
 def _squares(found: Fit, weight: Tensor, squared: Tensor, used: Tensor) -> Tensor:

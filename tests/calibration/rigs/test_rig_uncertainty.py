@@ -185,3 +185,27 @@ def test_each_camera_measures_with_its_part_of_the_joint_covariance(three: Scene
     assert located.knows_intrinsics
     projector = dp.PlaneProjector(one.cameras[0], dp.Plane.z(0.0))
     assert torch.allclose(projector(pixels)[0], found.points)
+
+
+@pytest.mark.parametrize("blur", [1.2, 3.0])
+def test_points_at_a_moment_that_was_blurred_for_one_camera(blur: float) -> None:
+    """By the noise of all moments together they would be off by twice their deviations and more."""
+    errors: dict[str, list[torch.Tensor]] = {"cam0": [], "cam1": []}
+    for seed in range(10):
+        true = scene(2, 12, missing=0.0, seed=seed)
+        pixels, moment = true.views["cam1"].pixels.clone(), true.views["cam1"].names[0]
+        pixels[0] += blur * torch.randn(pixels[0].shape, generator=torch.Generator().manual_seed(seed), dtype=D)
+        blurred = dp.Views(pixels, true.views["cam1"].visible, true.views["cam1"].names, size=(1280, 960))
+        rig = dp.calibrate_rig(true.views | {"cam1": blurred}, true.board)
+        m = int(moment.removeprefix("moment "))
+        for name in errors:
+            if moment not in true.views[name].names:
+                continue
+            camera = true.cameras[name]
+            there = camera.at(camera.R @ true.R[m], camera.R @ true.t[m] + camera.t)
+            points = true.board.points[[0, len(true.board.points) - 1]].to(D)
+            measured = dp.measure(there.project(points)[0], rig[name], dp.Plane.z(0.0), moment, pixel_sigma=1e-3)
+            errors[name].append(((measured.points - points) / measured.deviations)[:, :2].flatten())
+    for off in errors.values():
+        assert len(off) > 3
+        assert 0.5 < float(torch.cat(off).square().mean().sqrt()) < 1.4
