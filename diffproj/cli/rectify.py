@@ -25,8 +25,9 @@ the top view:
   It is seen from the camera's side of the plane, never mirrored. --extent is in
   the frame of the board, or of the landmarks, and in their unit where it names
   none. --height and --plane say which plane, as for 'diffproj measure'; what
-  stands above it leans away. On a plane that is not z = const, --extent is along
-  two axes in it, from the place nearest to the origin; the output names them.
+  stands above it leans away. On a plane that is not z = const, --extent is
+  along two axes in it, from its place nearest to the origin, which the output
+  names.
 
 on a map:
   --world-file writes where the pixels are: six lines, in a .pgw for a .png and
