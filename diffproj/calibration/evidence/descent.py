@@ -122,7 +122,7 @@ def best(task: Task, steps: int) -> Found:
     lower.
     """
     found = _nearest(task, steps)
-    if not any(isinstance(piece, Seen) and len(piece) >= 3 for piece in task.pieces) or steps == 0:
+    if sum(len(piece) for piece in task.pieces if isinstance(piece, Seen)) < 3 or steps == 0:
         return found
     return _with_rival(task, found, steps)
 
@@ -191,7 +191,8 @@ def _with_rival(task: Task, found: Found, steps: int) -> Found:
         return replace(found, rival=none)
     begin, turn = _mirrored(task, found)
     near = descended(task, turn, begin, found.prior, (), min(steps, RIVAL_STEPS))
-    if not bool((told & (near.cost < found.cost + RIVAL)).any()):
+    told &= near.cost < found.cost + RIVAL  # of each by itself, whatever others of the batch there are
+    if not bool(told.any()):
         return replace(found, rival=none)
     turn = turn if near.parameters.start is None else near.parameters.start
     other = descended(task, turn, near.values, found.prior, (), steps)

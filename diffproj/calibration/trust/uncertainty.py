@@ -65,7 +65,8 @@ def covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = N
     if known is not None and task.weights is None:
         variance = pooled(Noise(variance, found.degrees_of_freedom().to(variance)), known).variance
     whole = covariances.covariance(equations, variance=factor * variance, **common)
-    return widened_poses(whole, found, variance)
+    # What a located view's corners scatter more than its calibration's, `mismatch` tells, and `measure` counts.
+    return whole if known is not None else widened_poses(whole, found, variance)
 
 
 def _robust(found: Fit) -> tuple[Equations, Tensor, Tensor]:
