@@ -24,6 +24,7 @@ from diffproj.calibration.results.mismatch import Mismatch
 from diffproj.calibration.results.remark import Kind, Remark, Remarks
 from diffproj.calibration.trust.adequacy import poses_only
 from diffproj.calibration.trust.compatibility import mismatch
+from diffproj.calibration.trust.discounted import discounted
 from diffproj.calibration.trust.entangled import Entangled
 from diffproj.calibration.trust.handedness import upside_down
 from diffproj.calibration.trust.noise import Noise, level, noise_of
@@ -139,6 +140,7 @@ def outcome(
     )
 
     doubt = Entangled(found, status)
+    wrong = discounted(found)
     landmarks = data.target.names if isinstance(data.target, Landmarks) else None
     calibration = Calibration(
         camera,
@@ -166,6 +168,7 @@ def outcome(
         _remarks=partial(_remarks, found, status, doubt, data),
         landmarks=landmarks,
         uncertain=data.uncertain,
+        discounted=None if wrong is None else shaped(wrong),
         _mismatch=_mismatch(found, status, known, tuple(batch)),
     )
     if throw and bool((status != Status.CONVERGED).any()):

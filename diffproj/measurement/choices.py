@@ -103,7 +103,10 @@ def doubts(calibration: Calibration, view: int) -> str:
     if isinstance(calibration, Adjustment):
         return "; ".join(filter(None, [misfit, two, calibration.doubts]))
     points = "corners" if calibration.landmarks is None else "landmarks"
-    few = left_out.described(calibration.used[..., only, :], calibration.rejected[..., only, :], name, points)
+    robust = calibration.discounted is not None
+    few = left_out.described(
+        calibration.counting[..., only, :], calibration.left_out[..., only, :], name, points, robust
+    )
     return "; ".join(filter(None, [misfit, two, few, calibration.contradiction]))
 
 

@@ -14,12 +14,13 @@ from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.problem.parametrisation import BOW, SKEW, Parametrisation
 from diffproj.calibration.problem.shape import AXES
 from diffproj.calibration.results import advice
+from diffproj.calibration.results import ambiguity as ambiguities
 from diffproj.calibration.results.ambiguity import SURE
 from diffproj.calibration.results.border import border_with_rays
 from diffproj.calibration.results.covariance import Covariance
 from diffproj.calibration.results.distinct import alike, described
 from diffproj.calibration.results.left_out import mostly_left_out
-from diffproj.calibration.results.remark import Remarks
+from diffproj.calibration.results.remark import Kind, Remarks, text_of
 from diffproj.geometry.camera import Camera
 from diffproj.targets.views import Views
 
@@ -58,6 +59,16 @@ class Account(Shown):
         shares: Tensor | None
         lens_region: Tensor | None
         landmarks: tuple[str, ...] | None
+
+        @property
+        def counting(self) -> Tensor:
+            """See `Calibration`."""
+            ...
+
+        @property
+        def left_out(self) -> Tensor:
+            """See `Calibration`."""
+            ...
 
         @property
         def residuals(self) -> Tensor:
@@ -100,6 +111,11 @@ class Account(Shown):
             ...
 
         @property
+        def ambiguous(self) -> Tensor:
+            """See `Calibration`."""
+            ...
+
+        @property
         def has_covariance(self) -> bool:
             """See `Calibration`."""
             ...
@@ -133,6 +149,25 @@ class Account(Shown):
         def region(self) -> Tensor | None:
             """See `Calibration`."""
             ...
+
+    @property
+    def contradiction(self) -> str:
+        """Where poses alone were found, what residuals say against the `pixel_sigma`, in words; empty where nothing."""
+        if not (self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics)):
+            return ""
+        said = [
+            text_of(one for one in remarks if one.kind not in (Kind.BELOW, Kind.LEFT_OUT)) for remarks in self.findings
+        ]
+        if not self.views.batch_shape:
+            return said[0]
+        many = [camera for camera, text in enumerate(said) if text]
+        which = ", ".join(map(str, many))
+        return f"the residuals of cameras {which} are larger than pixel_sigma says: see remarks" if many else ""
+
+    @property
+    def ambiguity(self) -> str:
+        """Which views are ambiguous, in words; empty where none is, or where other poses are not known."""
+        return ambiguities.described(self.ambiguous, self.views.names) if self.has_alternatives else ""
 
     @cached_property
     def verdict(self) -> str:
@@ -176,7 +211,7 @@ class Account(Shown):
                 unsure,
                 self._scatter,
                 self.view_rms,
-                mostly_left_out(self.used, self.rejected),
+                mostly_left_out(self.counting, self.left_out),
                 self.views.names,
                 self.findings[0],
             )

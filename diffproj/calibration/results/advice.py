@@ -52,7 +52,7 @@ class Evidence:
             where it is not known.
         sigma: of a corner's coordinate in px.
         view_rms: `(V,)` in px.
-        left_out: of which views most corners were left out as outliers `(V,)`.
+        left_out: of which views too many corners were left out as outliers `(V,)`.
         names: of the views.
         remarks: what the residuals leave over.
     """

@@ -15,7 +15,6 @@ from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.problem.bow import bow_deviation, bowed
 from diffproj.calibration.problem.parametrisation import Parametrisation
 from diffproj.calibration.problem.shape_names import Shape
-from diffproj.calibration.results import ambiguity as ambiguities
 from diffproj.calibration.results import left_out
 from diffproj.calibration.results import mismatch as mismatches
 from diffproj.calibration.results.account import Account, told_of
@@ -27,7 +26,7 @@ from diffproj.calibration.results.mismatch import Mismatch
 from diffproj.calibration.results.positions import Positions, positions
 from diffproj.calibration.results.record import Recorded
 from diffproj.calibration.results.region import covered_region
-from diffproj.calibration.results.remark import Kind, Remarks, text_of
+from diffproj.calibration.results.remark import Remarks, text_of
 from diffproj.geometry.camera import Camera
 from diffproj.targets.residuals import projected_minus_seen
 from diffproj.targets.views import Views
@@ -63,6 +62,8 @@ class Calibration(Account, Copied, Recorded, Indexed):
         nominal: the target's points `(N, 3)` in world units, as they were given.
         used: which corners were used `(*B, V, N)`: seen, not rejected as outliers, and in a view with at least 4.
         rejected: which corners were rejected as outliers `(*B, V, N)`.
+        discounted: which of the used ones a robust loss holds for wrong `(*B, V, N)`: they count less than half, and
+            are further off than four deviations of the noise. `None` without such a loss.
         status: how it ended, `Status` codes `(*B,)`.
         iterations: how many steps the solver tried `(*B,)`.
         bow: how far the middle of the board stands off its edges along x and y `(*B, 2)` in world units, where it was
@@ -109,6 +110,7 @@ class Calibration(Account, Copied, Recorded, Indexed):
     landmarks: tuple[str, ...] | None = None
     displacements: Float[Tensor, "*batch n 3"] | None = None
     uncertain: Bool[Tensor, " n"] | None = None
+    discounted: Bool[Tensor, "*batch v n"] | None = None
     rig: str | None = None
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
@@ -172,6 +174,16 @@ class Calibration(Account, Copied, Recorded, Indexed):
         return torch.where((self.used & ~projected).unsqueeze(-1), torch.inf, residuals)
 
     @property
+    def left_out(self) -> Bool[Tensor, "*batch v n"]:
+        """Which corners do not count, or hardly `(*B, V, N)`: `rejected` as outliers, or `discounted`."""
+        return self.rejected if self.discounted is None else self.rejected | self.discounted
+
+    @property
+    def counting(self) -> Bool[Tensor, "*batch v n"]:
+        """Which corners count `(*B, V, N)`: those `used` that no robust loss holds for wrong."""
+        return self.used if self.discounted is None else self.used & ~self.discounted
+
+    @property
     def view_rms(self) -> Float[Tensor, "*batch v"]:
         """RMS reprojection error of each view `(*B, V)` in pixels; NaN where no corner was used; see `residuals`."""
         return (self.residuals.square().sum(dim=(-2, -1)) / self.used.sum(-1)).sqrt()
@@ -203,33 +215,14 @@ class Calibration(Account, Copied, Recorded, Indexed):
     def doubts(self) -> str:
         """What makes the poses doubtful, in words; empty where nothing does, or where it is not known.
 
-        Views that are `ambiguous`; views most of whose corners were left out as outliers; of what `locate` found, views
-        that the calibration or the camera does not fit: see `mismatch`; and where poses alone were found, residuals
-        that the `pixel_sigma` that was said does not explain.
+        Views that are `ambiguous`; views of which too many corners are `left_out` as outliers; of what `locate` found,
+        views that the calibration or the camera does not fit: see `mismatch`; and where poses alone were found,
+        residuals that the `pixel_sigma` that was said does not explain.
         """
         misfit = mismatches.described(self.mismatch, self.views.names, self.lens_region is not None)
         points = "corners" if self.landmarks is None else "landmarks"
-        few = left_out.described(self.used, self.rejected, self.views.names, points)
+        few = left_out.described(self.counting, self.left_out, self.views.names, points, self.discounted is not None)
         return "; ".join(filter(None, [self.ambiguity, misfit, few, self.contradiction]))
-
-    @property
-    def contradiction(self) -> str:
-        """Where poses alone were found, what residuals say against the `pixel_sigma`, in words; empty where nothing."""
-        if not (self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics)):
-            return ""
-        said = [
-            text_of(one for one in remarks if one.kind not in (Kind.BELOW, Kind.LEFT_OUT)) for remarks in self.findings
-        ]
-        if not self.views.batch_shape:
-            return said[0]
-        many = [camera for camera, text in enumerate(said) if text]
-        which = ", ".join(map(str, many))
-        return f"the residuals of cameras {which} are larger than pixel_sigma says: see remarks" if many else ""
-
-    @property
-    def ambiguity(self) -> str:
-        """Which views are ambiguous, in words; empty where none is, or where other poses are not known."""
-        return ambiguities.described(self.ambiguous, self.views.names) if self.has_alternatives else ""
 
     @cached_property
     def mismatch(self) -> Mismatch:

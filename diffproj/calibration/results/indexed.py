@@ -19,7 +19,7 @@ C = TypeVar("C", bound="Indexed")
 
 BEHIND = {
     **{"used": 2, "rejected": 2, "status": 0, "iterations": 0, "bow": 1, "pixel_sigma": 0, "shares": 1},
-    **{"degrees_of_freedom": 0, "lens_region": 1, "displacements": 2},
+    **{"degrees_of_freedom": 0, "lens_region": 1, "displacements": 2, "discounted": 2},
 }
 """How many axes the tensors of a calibration have behind those of the batch."""
 

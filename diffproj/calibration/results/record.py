@@ -21,7 +21,7 @@ T = TypeVar("T")
 OBJECTIVES = ("image", "plane")
 TENSORS = (
     *("rms", "status", "iterations", "bow", "displacements", "used", "rejected", "pixel_sigma", "shares"),
-    *("degrees_of_freedom", "lens_region"),
+    *("degrees_of_freedom", "lens_region", "discounted"),
 )
 """Attributes that go into a file as they are."""
 
@@ -107,6 +107,9 @@ class Recorded:
         used, rejected = (mask(fields, name, (*batch, V, N)) for name in ("used", "rejected"))
         if bool((used & ~visible).any()) or bool((used & rejected).any()):
             raise ValueError("used: want corners that are visible and not rejected, got others")
+        discounted = mask(fields, "discounted", (*batch, V, N)) if present(fields, "discounted") else None
+        if discounted is not None and bool((discounted & ~used).any()):
+            raise ValueError("discounted: want corners that are used, got others")
         R, t = tensor(fields, "R", (*batch, V, 3, 3)), tensor(fields, "t", (*batch, V, 3))
         posed = camera if not batch else camera[..., None]
         if camera.dtype != torch.float64:
@@ -137,6 +140,7 @@ class Recorded:
             rig=_rig(fields.get("rig")),
             landmarks=_landmarks(fields.get("landmarks"), N),
             uncertain=mask(fields, "uncertain", (N,)) if present(fields, "uncertain") else None,
+            discounted=discounted,
             displacements=tensor(fields, "displacements", (*batch, N, 3)) if present(fields, "displacements") else None,
             _covariance=None if covariance is None else partial(_same, covariance),
             _others=None if others is None else partial(_same, others),

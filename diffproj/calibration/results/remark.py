@@ -28,7 +28,7 @@ class Kind(StrEnum):
     BELOW = "below"
     """Landmarks on a level plane are seen from below, by a camera that is upside down if z is up."""
     LEFT_OUT = "left out"
-    """Most corners of some views were left out as outliers."""
+    """Too many corners of some views were left out as outliers, or hardly counted."""
     WRONG_PRIOR = "wrong prior"
     """The views contradict what was said beforehand of a parameter."""
 

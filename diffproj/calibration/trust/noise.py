@@ -8,6 +8,7 @@ from torch import Tensor
 
 from diffproj.calibration.fitting.fit import Fit
 from diffproj.calibration.results.calibration import Calibration
+from diffproj.calibration.trust.discounted import discounted
 
 CONTRADICTION = 0.01
 """Chance of residuals as large as the fit's under the noise that was known, below which that does not hold here."""
@@ -46,9 +47,16 @@ def level(found: Fit, known: Noise | None = None) -> Noise:
     own = Noise(sigma.square(), freedom.to(sigma))
     if found.knows_noise:
         return Noise(own.variance, torch.full_like(own.freedom, torch.inf))
-    if known is None or found.task.weights is not None:
-        return own
-    return pooled(own, known)
+    wrong = discounted(found)
+    if wrong is not None:  # what the loss holds for wrong tells of the noise no more than what was rejected
+        each = wrong.sum(-1) if found.task.shares is None else wrong.sum(-1) * found.task.shares
+        own = own._replace(freedom=torch.minimum(own.freedom, (own.freedom - 2 * each.sum(-1)).clamp(min=1)))
+    return with_known(own, known, found)
+
+
+def with_known(own: Noise, known: Noise | None, found: Fit) -> Noise:
+    """The noise of a fit together with what was known before, where that is in the same unit."""
+    return own if known is None or found.task.weights is not None else pooled(own, known)
 
 
 def own_noise(found: Fit) -> Noise:

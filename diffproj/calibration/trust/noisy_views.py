@@ -48,8 +48,14 @@ def widened_poses(covariance: Covariance, found: Fit, variance: Tensor) -> Covar
     return replace(covariance, _alone=covariance._alone * factor[..., None, None])
 
 
-def noise_factor(found: Fit, variance: Tensor) -> Tensor:
-    """The factor on the variance of each view's pose `(P, V)`, at least 1; `variance` is as in `widened_poses`."""
+def noise_factor(found: Fit, variance: Tensor, without: Tensor | None = None) -> Tensor:
+    """The factor on the variance of each view's pose `(P, V)`, at least 1.
+
+    Args:
+        found: the fit.
+        variance: as in `widened_poses`.
+        without: which part of each corner is not counted, for it counts elsewhere `(P, V, N)`.
+    """
     task = found.task
     seen = replace(task, objective="image", used=task.used | found.rejected)
     local = tuple(z.detach() for z in found.solution.local)
@@ -60,12 +66,13 @@ def noise_factor(found: Fit, variance: Tensor) -> Tensor:
     squared = residual.square().sum(2)
     used = task.used & squared.isfinite()
     squared = torch.where(used, squared, 0.0)
-    count = used.sum(-1)
+    counted = used.to(squared) if without is None else used * (1 - without)
+    count = counted.sum(-1)
     parameters = len(task.names) if task.basis is None else task.basis.shape[-1]
     spare = 2 * count - (POSE - task.pose_known) - parameters * count / count.sum(-1, keepdim=True).clamp(min=1)
     pooled = variance.unsqueeze(-1)
     known = (spare >= 1) & (pooled > 0)
-    ratio = _squares(found, weight, squared, used) / spare.clamp(min=1) / pooled
+    ratio = _squares(found, weight, squared, counted) / spare.clamp(min=1) / pooled
     excess, believed = beyond_chance(torch.where(known, ratio, 1.0), spare)
     if not bool(found.rejected.any()):
         return 1 + excess * believed
@@ -90,11 +97,11 @@ def beyond_chance(ratio: Tensor, spare: Tensor) -> tuple[Tensor, Tensor]:
     return excess, beyond / (1 + beyond)
 
 
-def _squares(found: Fit, weight: Tensor, squared: Tensor, used: Tensor) -> Tensor:
+def _squares(found: Fit, weight: Tensor, squared: Tensor, counted: Tensor) -> Tensor:
     """The sum of squares of each view `(P, V)`; with a robust loss, of the scores over their mean slope."""
     loss = found.task.loss
     if loss is None:
-        return (weight * squared).sum(-1)
+        return (weight * squared * counted).sum(-1)
     slope, bend = slope_and_bend(loss, squared)
-    mean = ((slope + bend * squared) * used).sum(-1) / used.sum(-1).clamp(min=1)
-    return (weight * slope.square() * squared).sum(-1) / mean.clamp(min=1e-3).square()
+    mean = ((slope + bend * squared) * counted).sum(-1) / counted.sum(-1).clamp(min=1)
+    return (weight * slope.square() * squared * counted).sum(-1) / mean.clamp(min=1e-3).square()

@@ -27,6 +27,7 @@ from diffproj.calibration.trust.adequacy import (
     poses_only,
     wants_skew,
 )
+from diffproj.calibration.trust.discounted import discounted
 from diffproj.calibration.trust.entangled import DENOMINATOR, Entangled, Simpler
 from diffproj.calibration.trust.leftover import Leftover, leftover
 from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
@@ -96,11 +97,16 @@ def remarks(
             "or give a larger pixel_sigma"
         )
         said[p].append(Remark(sentence, Kind.CONTRADICTION, reason))
-    few = converged & mostly_left_out(task.used, found.rejected).any(-1)
+    wrong = discounted(found)
+    out = found.rejected if wrong is None else found.rejected | wrong
+    few = converged & mostly_left_out(task.used & ~out, out).any(-1)
     for p in map(int, few.nonzero().flatten().tolist()):
         points = "landmarks" if of_landmarks else "corners"
         said[p].append(
-            Remark(left_out.described(task.used[p], found.rejected[p], tuple(names[p]), points), Kind.LEFT_OUT)
+            Remark(
+                left_out.described((task.used & ~out)[p], out[p], tuple(names[p]), points, wrong is not None),
+                Kind.LEFT_OUT,
+            )
         )
     sigma = found.pixel_sigma().detach()
     which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
