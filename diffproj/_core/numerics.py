@@ -231,6 +231,15 @@ def transform(matrix: Tensor, vectors: Tensor) -> Tensor:
     return torch.stack(linear(entries(matrix), vectors.unbind(-1)), dim=-1)
 
 
+def inverse2(matrix: Tensor) -> Tensor:
+    """Inverses of `(..., 2, 2)`; 0 where there is none."""
+    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
+    determinant = a * d - b * c
+    sound = determinant.abs() > 0
+    adjugate = torch.stack([torch.stack([d, -b], dim=-1), torch.stack([-c, a], dim=-1)], dim=-2)
+    return torch.where(sound[..., None, None], adjugate / torch.where(sound, determinant, 1.0)[..., None, None], 0.0)
+
+
 def in_float64(tensor: Tensor) -> Tensor:
     """The tensor in float64 where its device has that type, for sums that are built once and used a million times."""
     return tensor if tensor.device.type == "mps" else tensor.double()

@@ -134,6 +134,12 @@ def deviation_matrices(pixel_sigma: float | Tensor | Array, points: Tensor) -> T
         raise ValueError("pixel_sigma: want values, got a tensor on the device meta")
     given = given.to(points)
     *batch, N = points.shape[:-1]
+    if _may_be_either(given.detach(), N, len(batch)):
+        want = (*batch, N, 2, 2)
+        raise ValueError(
+            f"pixel_sigma: want deviations or covariances, got shape {tuple(given.shape)}, which fits deviations, and "
+            f"values that a covariance has; give covariances as {want}"
+        )
     if _expands(given.shape, (*batch, N)):
         _check_deviations(given.detach())
         each = given.expand(*batch, N)
@@ -148,6 +154,17 @@ def deviation_matrices(pixel_sigma: float | Tensor | Array, points: Tensor) -> T
         f"pixel_sigma: want a number or a shape that broadcasts to {want}, (*{want}, 2) or (*{want}, 2, 2), got "
         f"{tuple(given.shape)}"
     )
+
+
+def _may_be_either(given: Tensor, count: int, axes: int) -> bool:
+    """Whether it has the shape of deviations of two pixels, and is a covariance of u and v besides: nobody can tell.
+
+    Where all are alike they are deviations: as a covariance they would say that u and v err alike.
+    """
+    if given.shape[-2:] != (2, 2) or count != 2 or given.ndim - axes > 2:
+        return False
+    a, b, c, d = given.flatten(-2).unbind(-1)
+    return bool(((b == c) & (b * c < a * d)).all())
 
 
 def _expands(shape: Sequence[int], to: Sequence[int]) -> bool:

@@ -5,14 +5,16 @@ estimate and its covariance are
 
     y = C sum_c C_c^-1 y_c        C^-1 = sum_c C_c^-1
 
-where a camera that did not see a point adds nothing about it, and what it knows of the others still counts. The errors
+where a camera that did not see a point adds nothing about it, and what it knows of the others still counts. All are
+linearised at the estimate (`relinearised.py`): each at its own point they would be biased near the horizon. The errors
 of different cameras are taken to be independent, as they are where each was calibrated and located by itself. Several
-photographs of one calibrated camera share the errors of its intrinsics, and those by the cameras of a rig the errors of
-all that was calibrated with it, and cameras that were located by the same landmarks the errors that these came with, in
-ways that are not known here: each of n counts by an nth of its information, which
-no correlation makes too much (covariance intersection, Julier and Uhlmann 1997). So does a measurement that is given
-twice. Of a rig's own moments, and of points in space, `RigCalibration.triangulate` knows the joint covariance, and is
-surer.
+photographs of one calibrated camera share the errors of its intrinsics, frames of one that stands still those of its
+pose, the cameras of a rig those of all that was calibrated with it, and cameras that were found by the same landmarks
+those that these came with (`shared_errors.py`), in ways that are not known here: each of n counts by an nth of its
+information, which no correlation makes too much (covariance intersection, Julier and Uhlmann 1997). So does a
+measurement that is given twice. Of a rig's own moments, and of points in space, `RigCalibration.triangulate` knows the
+joint covariance, and is surer. So is one measurement of the mean of a point's pixels in many frames of a camera that
+stands still: the mean of n clicks is off by a click's deviation over the root of n, which is its `pixel_sigma`.
 
 Whether the cameras agree is tested: each camera against the estimate of all others, by the chi-square of the difference
 (by F's distribution where deviations were estimated from few residuals). The camera that disagrees most is named, then
@@ -22,13 +24,13 @@ grows by chi-square over its degrees of freedom (Birge 1932), until its owner me
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.utils._pytree import tree_leaves
 
 from diffproj._core.arguments import called
 from diffproj._core.numerics import broadcast_batches
@@ -37,10 +39,17 @@ from diffproj.geometry.plane import Plane
 from diffproj.measurement.agreement import chances, chi_square, disagreeing, inverse, joined, without
 from diffproj.measurement.measurement import Measurement
 from diffproj.measurement.propagation import Noise
+from diffproj.measurement.quantity import BENT
+from diffproj.measurement.relinearised import bent, relinearised
+from diffproj.measurement.shared_errors import sharing
 from diffproj.measurement.sight import Sight, Straight
+from diffproj.measurement.student import normal_reach
 
 MOST_POINTS = 3000
 """Whose joint covariance is inverted for each camera."""
+MOST_STEPS = 10
+STANDS = 1e-4
+"""Deviations by which a further step may move the estimate."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,6 +63,9 @@ class FusedMeasurement(Measurement):
             1 where no other saw its points.
         disagrees: which cameras differ by more than chance `(*B, C)`.
         scale: by what the deviations were multiplied, as the cameras disagree, `(*B,)`; 1 where they agree.
+        bent: which points' deviations and intervals mislead, as all cameras together are not sure enough of them for
+            the curve from pixels to the plane to be straight `(*B, N)`.
+        beyond: which were extrapolated by all cameras that saw them `(*B, N)`, where that is known.
     """
 
     names: tuple[str, ...] = ()
@@ -61,8 +73,20 @@ class FusedMeasurement(Measurement):
     chance: Float[Tensor, "*batch c"] | None = None
     disagrees: Bool[Tensor, "*batch c"] | None = None
     scale: Float[Tensor, "*batch"] | None = None
+    bent: Bool[Tensor, "*batch n"] | None = None
+    beyond: Bool[Tensor, "*batch n"] | None = None
 
     _lie = "measured"
+
+    @cached_property
+    def nonlinear(self) -> Bool[Tensor, "*batch n"]:
+        """Where deviations and intervals mislead `(*B, N)`: see `bent`."""
+        return torch.zeros_like(self.valid) if self.bent is None else self.bent
+
+    @cached_property
+    def extrapolated(self) -> Bool[Tensor, "*batch n"] | None:
+        """Which points no camera saw within the region that its calibration's corners covered `(*B, N)`."""
+        return self.beyond
 
     def to_dict(self) -> dict[str, list[Any]]:
         """The points as columns of Python's own numbers; `cameras` counts those that measured a point."""
@@ -119,22 +143,18 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
     T = (plane.tangents() if plane.is_per_point else plane.tangents().unsqueeze(-3)).to(torch.float64)
     T = T.expand(*batch, N, 3, 2)
     seen = torch.stack([_seen(one).expand(*batch, N) for one in found], dim=-2)  # (*B, C, N)
-    points = torch.stack([one.points.expand(*batch, N, 3) for one in found], dim=-3)
-    origin = _mean(points, seen)  # near the points, so that their coordinates are small
-    y = torch.einsum("...nij,...cni->...cnj", T, points - origin.unsqueeze(-3)).flatten(-2)  # (*B, C, 2 N)
+    shares = sharing(found, batch).to(torch.float64)
+    best = _joined(names, found, seen, T, shares)
+    # From there on all are linearised at the estimate, each element of the batch until it stands still.
+    at, moving = best.placed.detach(), torch.ones(batch, dtype=torch.bool, device=T.device)
+    for _ in range(MOST_STEPS):
+        best = _joined(names, [relinearised(one, at) for one in found], seen, T, shares)
+        moving = moving & (best.deviations_from(at) > STANDS)
+        if not bool(moving.any()):
+            break
+        at = torch.where(moving[..., None, None], best.placed.detach(), at)
+    y, C, information, estimate, covariance, valid = best.y, best.C, best.information, *best.estimate
     both = seen.repeat_interleave(2, dim=-1)
-    y = torch.where(both, y, 0.0)
-    C = torch.stack([_along(one.joint().expand(*batch, 3 * N, 3 * N), T) for one in found], dim=-3)
-    sharing = torch.tensor(_sharing(found), dtype=C.dtype, device=C.device)
-    C = without(sharing[:, None, None] * C, both)
-    information, sound = inverse(C)
-    if not bool(sound.all()):
-        who = next(name for name, bad in zip(names, _of_any(~sound), strict=True) if bad)
-        raise ValueError(
-            f"measurements: want points with an uncertainty of their own, got {who} without; give pixel_sigma above 0"
-        )
-    information = torch.where(both.unsqueeze(-1) & both.unsqueeze(-2), information, 0.0)
-    estimate, covariance, valid = joined(information, y)
     chi2 = chi_square(information, y - estimate.unsqueeze(-2)).sum(-1)
     spare = both.sum((-1, -2)) - valid.sum(-1)
     freedom = torch.stack([one.degrees_of_freedom.expand(batch) for one in found], dim=-1)
@@ -143,9 +163,7 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
     grown = disagrees.any(-1) & (chi2 > spare)
     scale = torch.where(grown, (chi2 / spare.clamp(min=1)).sqrt(), 1.0)
     common = scale[..., None, None, None] * T @ torch.linalg.cholesky(covariance).unflatten(-2, (N, 2))
-    there = valid.unflatten(-1, (N, 2)).all(-1)
-    placed = origin + (T @ estimate.unflatten(-1, (N, 2)).unsqueeze(-1)).squeeze(-1)
-    placed = torch.where(there.unsqueeze(-1), placed, 0.0)
+    there, placed = best.there, best.placed
     common = torch.where(there[..., None, None], common, 0.0)
     unit = torch.eye(2 * N, dtype=y.dtype, device=y.device).expand(*batch, 2 * N, 2 * N)
     noise = Noise(
@@ -161,7 +179,61 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
         warnings.warn(doubts, CameraDisagreementWarning, stacklevel=2)
     told = "; ".join(dict.fromkeys([doubts, *(one.doubts for one in found)])).strip("; ")
     includes = all(one.includes_intrinsics for one in found)
-    return FusedMeasurement(placed, there, includes, noise, None, told, names, seen, chance, disagrees, scale)
+    each = {"names": names, "seen": seen, "chance": chance, "disagrees": disagrees, "scale": scale}
+    fused = FusedMeasurement(placed, there, includes, noise, None, told, **each)
+    curved = _curved(found, fused) | (moving.unsqueeze(-1) & there)
+    return replace(fused, bent=curved, beyond=_extrapolated(found, seen))
+
+
+class _Joined(NamedTuple):
+    """The best estimate of measurements as they are linearised.
+
+    Attributes:
+        y: what each measured, along the plane from near the points `(*B, C, 2 N)`.
+        C: the covariances, as much larger as others share them `(*B, C, 2 N, 2 N)`.
+        information: their inverses.
+        estimate: the estimate of y, its covariance, and which coordinates anybody knows.
+        placed: the estimate in the world `(*B, N, 3)`; 0 where nobody saw the point.
+        there: which points somebody saw `(*B, N)`.
+        T: the plane's directions `(*B, N, 3, 2)`.
+    """
+
+    y: Tensor
+    C: Tensor
+    information: Tensor
+    estimate: tuple[Tensor, Tensor, Tensor]
+    placed: Tensor
+    there: Tensor
+    T: Tensor
+
+    def deviations_from(self, at: Tensor) -> Tensor:
+        """How many deviations the furthest point is from there `(*B,)`."""
+        step = torch.einsum("...nij,...ni->...nj", self.T, self.placed.detach() - at).flatten(-2)
+        spread = self.estimate[1].detach().diagonal(dim1=-2, dim2=-1).sqrt()
+        return torch.where(self.estimate[2], step.abs() / spread, 0.0).amax(-1)
+
+
+def _joined(names: Sequence[str], found: Sequence[Measurement], seen: Tensor, T: Tensor, shares: Tensor) -> _Joined:
+    """Join them; `shares (*B, C)` is how many share each one's errors."""
+    *batch, N, _, _ = T.shape
+    points = torch.stack([one.points.expand(*batch, N, 3) for one in found], dim=-3)
+    origin = _mean(points, seen)  # near the points, so that their coordinates are small
+    y = torch.einsum("...nij,...cni->...cnj", T, points - origin.unsqueeze(-3)).flatten(-2)
+    both = seen.repeat_interleave(2, dim=-1)
+    y = torch.where(both, y, 0.0)
+    C = torch.stack([_along(one.joint().expand(*batch, 3 * N, 3 * N), T) for one in found], dim=-3)
+    C = without(shares[..., None, None] * C, both)
+    information, sound = inverse(C)
+    if not bool(sound.all()):
+        who = next(name for name, bad in zip(names, _of_any(~sound), strict=True) if bad)
+        raise ValueError(
+            f"measurements: want points with an uncertainty of their own, got {who} without; give pixel_sigma above 0"
+        )
+    information = torch.where(both.unsqueeze(-1) & both.unsqueeze(-2), information, 0.0)
+    estimate = joined(information, y)
+    there = estimate[2].unflatten(-1, (N, 2)).all(-1)
+    placed = origin + (T @ estimate[0].unflatten(-1, (N, 2)).unsqueeze(-1)).squeeze(-1)
+    return _Joined(y, C, information, estimate, torch.where(there.unsqueeze(-1), placed, 0.0), there, T)
 
 
 def _checked(
@@ -225,26 +297,29 @@ def _same(a: Plane, b: Plane) -> bool:
         return False
 
 
-def _sharing(found: Sequence[Measurement]) -> list[int]:
-    """For each measurement how many have its errors in common: those of one calibration, rig or survey, and copies."""
-    return [sum(one is other or _one_calibration(one, other) for other in found) for one in found]
-
-
-def _one_calibration(one: Measurement, other: Measurement) -> bool:
-    """Whether both have errors in common: of landmarks, or of one calibration, whose numbers, or rig's, are its own."""
-    if one._sight.landmarks & other._sight.landmarks:
-        return True
-    if not (one.includes_intrinsics and other.includes_intrinsics):
-        return False
-    if one._sight.rig is not None and one._sight.rig == other._sight.rig:
-        return True
-    a, b = ((camera.K, *tree_leaves(camera.distortion)) for camera in (one._sight.camera, other._sight.camera))
-    return len(a) == len(b) and all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
-
-
 def _seen(one: Measurement) -> Tensor:
     """Which points a camera tells something about: valid ones of finite variance."""
     return one.valid & one.covariance.isfinite().all(-1).all(-1)
+
+
+def _curved(found: Sequence[Measurement], fused: FusedMeasurement) -> Tensor:
+    """Of which points `(*B, N)` the 95 % interval is not straight for a camera that saw them."""
+    C = fused.covariance.detach().nan_to_num(0.0)
+    values, vectors = torch.linalg.eigh(C)
+    axes = normal_reach(0.95) * vectors * values.clamp(min=0).sqrt().unsqueeze(-2)
+    steps, at = torch.cat([axes, -axes], dim=-1), fused.points.detach()
+    return torch.stack([bent(one, at, steps, BENT).expand(fused.valid.shape) for one in found]).any(0)
+
+
+def _extrapolated(found: Sequence[Measurement], seen: Tensor) -> Tensor | None:
+    """Which points `(*B, N)` were extrapolated by all that saw them; `None` where that is known of none of these."""
+    known = [one.extrapolated for one in found]
+    if all(one is None for one in known):
+        return None
+    inside = [
+        torch.ones_like(here) if one is None else here & ~one for one, here in zip(known, seen.unbind(-2), strict=True)
+    ]
+    return seen.any(-2) & ~torch.stack(inside).any(0)
 
 
 def _mean(points: Tensor, seen: Tensor) -> Tensor:

@@ -27,7 +27,9 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.arguments import Array
-from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64, transform
+from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64, inverse2, transform
+from diffproj.calibration.evidence.adjustment import Adjustment
+from diffproj.calibration.evidence.observations import Seen
 from diffproj.calibration.problem.parametrisation import POSE, Parametrisation
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.results.region import in_region
@@ -130,7 +132,7 @@ def measure(
     by_theta, by_point = _projection_derivatives(pixels, points, valid, camera, parameters, known, middle)
     tangents = plane.tangents()
     T = (tangents if plane.is_per_point else tangents.unsqueeze(-3)).expand(*points.shape, 2)  # (*B, N, 3, 2)
-    D = torch.where(valid[..., None, None], T @ _inverse2(by_point @ T), 0.0)
+    D = torch.where(valid[..., None, None], T @ inverse2(by_point @ T), 0.0)
     lost = valid & ~((D.abs().sum((-2, -1)) > 0) & ((D @ by_theta).abs().sum((-2, -1)) < LOST))
     if bool(lost.any()):
         D, by_theta, by_point = (torch.where(lost[..., None, None], 0.0, z) for z in (D, by_theta, by_point))
@@ -257,15 +259,6 @@ def _product(matrix: Tensor, vectors: Tensor) -> Tensor:
     return (matrix @ vectors.unsqueeze(-1)).squeeze(-1)
 
 
-def _inverse2(matrix: Tensor) -> Tensor:
-    """Inverses of `(..., 2, 2)`; 0 where there is none."""
-    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
-    determinant = a * d - b * c
-    sound = determinant.abs() > 0
-    adjugate = torch.stack([torch.stack([d, -b], dim=-1), torch.stack([-c, a], dim=-1)], dim=-2)
-    return torch.where(sound[..., None, None], adjugate / torch.where(sound, determinant, 1.0)[..., None, None], 0.0)
-
-
 def _block_diagonal(blocks: list[Tensor], batch: Sequence[int]) -> Tensor:
     size = sum(block.shape[-1] for block in blocks)
     rows, start = [], 0
@@ -278,6 +271,9 @@ def _block_diagonal(blocks: list[Tensor], batch: Sequence[int]) -> Tensor:
 
 def _uncertain_landmarks(calibration: object) -> frozenset[tuple[float, ...]]:
     """Where the landmarks are that a camera was found by and that are uncertain themselves."""
+    if isinstance(calibration, Adjustment):
+        seen_by = [one for one in calibration.observations if isinstance(one, Seen)]
+        return frozenset().union(*(one.uncertain_places() for one in seen_by))
     if not isinstance(calibration, Calibration) or calibration.uncertain is None:
         return frozenset()
     seen = calibration.uncertain & calibration.used.flatten(0, -2).any(0)

@@ -90,3 +90,24 @@ def test_deviations_and_covariances_of_pixels_say_the_same(calibration: dp.Calib
     ]
     for found in spread[1:]:
         torch.testing.assert_close(found, spread[0], rtol=1e-12, atol=0)
+
+
+def test_a_covariance_is_not_read_as_deviations_of_two_pixels() -> None:
+    """Of two pixels both have the same shape, and the error bars would be several times too small."""
+    down = dp.Camera(
+        torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]).double(), t=torch.tensor([0, 0, 500.0]).double()
+    )
+    ends, table = [[300.0, 240.0], [340.0, 240.0]], dp.Plane.z(0.0)
+    for given in ([[0.09, 0.0], [0.0, 0.09]], [[0.3, 0.1], [0.1, 0.2]]):
+        with pytest.raises(ValueError, match=r"want deviations or covariances, .* give covariances as \(2, 2, 2\)"):
+            dp.measure(ends, down, table, pixel_sigma=given)
+        for one in (ends[:1], [*ends, [320.0, 200.0]]):
+            with pytest.raises(ValueError, match="pixel_sigma"):  # for any other number they do not fit
+                dp.measure(one, down, table, pixel_sigma=given)
+    as_covariances = dp.measure(ends, down, table, pixel_sigma=[[[0.09, 0.0], [0.0, 0.09]]] * 2)
+    torch.testing.assert_close(as_covariances.lengths().deviation, torch.tensor([0.3 * 2**0.5]).double())
+    for given in ([[0.3, 0.3], [0.3, 0.3]], [[0.3, 0.4], [0.2, 0.3]], [[0.3], [0.4]], [0.3, 0.4]):
+        assert bool((dp.measure(ends, down, table, pixel_sigma=given).deviations[:, 0] > 0.19).all())
+    many = down[None].expand(3)
+    with pytest.raises(ValueError, match=r"give covariances as \(3, 2, 2, 2\)"):
+        dp.measure(ends, many, table, pixel_sigma=[[[0.09, 0.0], [0.0, 0.09]]])

@@ -52,13 +52,26 @@ def measured(seed: int, points: torch.Tensor = POINTS, batch: tuple[int, ...] = 
 def test_it_is_the_weighted_mean_that_one_writes_down() -> None:
     found = measured(0)
     fused = dp.fuse(found)
-    xy = [one.points[:, :2].flatten() for one in found]
-    information = [torch.linalg.inv(one.joint().reshape(4, 3, 4, 3)[:, :2, :, :2].reshape(8, 8)) for one in found]
-    C = torch.linalg.inv(sum(information))
-    want = C @ sum(i @ y for i, y in zip(information, xy, strict=True))
-    torch.testing.assert_close(fused.points[:, :2].flatten(), want, rtol=1e-9, atol=1e-12)
+
+    def moved_to(xy: torch.Tensor, one: dp.Measurement) -> tuple[torch.Tensor, torch.Tensor]:
+        """What it measured and its information, linearised there: pixels, and their covariance by its own slopes."""
+        seen_by, own = one._sight.camera, one.points[:, :2].detach()
+
+        def image(at: torch.Tensor) -> torch.Tensor:
+            return seen_by.project(torch.nn.functional.pad(at.reshape(4, 2), (0, 1)))[0].flatten()
+
+        there, here = (torch.func.jacrev(image)(at.flatten()) for at in (xy, own))
+        C = here @ one.joint().reshape(4, 3, 4, 3)[:, :2, :, :2].reshape(8, 8) @ here.mT
+        y = xy.flatten() + torch.linalg.solve(there, one._sight.pixels.flatten() - image(xy.flatten()))
+        return y, there.mT @ torch.linalg.inv(C) @ there
+
+    at = fused.points[:, :2]
+    moved = [moved_to(at, one) for one in found]
+    C = torch.linalg.inv(sum(information for _, information in moved))
+    want = C @ sum(information @ y for y, information in moved)
+    torch.testing.assert_close(at.flatten(), want, rtol=1e-7, atol=1e-9)
     joint = fused.joint().reshape(4, 3, 4, 3)[:, :2, :, :2].reshape(8, 8)
-    torch.testing.assert_close(joint, C, rtol=1e-7, atol=1e-12)
+    torch.testing.assert_close(joint, C, rtol=1e-6, atol=1e-12)
     assert not fused.points[:, 2].any()
     assert bool((fused.deviations[:, :2] < torch.stack([one.deviations[:, :2] for one in found]).amin(0)).all())
     assert fused.names == ("camera 0", "camera 1", "camera 2")
@@ -243,3 +256,94 @@ def test_cameras_of_one_rig_share_its_errors(tmp_path) -> None:
     independent = torch.linalg.inv(torch.linalg.inv(alone).sum(0)).diagonal(dim1=-2, dim2=-1).sqrt()
     fused = dp.fuse(seen)
     assert bool((fused.deviations[:, :2] / fused.scale < 1.05 * independent).all())
+
+
+def test_frames_of_a_camera_that_stands_still_share_its_pose() -> None:
+    """However many they are, they tell no more of it."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=generator, dtype=D)
+
+    truth = dp.Camera.mounted(10.0, 35.0, heading_deg=50.0, focal=1000.0, size=(1920, 1080))
+    points, _ = dp.back_project(torch.tensor([[960.0, 700.0], [500.0, 800.0]], dtype=D), truth, GROUND)
+    pixels, draws = truth.project(points)[0], 200
+    height, tilt = 10 + 0.1 * normal(draws), 35 + 0.5 * normal(draws)
+    guess = dp.Camera.mounted(height, tilt, heading_deg=50.0, focal=1000.0, size=(1920, 1080))
+    known = dp.adjust(guess, priors={"height": 0.1, "tilt": 0.5}, fixed=("roll", "heading", "position"))
+    for frames in (2, 8):
+        seen = [dp.measure(pixels + 0.5 * normal(draws, 2, 2), known, GROUND, pixel_sigma=0.5) for _ in range(frames)]
+        fused = dp.fuse(seen)
+        low, high = fused.interval()
+        within = ((low <= points) & (points <= high))[..., :2].double().mean()
+        assert 0.9 < float(within) < 0.99
+        assert bool((fused.deviations[..., :2] > 0.9 * seen[0].deviations[..., :2]).all())
+    exact = dp.fuse([dp.measure(pixels, truth, GROUND, pixel_sigma=0.5) for _ in range(4)])
+    one = dp.measure(pixels, truth, GROUND, pixel_sigma=0.5)
+    torch.testing.assert_close(exact.covariance, one.covariance / 4)  # an exact camera has no errors to share
+
+
+def test_cameras_that_were_adjusted_to_the_same_landmarks_share_their_errors() -> None:
+    """As those that `locate` found by them do."""
+    generator = torch.Generator().manual_seed(1)
+    truths = [camera(place) for place in PLACES]
+    survey = torch.tensor([[0, 0, 0], [6, 0, 0], [0, 4, 0], [6, 4, 0], [3, 2, 1.0]], dtype=D)
+    surveyed = survey + 0.05 * torch.randn(survey.shape, generator=generator, dtype=D)
+    found = []
+    for one in truths:
+        seen = one.project(survey)[0] + 0.3 * torch.randn((5, 2), generator=generator, dtype=D)
+        posed = dp.adjust(one, [dp.Seen(surveyed, seen, pixel_sigma=0.3, sigma=0.05)])
+        found.append(dp.measure(one.project(POINTS)[0], posed, GROUND, pixel_sigma=0.3))
+    fused = dp.fuse(found)
+    information = torch.linalg.inv(torch.stack([one.covariance[:, :2, :2] for one in found])).mean(0)
+    bound = torch.linalg.inv(information).diagonal(dim1=-2, dim2=-1).sqrt()
+    assert bool((fused.deviations[:, :2] > 0.8 * bound).all())
+
+
+def test_far_points_are_not_drawn_towards_the_cameras() -> None:
+    """Near the horizon each camera's own deviation grows with what it measures, and would weigh it."""
+    mast, far, draws = dp.Camera.mounted(2.0, 0.0, focal=500.0, size=(640, 480)), 100.0, 2000
+    pixel = mast.project(torch.tensor([[1.0, far, 0.0]], dtype=D))[0]
+    noise = torch.randn((10, draws, 1, 2), generator=torch.Generator().manual_seed(2), dtype=D)
+    alone = [dp.measure(pixel + one, mast, GROUND, pixel_sigma=1.0) for one in noise]
+    fused = dp.fuse(alone)
+    assert abs(float(fused.points[..., 1].median()) / far - 1) < 0.005
+    low, high = fused.interval()
+    assert 0.93 < float(((low <= far) & (far <= high))[..., 1].double().mean()) < 0.97
+    assert float(alone[0].nonlinear.double().mean()) > 0.9
+    assert not bool(fused.nonlinear.any())  # ten together are sure enough
+    two = dp.fuse(alone[:2])
+    assert float(two.nonlinear.double().mean()) > 0.5
+    assert "nonlinear" in dp.fuse([dp.measure(pixel, mast, GROUND, pixel_sigma=1.0)] * 2).summary()
+
+
+def test_pinholes_without_a_lens_are_joined() -> None:
+    views = dp.example_views("left")
+    calibration = dp.calibrate(views, dp.Chessboard(), "none")
+    found = [dp.measure(views.pixels[v, :3], calibration, GROUND, v, 0.5) for v in (0, 1)]
+    fused = dp.fuse(found)
+    assert bool((fused.deviations[:, :2] > 0.9 * torch.minimum(*(one.deviations[:, :2] for one in found))).all())
+
+
+def test_one_of_a_fleet_shares_the_fleets_errors_in_its_own_place() -> None:
+    left, right = (dp.example_views(name)[:9] for name in ("left", "right"))
+    fleet = dp.calibrate(dp.Views(torch.stack([left.pixels, right.pixels]), size=left.size), dp.Chessboard())
+    many = dp.measure(fleet.views.pixels[:, 0, ::9], fleet, GROUND, view=0, pixel_sigma=0.3)
+    one = dp.measure(fleet.views.pixels[0, 0, ::9], fleet[0], GROUND, view=0, pixel_sigma=0.3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dp.CameraDisagreementWarning)
+        fused = dp.fuse([many, one])
+    torch.testing.assert_close(fused.covariance[0], one.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_what_all_cameras_extrapolate_is_said() -> None:
+    views = dp.example_views("left")
+    calibration = dp.calibrate(views, dp.Chessboard())
+    pixels = torch.tensor([[10.0, 240.0], [320.0, 240.0]], dtype=D)
+    one, other = (dp.measure(pixels, calibration, GROUND, view, 0.5) for view in (0, 1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dp.CameraDisagreementWarning)
+        fused = dp.fuse([one, other])
+    assert fused.extrapolated is not None
+    assert fused.extrapolated.tolist() == [True, False]
+    assert "extrapolated" in fused.summary()

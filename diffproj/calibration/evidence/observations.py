@@ -100,6 +100,14 @@ class Seen(Observed):
         """The number of points, N."""
         return len(self.points)
 
+    def uncertain_places(self) -> frozenset[tuple[float, ...]]:
+        """Where those points are that are seen and that came with an error of their own."""
+        if self.covariances is None:
+            return frozenset()
+        unsure = self.covariances.detach().diagonal(dim1=-2, dim2=-1).sum(-1) > 0
+        seen = self.visible.reshape(-1, len(self)).any(0)
+        return frozenset(map(tuple, self.points.detach()[unsure & seen].tolist()))
+
     def _residuals(self, camera: Camera) -> Float[Tensor, "*batch m 2"]:
         """Projected minus seen, over the deviation that pixels and points have together."""
         points = self.points.to(camera.device)
