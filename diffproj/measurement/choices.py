@@ -151,7 +151,7 @@ def deviation_matrices(pixel_sigma: float | Tensor | Array, points: Tensor) -> T
         return _root2(given).expand(*batch, N, 2, 2)
     want = (*batch, N)
     raise ValueError(
-        f"pixel_sigma: want a number or a shape that broadcasts to {want}, (*{want}, 2) or (*{want}, 2, 2), got "
+        f"pixel_sigma: want a number or a shape that broadcasts to {want}, {(*want, 2)} or {(*want, 2, 2)}, got "
         f"{tuple(given.shape)}"
     )
 

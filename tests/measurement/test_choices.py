@@ -106,7 +106,7 @@ def test_a_covariance_is_not_read_as_deviations_of_two_pixels() -> None:
                 dp.measure(one, down, table, pixel_sigma=given)
     as_covariances = dp.measure(ends, down, table, pixel_sigma=[[[0.09, 0.0], [0.0, 0.09]]] * 2)
     torch.testing.assert_close(as_covariances.lengths().deviation, torch.tensor([0.3 * 2**0.5]).double())
-    for given in ([[0.3, 0.3], [0.3, 0.3]], [[0.3, 0.4], [0.2, 0.3]], [[0.3], [0.4]], [0.3, 0.4]):
+    for given in ([[0.3, 0.3], [0.3, 0.3]], [[0.3, 0.4], [0.2, 0.3]], [0.3, 0.4]):
         assert bool((dp.measure(ends, down, table, pixel_sigma=given).deviations[:, 0] > 0.19).all())
     many = down[None].expand(3)
     with pytest.raises(ValueError, match=r"give covariances as \(3, 2, 2, 2\)"):
