@@ -99,9 +99,9 @@ def doubts(calibration: Calibration, view: int) -> str:
     misfit = mismatch.described(found, name, calibration.lens_region is not None)
     if misfit:
         warn_caller(f"measure: {misfit}", CameraMismatchWarning)
-    two = ambiguity.described(calibration.ambiguous[..., only], name) if calibration.has_alternatives else ""
     if isinstance(calibration, Adjustment):
-        return "; ".join(filter(None, [misfit, two, calibration.doubts]))
+        return "; ".join(filter(None, [misfit, calibration.doubts]))
+    two = ambiguity.described(calibration.ambiguous[..., only], name) if calibration.has_alternatives else ""
     points = "corners" if calibration.landmarks is None else "landmarks"
     robust = calibration.discounted is not None
     few = left_out.described(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
+from typing import TypeVar
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -9,22 +10,24 @@ from torch import Tensor
 
 from diffproj._core.arguments import called, flag, listing, whole_number, words
 from diffproj.calibration.evidence.adjusted_covariance import covariance_of
-from diffproj.calibration.evidence.adjustment import Adjustment, Rivals
+from diffproj.calibration.evidence.adjustment import Adjustment
 from diffproj.calibration.evidence.descent import Found, Task, best, differentiated, spare
 from diffproj.calibration.evidence.knowledge import Knowledge, knowledge, prior_shapes
 from diffproj.calibration.evidence.observation import Observation
 from diffproj.calibration.evidence.observations import Seen
 from diffproj.calibration.evidence.pose_parameters import PLACE
+from diffproj.calibration.evidence.rivals import Rivals
 from diffproj.calibration.evidence.undetermined import described
 from diffproj.calibration.least_squares.losses import check_loss
 from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.problem.constraints import Priors
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
-from diffproj.calibration.results.covariance import Covariance
 from diffproj.calibration.results.remark import Kind, Remark, Remarks
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounding
 from diffproj.targets.views import Views
+
+T = TypeVar("T")
 
 UPRIGHT = 0.2
 """Cosine between z and up in the photograph from which on a camera below landmarks may look at a ceiling."""
@@ -174,6 +177,9 @@ def _outcome(
         ("camera",),
         camera.size,
     )
+    rivals = None if found.rival is None else Rivals.of(*found.rival, batch)
+    known = covariance.shared.diagonal(dim1=-2, dim2=-1)
+    others = None if rivals is None or bool((known != 0).any()) else rivals.as_other_poses(posed)
     adjusted = Adjustment(
         camera.without_pose(),
         posed,
@@ -191,7 +197,8 @@ def _outcome(
         spare=shaped(left),
         cost=shaped(found.cost),
         unknown=tuple(each.names for each in names),
-        rivals=None if found.rival is None else Rivals.of(*found.rival, batch),
+        rivals=rivals,
+        _others=None if others is None else partial(_same, others),
         _remarks=partial(_from_below, posed, task.pieces, shaped(status)),
     )
     if throw and bool((status != Status.CONVERGED).any()):
@@ -213,5 +220,5 @@ def _from_below(posed: Camera, pieces: Sequence[Observation], status: Tensor) ->
     return tuple((said,) if each else () for each in wrong.tolist())
 
 
-def _same(covariance: Covariance) -> Covariance:
-    return covariance
+def _same(found: T) -> T:
+    return found

@@ -2,17 +2,17 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from diffproj._core.batched import index_batch
 from diffproj._core.shown import counted, number
 from diffproj.calibration.evidence.observation import Observation
 from diffproj.calibration.evidence.pose_parameters import MOUNTING
 from diffproj.calibration.evidence.problem import jacobian
+from diffproj.calibration.evidence.rivals import Rivals
 from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.results.account import SENTENCES
@@ -41,31 +41,6 @@ ROUNDED = 1e-7
 """The same relative to the largest deviation of the pose, whose covariance it was computed from."""
 
 
-class Rivals(NamedTuple):
-    """The pose of each camera that explains its evidence second best, with batch shape `*B`.
-
-    Attributes:
-        ratio: how many times more likely the pose is that was kept; infinite where there is no other.
-        height: of the camera in the other pose.
-        tilt: there, in degrees.
-        roll: there, in degrees.
-        heading: there, in degrees.
-    """
-
-    ratio: Float[Tensor, "*batch"]
-    height: Float[Tensor, "*batch"]
-    tilt: Float[Tensor, "*batch"]
-    roll: Float[Tensor, "*batch"]
-    heading: Float[Tensor, "*batch"]
-
-    @classmethod
-    def of(cls, above: Tensor, R: Tensor, place: Tensor, batch: tuple[int, ...]) -> "Rivals":
-        """Of poses `(P, 3, 3)` at places `(P, 3)` that cost so much more `(P,)`."""
-        tilt, roll, heading = mounting_from_rotation(R.detach())
-        parts = above.detach().exp(), place[:, 2].detach(), tilt, roll, heading
-        return cls(*(part.reshape(batch) for part in parts))
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Adjustment(Calibration):
     """A `Calibration` of one view without corners: what `adjust` found from other evidence, or from priors alone.
@@ -80,7 +55,8 @@ class Adjustment(Calibration):
         cost: half the sum of squares of residuals and priors over their deviations, under robust losses what these make
             of it.
         unknown: for each camera the names that nothing tells, `*B` flattened.
-        rivals: the pose that explains the evidence second best; `None` where it was not looked for.
+        rivals: the pose that explains the evidence second best; `None` where it was not looked for. Where the
+            intrinsics were held, `alternatives` have it too, and covariance and measurements hold the doubt.
     """
 
     observations: tuple[Observation, ...] = ()
@@ -96,7 +72,7 @@ class Adjustment(Calibration):
             "parts": tuple(some_of(part, shape, index, 2) for part in self.parts),
             "spare": some_of(self.spare, shape, index, 0),
             "cost": some_of(self.cost, shape, index, 0),
-            "rivals": None if self.rivals is None else Rivals(*(index_batch(part, index, 0) for part in self.rivals)),
+            "rivals": None if self.rivals is None else self.rivals.chosen(index),
             "unknown": tuple(self.unknown[i] for i in numbers(shape, index)) if self.unknown else (),
         }
 

@@ -48,7 +48,8 @@ class OtherPoses:
 
     Attributes:
         R, t: `(*B, V, 3, 3)` and `(*B, V, 3)`; the kept pose where there is no other.
-        ratio: of the likelihoods of the kept pose and of the other `(*B, V)`, at least 1; infinite where there is none.
+        ratio: of the likelihoods of the kept pose and of the other `(*B, V)`; infinite where there is none. At least 1,
+            but after `adjust`, which keeps the pose that it was led to unless the other is much likelier.
     """
 
     R: Float[Tensor, "*batch v 3 3"]
@@ -57,7 +58,7 @@ class OtherPoses:
 
     @property
     def probability(self) -> Float[Tensor, "*batch v"]:
-        """That the other pose is the right one `(*B, V)`, from 0 to 1/2."""
+        """That the other pose is the right one `(*B, V)`."""
         return 1 / (1 + self.ratio)
 
 

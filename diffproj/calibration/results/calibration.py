@@ -282,7 +282,15 @@ class Calibration(Account, Copied, Recorded, Indexed):
         own = self.covariance_of_kept_poses
         if not self.has_alternatives or not bool((self.other_poses.probability > 0).any()):
             return own
-        return widened(own, (self.cameras.R, self.cameras.t), self.other_poses, self.nominal.mean(0))
+        return widened(own, (self.cameras.R, self.cameras.t), self.other_poses, self._middle)
+
+    @property
+    def _middle(self) -> Float[Tensor, "3"]:
+        """That of the target, about which its two poses turn; after `adjust` that of the covariance."""
+        if len(self.nominal):
+            return self.nominal.mean(0)
+        known = self.covariance_of_kept_poses.middle
+        return self.nominal.new_zeros(3) if known is None else known
 
     @cached_property
     def covariance_of_kept_poses(self) -> Covariance:

@@ -179,7 +179,7 @@ def _covariance(fields: dict[str, Any], batch: tuple[int, ...], views: int, stat
 def _others(fields: dict[str, Any] | None, batch: tuple[int, ...], views: int) -> OtherPoses | None:
     if fields is None:
         return None
-    ratio = tensor(fields, "likelihood_ratio", (*batch, views), least=1, gaps=True)
+    ratio = tensor(fields, "likelihood_ratio", (*batch, views), least=0, gaps=True)
     R, t = tensor(fields, "R", (*batch, views, 3, 3), gaps=True), tensor(fields, "t", (*batch, views, 3), gaps=True)
     return OtherPoses(R, t, torch.where(ratio.isnan(), torch.inf, ratio))
 

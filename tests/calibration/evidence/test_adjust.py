@@ -651,6 +651,28 @@ def test_the_mirrored_pose_is_told_or_taken_wherever_the_start_is(heading: float
     assert f"of cameras {', '.join(named)} nearly as well" in found.doubts
 
 
+@pytest.mark.parametrize("heading", [0.0, 180.0])
+def test_deviations_hold_the_doubt_between_two_poses(heading: float) -> None:
+    """A point on the ground is as uncertain as if it were known only from which pose it was measured, and how likely."""
+    camera, points, pixels = from_afar()
+    start = camera if heading == 0 else made(height=60, tilt_deg=50, heading_deg=heading, position=[0, 80], focal=2500)
+    found = dp.adjust(start, dp.Seen(points, pixels, pixel_sigma=1.0), throw=False)
+    assert found.has_alternatives
+    place = torch.tensor([[8.0, 5.0, 0.0]], dtype=D)
+    measured = dp.measure(camera.project(place)[0].expand(60, 1, 2), found, dp.Plane.z(0.0), pixel_sigma=0.01)
+    known = found.converged & measured.deviations.isfinite().all(-1).squeeze(-1)
+    off = ((measured.points - place) / measured.deviations)[known, 0, :2]
+    assert int(known.sum()) > 20
+    assert 0.5 < float(off.square().mean().sqrt()) < 1.5
+    doubtful = found.ambiguous[:, 0] & found.converged
+    kept, other = found.cameras.center[doubtful, 0], found.alternatives.center[doubtful, 0]
+    p = 1 / (1 + found.rivals.ratio[doubtful, None])
+    far = (kept - other).norm(dim=-1) * p.sqrt().squeeze(-1)
+    assert bool((found.positions.deviations[doubtful, 0].norm(dim=-1) > 0.4 * far).all())  # a large turn, straightened
+    again = dp.Calibration.from_fields(found.to_fields(), found.camera)
+    torch.testing.assert_close(again.positions.deviations, found.positions.deviations)
+
+
 def test_landmarks_with_relief_have_one_pose() -> None:
     found = dp.adjust(START, dp.Seen(LANDMARKS, seen() + 0.5, pixel_sigma=1.0))
     assert found.rivals is not None
