@@ -90,7 +90,9 @@ def _camera(fields: dict[str, Any]) -> Found:
     wanted = (MATRIX, LENS, ("distortion_model",))
     missing = [names[0] for names in wanted if _first(fields, names) in (None, ("distortion_model", ""))]
     if missing:
-        raise ValueError(f"want {' and '.join(missing)} in a camera_info, got none")
+        models = "; its model is plumb_bob (5 coefficients), rational_polynomial (8) or equidistant (4)"
+        remedy = models if missing == ["distortion_model"] else ""
+        raise ValueError(f"want {' and '.join(missing)} in a camera_info, got none{remedy}")
     _check_whole_image(fields)
     width, height = (fields.get(f"image_{side}", fields.get(side)) for side in ("width", "height"))
     size = image_size(width, height)

@@ -89,7 +89,7 @@ DAMAGE = [
     ("calibration/covariance/follow", [[0.0]], "follow: want shape"),
     ("calibration/covariance/names", ["f_x"], "undetermined: want shape"),
     ("calibration/covariance/undetermined", ..., "want the key undetermined"),
-    ("calibration/other_poses/likelihood_ratio", [0.1] * 4, "likelihood_ratio: want numbers of at least 1"),
+    ("calibration/other_poses/likelihood_ratio", [-0.1] * 4, "likelihood_ratio: want numbers of at least 0"),
     ("calibration/status", ..., "want the key status"),
     ("camera/K/0/0", "533", "K: want numbers"),
     ("camera/K/0/0", float("nan"), "K: want finite values"),
