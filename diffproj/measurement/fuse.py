@@ -97,7 +97,10 @@ class FusedMeasurement(Measurement):
         columns |= {f"{axis}_deviation": part for axis, part in zip("xyz", self.deviations.unbind(-1), strict=True)}
         found = {name: values.detach().flatten().tolist() for name, values in columns.items()}
         reasons = ["VALID" if valid else "NOT_MEASURED" for valid in found["valid"]]
-        return found | {"nonlinear": self.nonlinear.flatten().tolist(), "reason": reasons}
+        flags = {"nonlinear": self.nonlinear.flatten().tolist()}
+        if self.extrapolated is not None:
+            flags["extrapolated"] = self.extrapolated.flatten().tolist()
+        return found | flags | {"reason": reasons}
 
     def _facts(self) -> list[str]:
         return [f"{len(self.names)} cameras", *super()._facts()]

@@ -7,6 +7,7 @@ rig share all that was calibrated with it; and cameras that were found by the sa
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,45 +16,61 @@ from diffproj.calibration.problem.parametrisation import POSE, Parametrisation
 from diffproj.measurement.measurement import Measurement
 
 
+class _Estimates(NamedTuple):
+    """What a measurement knows of its camera, and how surely.
+
+    Attributes:
+        intrinsics: focal lengths, principal point and lens, each `(*B,)` with its variance.
+        pose: R `(*B, 3, 3)` and t `(*B, 3)`.
+        unsure: whether the pose is uncertain `(*B,)`.
+        lens: the kind of lens.
+    """
+
+    intrinsics: list[tuple[Tensor, Tensor]]
+    pose: tuple[Tensor, Tensor]
+    unsure: Tensor
+    lens: type
+
+    @classmethod
+    def of(cls, one: Measurement) -> "_Estimates | None":
+        """Those of a measurement; `None` where the camera counts as exact."""
+        camera, q = one._sight.camera, one._sight.by_theta.shape[-1]
+        if q == 0:
+            return None
+        variances = one._noise.sigma.detach().diagonal(dim1=-2, dim2=-1)[..., :q]
+        values = Parametrisation.of(camera).pack(camera).detach().unbind(-1)
+        intrinsics = list(zip(values, variances.unbind(-1)[:-POSE], strict=False))
+        pose = camera.R.detach(), camera.t.detach()
+        return cls(intrinsics, pose, (variances[..., -POSE:] > 0).any(-1), type(camera.distortion))
+
+
 def sharing(found: Sequence[Measurement], batch: Sequence[int]) -> Tensor:
     """For each measurement how many have errors in common with it, itself among them, `(*B, C)`."""
+    known = [_Estimates.of(one) for one in found]
     counts = []
-    for one in found:
-        common = [torch.as_tensor(_share(one, other), device=one.points.device).expand(tuple(batch)) for other in found]
-        counts.append(torch.stack(common).sum(0))
+    for one, ours in zip(found, known, strict=True):
+        common = [
+            torch.as_tensor(one is other or _of_one_source(one, other) or _alike(ours, theirs)).expand(tuple(batch))
+            for other, theirs in zip(found, known, strict=True)
+        ]
+        counts.append(torch.stack([each.to(one.points.device) for each in common]).sum(0))
     return torch.stack(counts, dim=-1)
 
 
-def _share(one: Measurement, other: Measurement) -> Tensor | bool:
-    """Whether both have errors in common, in each element of the batch."""
+def _of_one_source(one: Measurement, other: Measurement) -> bool:
+    """Whether both were found by the same uncertain landmarks, or with one rig."""
     a, b = one._sight, other._sight
-    if one is other or a.landmarks & b.landmarks:
-        return True
-    if one.includes_intrinsics and other.includes_intrinsics and a.rig is not None and a.rig == b.rig:
-        return True
-    if not (a.by_theta.shape[-1] and b.by_theta.shape[-1]):
-        return False  # cameras without a covariance are exact
-    ours, theirs = _intrinsics(one), _intrinsics(other)
-    count = min(len(ours), len(theirs)) if type(a.camera.distortion) is type(b.camera.distortion) else 4
-    found = torch.zeros((), dtype=torch.bool, device=one.points.device)
-    for (x, its), (y, of_other) in zip(ours[:count], theirs[:count], strict=True):
-        found = found | ((x == y) & (its > 0) & (of_other > 0))
-    stands = (a.camera.R == b.camera.R).all(-1).all(-1) & (a.camera.t == b.camera.t).all(-1)
-    return found | (stands & _pose_variance(one) & _pose_variance(other))
+    same_rig = a.rig is not None and a.rig == b.rig
+    return bool(a.landmarks & b.landmarks) or (same_rig and one.includes_intrinsics and other.includes_intrinsics)
 
 
-def _intrinsics(one: Measurement) -> list[tuple[Tensor, Tensor]]:
-    """Focal lengths, principal point and lens, each `(*B,)` with its variance."""
-    camera = one._sight.camera
-    values = Parametrisation.of(camera).pack(camera).detach().unbind(-1)
-    return list(zip(values, _variances(one).unbind(-1)[:-POSE], strict=False))
-
-
-def _pose_variance(one: Measurement) -> Tensor:
-    """Whether the pose is uncertain `(*B,)`."""
-    return (_variances(one)[..., -POSE:] > 0).any(-1)
-
-
-def _variances(one: Measurement) -> Tensor:
-    """Of all parameters of the camera and of its pose `(*B, q)`."""
-    return one._noise.sigma.detach().diagonal(dim1=-2, dim2=-1)[..., : one._sight.by_theta.shape[-1]]
+def _alike(ours: _Estimates | None, theirs: _Estimates | None) -> Tensor | bool:
+    """Whether an uncertain number of both is the same, or the pose, in each element of the batch."""
+    if ours is None or theirs is None:
+        return False
+    count = min(len(ours.intrinsics), len(theirs.intrinsics)) if ours.lens is theirs.lens else 4
+    (R, t), (S, s) = ours.pose, theirs.pose
+    found = (R == S).all(-1).all(-1) & (t == s).all(-1) & ours.unsure & theirs.unsure
+    for (x, spread), (y, other) in zip(ours.intrinsics[:count], theirs.intrinsics[:count], strict=True):
+        found = found | ((x == y) & (spread > 0) & (other > 0))
+    return found

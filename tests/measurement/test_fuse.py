@@ -347,3 +347,4 @@ def test_what_all_cameras_extrapolate_is_said() -> None:
     assert fused.extrapolated is not None
     assert fused.extrapolated.tolist() == [True, False]
     assert "extrapolated" in fused.summary()
+    assert fused.to_dict()["extrapolated"] == [True, False]
