@@ -63,12 +63,15 @@ class Corners(NamedTuple):
             instead of 0.86 to 1.11.
         visible: `(rows, columns)`, false where something hides the corner.
         misfit: the median over the corners; above a third, it is no chessboard.
+        begins_dark: whether the square between the first four corners is dark. Each visible corner by itself shows
+            which of the squares around it are, and all of them agree: one that does not is hidden.
     """
 
     grid: Float[np.ndarray, "rows columns 2"]
     sigma: Float[np.ndarray, "rows columns"]
     visible: Bool[np.ndarray, "rows columns"]
     misfit: float
+    begins_dark: bool
 
     def is_board(self) -> bool:
         """Whether enough of it proves to be a board: half of all corners, and half of those along each side."""
@@ -101,7 +104,10 @@ def refine_grid(image: Shaped[np.ndarray, "h w"], rough: Float[np.ndarray, "rows
             *(np.where(good, old, new) for old, new in zip(fit[1:], tried[1:], strict=True)),
         )
         good = _trusted(image, fit, everywhere)
-    return Corners(np.where(good[..., None], fit.grid, np.nan), fit.sigma, good, _median(fit.misfit.ravel()))
+    begins_dark = bool((_alternated(fit.contrast)[good] > 0).any())
+    return Corners(
+        np.where(good[..., None], fit.grid, np.nan), fit.sigma, good, _median(fit.misfit.ravel()), begins_dark
+    )
 
 
 class _Fit(NamedTuple):
@@ -203,8 +209,7 @@ def _trusted(
     """
     grid, misfit, contrast, sigma = fit
     usual = _median(misfit[known])
-    # Dark and light change places from one corner to the next.
-    contrast = contrast * (1 - 2 * (np.indices(contrast.shape).sum(axis=0) % 2))
+    contrast = _alternated(contrast)
     contrast /= _median(contrast[known]) or 1.0
     use = known & (misfit < max(MISFIT, UNUSUAL * usual)) & (contrast > FAINT)
     use &= sigma < np.maximum(VAGUE, 6 * _median(sigma[known]))
@@ -227,6 +232,14 @@ def _trusted(
             break
         weight = use / (1 + (off / (0.5 * limit)) ** 4)
     return use & (off < limit)
+
+
+def _alternated(contrast: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+    """The contrasts of a board's corners with one sign: dark and light change places from one corner to the next.
+
+    Positive where the square between the first four corners is dark.
+    """
+    return contrast * (1 - 2 * (np.indices(contrast.shape).sum(axis=0) % 2))
 
 
 def _fitted(

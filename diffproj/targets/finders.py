@@ -58,7 +58,7 @@ def _chessboard(image: Shaped[np.ndarray, "h w"], board: Chessboard) -> Found:
     refined = refine_grid(image, pattern.grid)
     if not refined.is_board():
         return Found(None)
-    return Found(in_order(refined.grid, image, board), board.size)
+    return Found(in_order(refined.grid, refined.begins_dark, board), board.size)
 
 
 def _april_grid(image: Shaped[np.ndarray, "h w"], board: AprilGrid) -> Found:
