@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 
 from diffproj.targets.april_grid import AprilGrid
 from diffproj.targets.boards import Board
@@ -13,9 +13,13 @@ from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.circles import find_circles
 from diffproj.targets.corners import refine_grid
 from diffproj.targets.images import as_8_bit
-from diffproj.targets.marked import find_marked, shows_rather
+from diffproj.targets.marked import find_marked, not_found
 from diffproj.targets.numbering import in_order
 from diffproj.targets.search import find_pattern
+
+ENDS = 2
+"""Corners at the end of a ChArUco board that only its own pattern has from which no other is thought of. Of 90 views of
+the other pattern none showed one."""
 
 OTHER_SPACING = 0.15
 """How far the gaps between tags may be from what was given, relative to it."""
@@ -86,14 +90,39 @@ def _spacing_of(grid: Float[np.ndarray, "rows columns 2"]) -> float:
 
 def _charuco(image: Shaped[np.ndarray, "h w"], board: CharucoBoard) -> Found:
     grey = as_8_bit(image)
-    corners = find_marked(image, grey, board)
-    other = with_other_start(board)
-    # With an odd number of columns most markers stand to each other alike on both, one square further on: those at the
-    # ends of rows tell which it is. Where none of them is in view, it is the one that was asked for.
-    alike = other if board.columns % 2 == 1 else None
-    if corners is not None and not (alike is not None and shows_rather(grey, alike, board)):
-        return Found(corners.reshape(*board.shape, 2))
-    if other is not None and find_marked(image, grey, other) is not None:
-        kind = "legacy" if other.legacy else "ordinary"
+    corners, other = find_marked(image, grey, board), with_other_start(board)
+    found = Found(None if corners is None else corners.reshape(*board.shape, 2))
+    if other is None or (corners is not None and board.columns % 2 == 0):
+        return found
+    # With an odd number of columns, either pattern is the other one square further on, but for the end that is its own.
+    own = _at_its_own_end(corners, board)
+    if own >= ENDS:
+        return found
+    others = find_marked(image, grey, other)
+    if others is None:
+        return found
+    kind = "legacy" if other.legacy else "ordinary"
+    if corners is None or own < _at_its_own_end(others, other):
         return Found(None, hint=f"one of the {kind} pattern: give legacy={other.legacy}")
-    return Found(None)
+    # Where its own end is not in view, it is the pattern that was asked for. Where it should be, and is not, who knows?
+    if own > _at_its_own_end(others, other) or not not_found(image, board, corners, _own_end(board)):
+        return found
+    return Found(
+        None,
+        hint=f"one that may as well be of the {kind} pattern: show the ends of its rows, or give legacy={other.legacy}",
+    )
+
+
+def _own_end(board: CharucoBoard) -> Bool[np.ndarray, " n"]:
+    """The corners of the column that the other pattern, laid upon this one so that most markers agree, does not have.
+
+    The first column of an ordinary board, the last of a legacy one: there the other board has its border.
+    """
+    own = np.zeros(board.shape, dtype=bool)
+    own[:, -1 if board.legacy else 0] = True
+    return own.reshape(-1)
+
+
+def _at_its_own_end(corners: Float[np.ndarray, "n 2"] | None, board: CharucoBoard) -> int:
+    """How many corners were found there."""
+    return 0 if corners is None else int(np.isfinite(corners[_own_end(board), 0]).sum())

@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Bool, Float, Shaped, UInt8
 
 from diffproj.targets.april_grid import AprilGrid
 from diffproj.targets.charuco import CharucoBoard
+from diffproj.targets.codes import contradicted
 from diffproj.targets.corner_fit import Fitted
 from diffproj.targets.dictionaries import dictionary_named
 from diffproj.targets.pattern_fit import LARGEST, SMALLEST, Patches, fit_patches, patches_of
@@ -91,18 +92,30 @@ def find_marked(
         markers = _agreeing(grey, board, border)
         if len(markers) > 1:
             corners = _Search(image, board, border).corners(markers)
-            if corners is not None:
+            if corners is not None and not contradicted(image, board, border, corners):
                 return corners
     return None
 
 
-def shows_rather(grey: UInt8[np.ndarray, "h w"], other: CharucoBoard, board: CharucoBoard) -> bool:
-    """Whether more markers stand to each other as on the other board, in the first copy in which the two differ."""
-    for small in _copies(grey):
-        one, two = (len(_consistent(_read(small, grey, each, 1), each.pitch)) for each in (other, board))
-        if one != two:
-            return one > two
-    return False
+def not_found(
+    image: Shaped[np.ndarray, "h w"],
+    board: MarkedBoard,
+    known: Float[np.ndarray, "n 2"],
+    which: Bool[np.ndarray, " n"],
+) -> int:
+    """How many of some corners should be well in view, as those that were found say, and were not found."""
+    where, room = known.copy(), np.full((len(known), 1), np.inf)
+    seen = np.isfinite(known[:, 0])
+    # From those that were found to their neighbours, and so on.
+    while not seen.all():
+        there, jacobians = _predicted(board.corners, board.corners[seen], where[seen], board.pitch, first=False)
+        new = np.isfinite(there[:, 0]) & ~seen
+        if not new.any():
+            break
+        where[new], seen = there[new], seen | new
+        room[new] = board.reach * np.linalg.norm(jacobians[new], axis=1).max(axis=-1, keepdims=True)
+    inside = np.all((where > room) & (where < np.array(image.shape[::-1]) - 1 - room), axis=-1)
+    return int((inside & which).sum())
 
 
 class _Search:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import diffproj as dp
+from diffproj.targets.codes import contradicted
 from tests.targets.boards_in_view import camera_before, errors, photographed
 
 CHARUCO = dp.CharucoBoard(8, 6, square=20.0, marker=15.0, dictionary="4X4_1000")
@@ -179,6 +180,71 @@ def test_the_other_pattern_is_told_where_it_is_the_same_one_square_further_on(le
     other = dp.CharucoBoard(7, 4, 20.0, 15.0, "4X4_1000", legacy=not legacy)
     with pytest.raises(dp.BoardNotFoundError, match=f"give legacy={legacy}"):
         dp.detect(photo, other)
+
+
+def of_either_pattern(legacy: bool) -> tuple[dp.CharucoBoard, dp.CharucoBoard]:
+    """A board whose markers stand alike on the other pattern but for those at the ends of rows, and that other."""
+    board, other = (dp.CharucoBoard(7, 4, 20.0, 15.0, "4X4_1000", legacy=kind) for kind in (legacy, not legacy))
+    return board, other
+
+
+def covered(photo: np.ndarray, camera: dp.Camera, places: np.ndarray, radius: float) -> np.ndarray:
+    """A photograph with grey discs, their radius in px, before places on a board's plane."""
+    points = torch.from_numpy(np.column_stack([places, np.zeros(len(places))]))
+    for u, v in camera.project(points)[0].round().int().tolist():
+        photo = cv2.circle(photo.copy(), (u, v), round(radius), 128, -1, cv2.LINE_AA)
+    return photo
+
+
+@pytest.mark.parametrize("legacy", [True, False])
+def test_the_other_pattern_is_told_where_markers_at_the_ends_of_rows_are_not_read(legacy):
+    """By the corners of the column that only the true one has; their markers were the only ones to tell it before."""
+    board, other = of_either_pattern(legacy)
+    camera = camera_before(board, 3, side_px=28, tilt_deg=20)
+    ends = [quad.mean(axis=0) for number, quad in board.markers.items() if number % 7 == 3]
+    photo = covered(photographed(camera, board), camera, np.array(ends), 7)
+    found = dp.detect(photo, board)
+    assert bool(found.visible.all())
+    assert errors(found, camera, board)[0].max() < 0.2
+    with pytest.raises(dp.BoardNotFoundError, match=f"one of the .* pattern: give legacy={legacy}"):
+        dp.detect(photo, other)
+
+
+@pytest.mark.parametrize("legacy", [True, False])
+def test_where_its_own_end_is_covered_a_board_may_be_of_either_pattern(legacy):
+    """It is refused. Where that end is out of view, it is the pattern that was asked for."""
+    board, other = of_either_pattern(legacy)
+    K = torch.tensor([[500.0, 0, 159.5], [0, 500.0, 119.5], [0, 0, 1]], dtype=torch.float64)
+    t = torch.tensor([-70.0, -40.0, 280.0], dtype=torch.float64)
+    camera = dp.Camera(K, size=(320, 240)).at(torch.eye(3, dtype=torch.float64), t)
+    photo = photographed(camera, board)
+    column = 6 if legacy else 1
+    hand = np.array([[column * 20.0 + step, 10.0 * row] for row in range(9) for step in (-5, 5, 15)])
+    hand = covered(photo, camera, hand if legacy else hand - [10, 0], 18)
+    for asked in (board, other):
+        with pytest.raises(dp.BoardNotFoundError, match=r"may as well be of the (legacy|ordinary) pattern"):
+            dp.detect(hand, asked)
+    cut = photo[:, :235] if legacy else photo[:, 85:]
+    found = dp.detect(cut, board)
+    assert not found.visible[0].reshape(3, 6)[:, -1 if legacy else 0].any()
+    truth = camera.project(board.points)[0] - torch.tensor([0 if legacy else 85, 0])
+    assert float((found.pixels[0] - truth)[found.visible[0]].norm(dim=-1).max()) < 0.2
+
+
+def test_markers_that_are_not_read_have_their_own_codes_where_corners_were_found():
+    """Of a grid of 5 x 4 tags, the first 4 columns have the corners of one of 4 x 4, and other tags."""
+    camera = camera_before(APRIL, 0, 24)
+    image = photographed(camera, APRIL)
+    corners = camera.project(APRIL.points)[0].numpy()
+    narrow = dp.AprilGrid(4, 4, tag=20.0, spacing=0.3)
+    assert not contradicted(image, APRIL, 2, corners)
+    assert contradicted(image, narrow, 2, corners.reshape(8, 10, 2)[:, :8].reshape(-1, 2))
+    nothing = np.full_like(corners, np.nan)
+    assert not contradicted(image, APRIL, 2, nothing)
+    ordinary = photographed(camera_before(CHARUCO, 3, 22), CHARUCO)
+    corners = camera_before(CHARUCO, 3, 22).project(CHARUCO.points)[0].numpy()
+    assert not contradicted(ordinary, CHARUCO, 1, corners)
+    assert contradicted(ordinary, LEGACY, 1, corners)
 
 
 @pytest.mark.parametrize(("given", "true"), [(0.2, 0.3), (0.5, 0.3), (0.3, 0.2), (0.25, 0.3)])
