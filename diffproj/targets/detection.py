@@ -63,7 +63,8 @@ def detect(
     A `CharucoBoard` or an `AprilGrid` is found by its markers, as much of it as is in view. Each corner is placed by
     fitting the whole print around it; corners that do not fit, or lie off the surface through their neighbours, are
     hidden (`Views.visible`). At least 6 must be visible, on two rows and two columns, or all of a board of 4. Each is
-    known by itself, however the board is turned.
+    known by itself, however the board is turned. A ChArUco board with an odd number of columns and an even one of rows
+    shows whether it is `legacy` by one end of its rows: where that is in view, but covered, it counts as not found.
 
     A `CircleGrid` is found as dark ellipses on a lattice, or light ones on dark, of which up to a quarter may be
     hidden; those that glare or a shadow draws aside are. The pixels are the middles of the ellipses; `calibrate` knows
