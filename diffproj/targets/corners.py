@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Float32, Int, Shaped
 
-from diffproj.targets.corner_fit import fit_corners
+from diffproj.targets.corner_fit import LARGEST, SMALLEST, fit_corners
 
 WINDOW = 0.30
 """Half the side of the window that brings a corner near its place, relative to the distance to its neighbour."""
@@ -25,8 +25,13 @@ WORSE = 1.25
 FAINT = 0.15
 """Least contrast, relative to the median of the view: glare drowns the rest."""
 
-VAGUE = 0.15
-"""Standard deviation in px from which a corner is doubted."""
+VAGUE, VAGUEST = 0.15, 0.5
+"""Standard deviations in px from which a corner is doubted, unless its whole view is vague, and from which none is
+taken: the corners of a vague view may be so far off their neighbours' surface, root mean square."""
+
+WIDE, ROOM = 1 / 6, 1.2
+"""Blur relative to the largest disc's radius from which a wider one is asked for, and how much wider a disc
+the squares must have room for."""
 
 LOOSE, TIGHT = (0.06, 0.15), (0.006, 0.1)
 """Distances from where neighbours put a corner from which it is doubted, for corners that look as good as the others
@@ -63,12 +68,14 @@ class Corners(NamedTuple):
             instead of 0.86 to 1.11.
         visible: `(rows, columns)`, false where something hides the corner.
         misfit: the median over the corners; above a third, it is no chessboard.
+        vague: whether it looks like a board, and its corners stay so uncertain that too few are left.
     """
 
     grid: Float[np.ndarray, "rows columns 2"]
     sigma: Float[np.ndarray, "rows columns"]
     visible: Bool[np.ndarray, "rows columns"]
     misfit: float
+    vague: bool = False
 
     def is_board(self) -> bool:
         """Whether enough of it proves to be a board: half of all corners, and half of those along each side."""
@@ -82,12 +89,60 @@ def refine_grid(image: Shaped[np.ndarray, "h w"], rough: Float[np.ndarray, "rows
     A corner is doubted where four alternating sectors do not explain the grey values around it, or where it lies off
     the smooth surface through its neighbours, of third degree in row and column, which no lens and no tilt fools.
 
+    Within a disc that is hardly wider than the blur, a shift of the corner looks as a gradient of the light does. Where
+    the blur asks for a wider disc, and the squares have room for it, all this is done in a copy of half the size, whose
+    pixels tell as much of such an image, and so on.
+
     Args:
         image: `(H, W)`, uint8 or float32.
         rough: `(rows, columns, 2)` px, to within a third of a square; NaN where a corner was not found.
     """
     known = np.isfinite(rough[..., 0])
     start = rough if known.all() else np.where(known[..., None], rough, predicted(rough, known).grid)
+    found, blur = _refined(image, start, known)
+    scale = 1
+    while blur > WIDE * LARGEST and _has_room(spacing_of(start) / scale):
+        scale *= 2
+        image = _halved(image)
+        found, blur = _refined(image, (start + 0.5) / scale - 0.5, known)
+        found = found._replace(grid=(found.grid + 0.5) * scale - 0.5, sigma=found.sigma * scale)
+    shown = _settled(found)
+    settled = found._replace(grid=np.where(shown[..., None], found.grid, np.nan), visible=shown)
+    return settled._replace(vague=found.is_board() and not settled.is_board())
+
+
+def _settled(found: Corners) -> Bool[np.ndarray, "rows columns"]:
+    """Which visible corners are known well enough: none of a view that is vague and whose corners scatter as much.
+
+    The grey values' noise alone does not tell how far vague corners stray, their neighbours do.
+    """
+    shown = found.visible & (found.sigma < VAGUEST)
+    if shown.sum() < FEWEST or _median(found.sigma[shown]) < VAGUE:
+        return shown
+    surface = predicted(found.grid, shown)
+    off = np.where(shown, _lengths(np.where(shown[..., None], found.grid - surface.grid, 0.0)), 0.0) / surface.spread
+    shown &= off < np.maximum(3 * VAGUEST, LOOSE[0] * spacing_of(surface.grid))
+    return shown & bool((off[shown] ** 2).sum() < 2 * VAGUEST**2 * shown.sum())
+
+
+def _has_room(spacing: Float[np.ndarray, "rows columns"]) -> bool:
+    """Whether neighbours are so far apart that discs wider than the largest hold but one corner each."""
+    return REACH * _median(spacing.ravel()) > ROOM * LARGEST and bool(REACH * spacing.min() > 2 * SMALLEST)
+
+
+def _halved(image: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "_h _w"]:
+    """The means of 2 x 2 pixels, unrounded; an odd last row or column is left out."""
+    height, width = (side // 2 for side in image.shape)
+    whole = image[: 2 * height, : 2 * width].astype(np.float32)
+    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _refined(
+    image: Shaped[np.ndarray, "h w"],
+    start: Float[np.ndarray, "rows columns 2"],
+    known: Bool[np.ndarray, "rows columns"],
+) -> tuple[Corners, float]:
+    """`refine_grid` in the image as it is, and the usual blur in px."""
     everywhere = np.ones_like(known)
     fit = _fitted(image, start, everywhere, REACH)
     good = _trusted(image, fit, known)
@@ -101,7 +156,8 @@ def refine_grid(image: Shaped[np.ndarray, "h w"], rough: Float[np.ndarray, "rows
             *(np.where(good, old, new) for old, new in zip(fit[1:], tried[1:], strict=True)),
         )
         good = _trusted(image, fit, everywhere)
-    return Corners(np.where(good[..., None], fit.grid, np.nan), fit.sigma, good, _median(fit.misfit.ravel()))
+    hidden = np.where(good[..., None], fit.grid, np.nan)
+    return Corners(hidden, fit.sigma, good, _median(fit.misfit.ravel())), _median(fit.blur.ravel())
 
 
 class _Fit(NamedTuple):
@@ -111,6 +167,7 @@ class _Fit(NamedTuple):
     misfit: Float[np.ndarray, "rows columns"]
     contrast: Float[np.ndarray, "rows columns"]
     sigma: Float[np.ndarray, "rows columns"]
+    blur: Float[np.ndarray, "rows columns"]
 
 
 class Prediction(NamedTuple):
@@ -201,7 +258,7 @@ def _trusted(
     One that looks as good as its fellows is held to its neighbours loosely, so that no lens fools the test: only
     another crossing looks as good. One that looks worse may be drawn aside by an edge nearby, and is held tightly.
     """
-    grid, misfit, contrast, sigma = fit
+    grid, misfit, contrast, sigma, _ = fit
     usual = _median(misfit[known])
     # Dark and light change places from one corner to the next.
     contrast = contrast * (1 - 2 * (np.indices(contrast.shape).sum(axis=0) % 2))
@@ -240,7 +297,7 @@ def _fitted(
     near = _brought_near(image, start[which], spacing)
     angles = np.stack([_directions(start)[which], _directions(start.swapaxes(0, 1)).T[which]], axis=-1)
     found = fit_corners(image, near, angles, spacing, reach)
-    fit = _Fit(start.copy(), *(np.zeros(which.shape) for _ in range(3)))
+    fit = _Fit(start.copy(), *(np.zeros(which.shape) for _ in range(4)))
     for whole, part in zip(fit, found, strict=True):
         whole[which] = part
     return fit

@@ -56,6 +56,10 @@ def _chessboard(image: Shaped[np.ndarray, "h w"], board: Chessboard) -> Found:
     if pattern.grid is None:
         return Found(None, pattern.seen)
     refined = refine_grid(image, pattern.grid)
+    if refined.vague:
+        return Found(
+            None, hint="one too blurred for its corners to be placed: take it in focus, camera and board at rest"
+        )
     if not refined.is_board():
         return Found(None)
     return Found(in_order(refined.grid, image, board), board.size)
