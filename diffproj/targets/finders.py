@@ -15,6 +15,7 @@ from diffproj.targets.corners import refine_grid
 from diffproj.targets.images import as_8_bit
 from diffproj.targets.marked import find_marked, shows_rather
 from diffproj.targets.numbering import in_order
+from diffproj.targets.repeated import largest
 from diffproj.targets.search import find_pattern
 
 OTHER_SPACING = 0.15
@@ -30,6 +31,7 @@ class Found(NamedTuple):
         hint: what is there instead of another board, and what to give then; empty for nothing.
         size: `(width, height)` of the photograph, which who reads it fills in.
         beside: what else was made of the photograph.
+        again: whether the board is seen elsewhere in it as well; the larger one was taken.
     """
 
     grid: Float[np.ndarray, "rows columns 2"] | None
@@ -37,6 +39,7 @@ class Found(NamedTuple):
     hint: str = ""
     size: tuple[int, int] = (0, 0)
     beside: object = None
+    again: bool = False
 
 
 def find(image: Shaped[np.ndarray, "h w"], target: Board) -> Found:
@@ -46,8 +49,8 @@ def find(image: Shaped[np.ndarray, "h w"], target: Board) -> Found:
     if isinstance(target, AprilGrid):
         return _april_grid(image, target)
     if isinstance(target, CircleGrid):
-        centres = find_circles(image, as_8_bit(image), target)
-        return Found(None if centres is None else centres.reshape(*target.shape, 2))
+        taken = find_circles(image, as_8_bit(image), target)
+        return Found(None) if taken is None else Found(taken.points.reshape(*target.shape, 2), again=taken.again)
     return _charuco(image, target)
 
 
@@ -55,26 +58,28 @@ def _chessboard(image: Shaped[np.ndarray, "h w"], board: Chessboard) -> Found:
     pattern = find_pattern(as_8_bit(image), board)
     if pattern.grid is None:
         return Found(None, pattern.seen)
-    refined = refine_grid(image, pattern.grid)
-    if refined.vague:
+    refined = [refine_grid(image, grid) for grid in (pattern.grid, *pattern.others)]
+    taken = largest([one.grid.reshape(-1, 2) for one in refined if one.is_board()])
+    if taken is not None:
+        grid = taken.points.reshape(board.rows, board.columns, 2)
+        return Found(in_order(grid, image, board), board.size, again=taken.again)
+    if any(one.vague for one in refined):
         return Found(
             None, hint="one too blurred for its corners to be placed: take it in focus, camera and board at rest"
         )
-    if not refined.is_board():
-        return Found(None)
-    return Found(in_order(refined.grid, image, board), board.size)
+    return Found(None)
 
 
 def _april_grid(image: Shaped[np.ndarray, "h w"], board: AprilGrid) -> Found:
-    corners = find_marked(image, as_8_bit(image), board)
-    if corners is None:
+    taken = find_marked(image, as_8_bit(image), board)
+    if taken is None:
         return Found(None)
-    grid = corners.reshape(*board.shape, 2)
+    grid = taken.points.reshape(*board.shape, 2)
     # Tags are read whatever their distance is said to be: their corners tell what it is.
     spacing = _spacing_of(grid)
     if abs(spacing - board.spacing) > OTHER_SPACING * board.spacing:
         return Found(None, hint=f"one whose tags stand {spacing:.2f} of their side apart: give spacing={spacing:.2f}")
-    return Found(grid)
+    return Found(grid, again=taken.again)
 
 
 def _spacing_of(grid: Float[np.ndarray, "rows columns 2"]) -> float:
@@ -90,13 +95,13 @@ def _spacing_of(grid: Float[np.ndarray, "rows columns 2"]) -> float:
 
 def _charuco(image: Shaped[np.ndarray, "h w"], board: CharucoBoard) -> Found:
     grey = as_8_bit(image)
-    corners = find_marked(image, grey, board)
+    taken = find_marked(image, grey, board)
     other = with_other_start(board)
     # With an odd number of columns most markers stand to each other alike on both, one square further on: those at the
     # ends of rows tell which it is. Where none of them is in view, it is the one that was asked for.
     alike = other if board.columns % 2 == 1 else None
-    if corners is not None and not (alike is not None and shows_rather(grey, alike, board)):
-        return Found(corners.reshape(*board.shape, 2))
+    if taken is not None and not (alike is not None and shows_rather(grey, alike, board)):
+        return Found(taken.points.reshape(*board.shape, 2), again=taken.again)
     if other is not None and find_marked(image, grey, other) is not None:
         kind = "legacy" if other.legacy else "ordinary"
         return Found(None, hint=f"one of the {kind} pattern: give legacy={other.legacy}")

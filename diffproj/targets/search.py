@@ -45,10 +45,12 @@ class Pattern(NamedTuple):
     Attributes:
         grid: `(rows, columns, 2)` px, to a pixel or so; NaN where a corner is hidden. None where no board fits.
         seen: `(columns, rows)` of the largest pattern in the photograph where no board fits; (0, 0) for none.
+        others: further patterns of the board's size, elsewhere.
     """
 
     grid: Float[np.ndarray, "rows columns 2"] | None
     seen: tuple[int, int] = (0, 0)
+    others: tuple[Float[np.ndarray, "rows columns 2"], ...] = ()
 
 
 def find_pattern(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Pattern:
@@ -57,7 +59,7 @@ def find_pattern(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Pattern:
     Copies of several sizes are searched for patterns of saddle points: one of at most 550 px, which shows most boards,
     then one of twice its size, one of half of it for blurred photographs, and larger ones for small boards. This takes
     a fraction of a second where nothing is found. Where a part of a pattern is found, but no board, OpenCV's two
-    detectors are asked as well.
+    detectors are asked as well. All patterns of the copy that shows the board may be boards.
     """
     if min(image.shape) < NARROWEST:
         return Pattern(None)
@@ -69,21 +71,26 @@ def find_pattern(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Pattern:
         found is not None
         and extent_of(coarse[0]) == (max(board.size), min(board.size))
         and _is_plain(found, image, half)
+        and not any(_telling(other, board) for other in coarse[1:])
     ):
         return Pattern(found)
     seen, partial, other_boards = (0, 0), None, []
     for patterns in itertools.chain((_patterns(first, image), coarse), _further_patterns(first, image)):
+        boards = []
         for pattern in patterns:
             found = matched(pattern, board)
             # Of another board, another copy may show no more, or no less, than what looks like this one.
             if found is not None and not any(_shadows(other, pattern) for other in other_boards):
-                return Pattern(found)
+                boards.append(found)
+                continue
             extent = extent_of(pattern)
             if _larger(extent, board):
                 other_boards.append(pattern)
             if extent[0] * extent[1] > seen[0] * seen[1]:
                 seen, partial = extent, pattern
-    if partial is None or np.isfinite(partial[..., 0]).sum() < HINT * len(board) or _is_other(seen, partial, board):
+        if boards:
+            return Pattern(boards[0], others=tuple(boards[1:]))
+    if partial is None or not _telling(partial, board) or _is_other(seen, partial, board):
         return Pattern(None, seen)
     return Pattern(_by_opencv(image, partial, board), seen)
 
@@ -93,6 +100,11 @@ def _patterns(small: UInt8[np.ndarray, "h w"], image: UInt8[np.ndarray, "H W"]) 
     saddles = saddle_points(small)
     grids = [_carried(as_grid(cells, saddles.points), small, image) for cells in lattices(saddles)]
     return sorted((grid for grid in grids if _spacing(grid) >= FINEST), key=_area, reverse=True)
+
+
+def _telling(pattern: Float[np.ndarray, "r c 2"], board: Chessboard) -> bool:
+    """Whether enough of a pattern is seen for a larger copy to be asked what it is."""
+    return bool(np.isfinite(pattern[..., 0]).sum() >= HINT * len(board))
 
 
 def _is_plain(
