@@ -15,7 +15,7 @@ from diffproj.targets.corners import refine_grid
 from diffproj.targets.images import as_8_bit
 from diffproj.targets.marked import find_marked, shows_rather
 from diffproj.targets.numbering import in_order
-from diffproj.targets.repeated import largest
+from diffproj.targets.repeated import covered
 from diffproj.targets.search import find_pattern
 
 OTHER_SPACING = 0.15
@@ -58,16 +58,13 @@ def _chessboard(image: Shaped[np.ndarray, "h w"], board: Chessboard) -> Found:
     pattern = find_pattern(as_8_bit(image), board)
     if pattern.grid is None:
         return Found(None, pattern.seen)
-    refined = [refine_grid(image, grid) for grid in (pattern.grid, *pattern.others)]
-    taken = largest([one.grid.reshape(-1, 2) for one in refined if one.is_board()])
-    if taken is not None:
-        grid = taken.points.reshape(board.rows, board.columns, 2)
-        return Found(in_order(grid, image, board), board.size, again=taken.again)
-    if any(one.vague for one in refined):
-        return Found(
-            None, hint="one too blurred for its corners to be placed: take it in focus, camera and board at rest"
-        )
-    return Found(None)
+    patterns = [refine_grid(image, grid) for grid in (pattern.grid, *pattern.others)]
+    boards = [one for one in patterns if one.is_board()]
+    if not boards:
+        blurred = "one too blurred for its corners to be placed: take it in focus, camera and board at rest"
+        return Found(None, hint=blurred if any(one.vague for one in patterns) else "")
+    refined = max(boards, key=lambda one: covered(one.grid.reshape(-1, 2)))
+    return Found(in_order(refined.grid, image, board), board.size, again=len(boards) > 1)
 
 
 def _april_grid(image: Shaped[np.ndarray, "h w"], board: AprilGrid) -> Found:

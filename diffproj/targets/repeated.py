@@ -21,10 +21,10 @@ class Taken(NamedTuple):
 
 def largest(boards: list[Float[np.ndarray, "n 2"]]) -> Taken | None:
     """The one that covers most of the photograph, of those that were found in it; None of none."""
-    return Taken(max(boards, key=_covered), len(boards) > 1) if boards else None
+    return Taken(max(boards, key=covered), len(boards) > 1) if boards else None
 
 
-def _covered(points: Float[np.ndarray, "n 2"]) -> float:
+def covered(points: Float[np.ndarray, "n 2"]) -> float:
     """The area in px around the points that are seen."""
     seen = points[np.isfinite(points[:, 0])].astype(np.float32)
     return float(cv2.contourArea(cv2.convexHull(seen))) if len(seen) > 2 else 0.0

@@ -71,9 +71,11 @@ def find_pattern(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Pattern:
         found is not None
         and extent_of(coarse[0]) == (max(board.size), min(board.size))
         and _is_plain(found, image, half)
-        and not any(_telling(other, board) for other in coarse[1:])
     ):
-        return Pattern(found)
+        # A smaller board beside it may have lost corners in this copy.
+        beside = any(_telling(other, board) for other in coarse[1:])
+        boards = [matched(pattern, board) for pattern in _patterns(first, image)] if beside else []
+        return Pattern(found, others=tuple(one for one in boards if one is not None and not _same(one, found)))
     seen, partial, other_boards = (0, 0), None, []
     for patterns in itertools.chain((_patterns(first, image), coarse), _further_patterns(first, image)):
         boards = []
@@ -100,6 +102,12 @@ def _patterns(small: UInt8[np.ndarray, "h w"], image: UInt8[np.ndarray, "H W"]) 
     saddles = saddle_points(small)
     grids = [_carried(as_grid(cells, saddles.points), small, image) for cells in lattices(saddles)]
     return sorted((grid for grid in grids if _spacing(grid) >= FINEST), key=_area, reverse=True)
+
+
+def _same(one: Float[np.ndarray, "r c 2"], other: Float[np.ndarray, "r c 2"]) -> bool:
+    """Whether two patterns of one size are in one place."""
+    apart = np.nanmean(one, axis=(0, 1)) - np.nanmean(other, axis=(0, 1))
+    return float(np.hypot(*apart)) < _spacing(other)
 
 
 def _telling(pattern: Float[np.ndarray, "r c 2"], board: Chessboard) -> bool:

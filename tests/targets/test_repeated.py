@@ -66,3 +66,11 @@ def test_another_board_is_no_repetition():
         photographed(camera_before(one, 7, side, tilt_deg=15), one) for one, side in ((board, large), (other, small))
     ]
     assert dp.detect(np.hstack(shown), board).visible.all()
+
+
+def test_a_double_that_a_small_copy_shows_in_part_is_seen():
+    """The larger board is found in a copy of half the size, in which the other has squares of 5 px and falls apart."""
+    board, large, _ = BOARDS["chessboard"]
+    with pytest.warns(UserWarning, match="seen more than once"):
+        views = dp.detect(side_by_side(board, (large, 10)), board)
+    assert bool((views.pixels[..., 0] < SIZE[0]).all())
