@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Shaped
 
-from diffproj.targets.corner_fit import LARGEST, SMALLEST, fit_corners
+from diffproj.targets.corner_fit import LARGEST, fit_corners
 
 WINDOW = 0.30
 """Half the side of the window that brings a corner near its place, relative to the distance to its neighbour."""
@@ -29,9 +29,9 @@ VAGUE, VAGUEST = 0.15, 0.5
 """Standard deviations in px from which a corner is doubted, unless its whole view is vague, and from which none is
 taken: the corners of a vague view may be so far off their neighbours' surface, root mean square."""
 
-WIDE, ROOM = 1 / 6, 1.2
-"""Blur relative to the largest disc's radius from which a wider one is asked for, and how much wider a disc
-the squares must have room for."""
+WIDE, WIDEST, ROOM = 1 / 6, 1 / 3, 1.2
+"""Blur relative to the largest disc's radius from which a wider one is asked for, and up to which the disc contains it;
+and how much wider a disc the squares must have room for."""
 
 LOOSE, TIGHT = (0.06, 0.15), (0.006, 0.1)
 """Distances from where neighbours put a corner from which it is doubted, for corners that look as good as the others
@@ -90,8 +90,8 @@ def refine_grid(image: Shaped[np.ndarray, "h w"], rough: Float[np.ndarray, "rows
     the smooth surface through its neighbours, of third degree in row and column, which no lens and no tilt fools.
 
     Within a disc that is hardly wider than the blur, a shift of the corner looks as a gradient of the light does. Where
-    the blur asks for a wider disc, and the squares have room for it, all this is done in a copy of half the size, whose
-    pixels tell as much of such an image, and so on.
+    the blur asks for a wider disc, and the squares have room for it, corners are taken from a copy of half the size,
+    whose pixels tell as much of such an image, and so on.
 
     Args:
         image: `(H, W)`, uint8 or float32.
@@ -100,34 +100,57 @@ def refine_grid(image: Shaped[np.ndarray, "h w"], rough: Float[np.ndarray, "rows
     known = np.isfinite(rough[..., 0])
     start = rough if known.all() else np.where(known[..., None], rough, predicted(rough, known).grid)
     found, blur = _refined(image, start, known)
-    scale = 1
-    while blur > WIDE * LARGEST and _has_room(spacing_of(start) / scale):
+    spacing, scale = spacing_of(start), 1
+    while _is_wide(blur, room := REACH * spacing > ROOM * LARGEST * scale):
+        contained = found.visible & (blur < WIDEST * LARGEST)
         scale *= 2
         image = _halved(image)
-        found, blur = _refined(image, (start + 0.5) / scale - 0.5, known)
-        found = found._replace(grid=(found.grid + 0.5) * scale - 0.5, sigma=found.sigma * scale)
-    shown = _settled(found)
+        wider, blur = _refined(image, (start + 0.5) / scale - 0.5, known)
+        wider = wider._replace(grid=(wider.grid + 0.5) * scale - 0.5, sigma=wider.sigma * scale)
+        # What a wider disc reaches, such as the board's edge seen steeply, may hide a corner that one before shows.
+        found = _joined(np.where(wider.visible, room | ~found.visible, room & ~contained), wider, found)
+    shown = _settled(found, scale > 1)
     settled = found._replace(grid=np.where(shown[..., None], found.grid, np.nan), visible=shown)
     return settled._replace(vague=found.is_board() and not settled.is_board())
 
 
-def _settled(found: Corners) -> Bool[np.ndarray, "rows columns"]:
-    """Which visible corners are known well enough: none of a view that is vague and whose corners scatter as much.
+def _settled(found: Corners, blurred: bool) -> Bool[np.ndarray, "rows columns"]:
+    """Which visible corners are known well enough: none of a view, vague or blurred, whose corners scatter by more.
 
-    The grey values' noise alone does not tell how far vague corners stray, their neighbours do.
+    The grey values' noise alone does not tell how far the corners of such a view stray, their neighbours do: by the
+    surface through them on the board's plane, where a steep view is as smooth as any. Along the board's sides it misses
+    even corners without error where a lens bends strongly.
     """
     shown = found.visible & (found.sigma < VAGUEST)
-    if shown.sum() < FEWEST or _median(found.sigma[shown]) < VAGUE:
+    if shown.sum() < FEWEST or not (blurred or _median(found.sigma[shown]) > VAGUE):
         return shown
-    surface = predicted(found.grid, shown)
-    off = np.where(shown, _lengths(np.where(shown[..., None], found.grid - surface.grid, 0.0)), 0.0) / surface.spread
-    shown &= off < np.maximum(3 * VAGUEST, LOOSE[0] * spacing_of(surface.grid))
-    return shown & bool((off[shown] ** 2).sum() < 2 * VAGUEST**2 * shown.sum())
+    cells = np.indices(shown.shape)[::-1].transpose(1, 2, 0).astype(float)
+    ahead, _ = cv2.findHomography(cells[shown], found.grid[shown])
+    if ahead is None:
+        return shown & False
+    known = np.where(shown[..., None], found.grid, found.grid[shown].mean(axis=0))
+    surface = predicted(cv2.perspectiveTransform(known, np.linalg.inv(ahead)), shown)
+    there = cv2.perspectiveTransform(surface.grid, ahead)
+    off = np.where(shown, _lengths(known - there), 0.0) / surface.spread
+    inner = np.pad(shown[1:-1, 1:-1], 1)
+    inner = inner if inner.sum() >= 4 else shown
+    most = np.maximum(3 * VAGUEST, LOOSE[0] * spacing_of(there))
+    settled = (np.minimum(off, most)[inner] ** 2).sum() < 2 * VAGUEST**2 * inner.sum()
+    return shown & ~(inner & (off > most)) & bool(settled)
 
 
-def _has_room(spacing: Float[np.ndarray, "rows columns"]) -> bool:
-    """Whether neighbours are so far apart that discs wider than the largest hold but one corner each."""
-    return REACH * _median(spacing.ravel()) > ROOM * LARGEST and bool(REACH * spacing.min() > 2 * SMALLEST)
+def _is_wide(blur: Float[np.ndarray, "rows columns"], room: Bool[np.ndarray, "rows columns"]) -> bool:
+    """Whether the usual blur, where neighbours leave room for a wider disc than the largest, asks for one."""
+    return bool(room.any()) and _median(blur[room]) > WIDE * LARGEST
+
+
+def _joined(which: Bool[np.ndarray, "rows columns"], these: Corners, others: Corners) -> Corners:
+    """Some corners of the one, and the rest of the others."""
+    return these._replace(
+        grid=np.where(which[..., None], these.grid, others.grid),
+        sigma=np.where(which, these.sigma, others.sigma),
+        visible=np.where(which, these.visible, others.visible),
+    )
 
 
 def _halved(image: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "_h _w"]:
@@ -141,8 +164,8 @@ def _refined(
     image: Shaped[np.ndarray, "h w"],
     start: Float[np.ndarray, "rows columns 2"],
     known: Bool[np.ndarray, "rows columns"],
-) -> tuple[Corners, float]:
-    """`refine_grid` in the image as it is, and the usual blur in px."""
+) -> tuple[Corners, Float[np.ndarray, "rows columns"]]:
+    """`refine_grid` in the image as it is, and the blur in px."""
     everywhere = np.ones_like(known)
     fit = _fitted(image, start, everywhere, REACH)
     good = _trusted(image, fit, known)
@@ -157,7 +180,7 @@ def _refined(
         )
         good = _trusted(image, fit, everywhere)
     hidden = np.where(good[..., None], fit.grid, np.nan)
-    return Corners(hidden, fit.sigma, good, _median(fit.misfit.ravel())), _median(fit.blur.ravel())
+    return Corners(hidden, fit.sigma, good, _median(fit.misfit.ravel())), fit.blur
 
 
 class _Fit(NamedTuple):

@@ -252,3 +252,18 @@ def test_no_corner_of_a_view_that_is_vague_throughout_is_taken_on_trust():
     found = refine_grid(noisy(sharp, 25), truth)
     assert found.is_board()
     assert not found.vague
+
+
+def test_a_blurred_view_from_the_side_through_a_bending_lens_keeps_its_corners():
+    """Their neighbours' surface misses corners along the board's sides by half a pixel, root mean square."""
+    board = Chessboard(9, 6, 1.0)
+    steep = dp.rotation_from_euler(*torch.tensor((0.95, 0.6, 0.3), dtype=D))
+    t = torch.tensor([0, 0, 7.5], dtype=D) - steep @ board.points.mean(0)
+    K = torch.tensor([[500.0, 0, 399.5], [0, 500.0, 299.5], [0, 0, 1]], dtype=D)
+    lens = dp.BrownConrady(torch.tensor([-0.3, 0.08, 0.0, 0.0, 0.0], dtype=D))
+    camera = dp.Camera(K, distortion=lens, size=(800, 600)).at(steep, t)
+    truth = camera.project(board.points)[0].numpy().reshape(6, 9, 2)
+    image = noisy(smeared(photograph(camera, board, noise=0.0).numpy(), 12, 30), 2.5)
+    found = refine_grid(image, truth)
+    assert found.visible.all()
+    assert np.linalg.norm(found.grid - truth, axis=-1).max() < 0.7
