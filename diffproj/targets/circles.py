@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, Shaped, UInt8
 
 from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.ellipses import Ellipses, dark_ellipses, fit_ellipses
+from diffproj.targets.repeated import Taken, largest
 from diffproj.targets.surface import Limits, off_surface
 
 WHOLE, FULL = 0.75, 0.5
@@ -58,10 +59,8 @@ _BASES = [
 """Bases of a lattice of whole numbers: seen at a slant, its nearest points need not be those along rows and columns."""
 
 
-def find_circles(
-    image: Shaped[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], board: CircleGrid
-) -> Float[np.ndarray, "n 2"] | None:
-    """The middles of the circles' images in px, in the board's order, NaN where hidden; None where it is not there.
+def find_circles(image: Shaped[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], board: CircleGrid) -> Taken | None:
+    """The middles of the circles' images in px, in the board's order; None where it is not there.
 
     They may be light on dark as well. Of orders that look alike, the one whose first circle is nearest the image's top
     left.
@@ -78,10 +77,10 @@ def find_circles(
             ellipses = Ellipses((found.centres + 0.5) * scale - 0.5, found.axes / scale)
             if len(ellipses.centres) < WHOLE * len(board):
                 continue
-            numbers = _numbered(ellipses, board)
-            middles = None if numbers is None else _refined(whole, ellipses, numbers, board)
-            if middles is not None:
-                return middles
+            refined = [_refined(whole, ellipses, numbers, board) for numbers in _numbered(ellipses, board)]
+            taken = largest([middles for middles in refined if middles is not None])
+            if taken is not None:
+                return taken
     return None
 
 
@@ -95,12 +94,13 @@ def _copies(grey: UInt8[np.ndarray, "h w"]) -> Iterator[UInt8[np.ndarray, "_h _w
     yield cv2.resize(first, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
 
 
-def _numbered(ellipses: Ellipses, board: CircleGrid) -> Int[np.ndarray, " n"] | None:
-    """Which ellipse is which circle, -1 for none; None where they are not the board."""
+def _numbered(ellipses: Ellipses, board: CircleGrid) -> Iterator[Int[np.ndarray, " n"]]:
+    """Which ellipse is which circle, -1 for none, for each board that they show, each in places of its own."""
     places = board.places
     steps = _lattice_places(board)
+    taken: set[int] = set()
     for cells in _lattices(ellipses):
-        if len(cells) < WHOLE * len(board):
+        if len(cells) < WHOLE * len(board) or not taken.isdisjoint(cells.values()):
             continue
         candidates = []
         nodes, which = np.array(list(cells)), np.array(list(cells.values()))
@@ -122,8 +122,8 @@ def _numbered(ellipses: Ellipses, board: CircleGrid) -> Int[np.ndarray, " n"] | 
                 orders.append((float(np.linalg.norm(_first(places, seen))), order))
         # With a side's circles hidden, an asymmetric grid may look like itself turned: then nobody knows which it is.
         if orders and all(_alike(order, orders[0][1], board) for _, order in orders):
-            return min(orders, key=lambda pair: pair[0])[1]
-    return None
+            taken.update(cells.values())
+            yield min(orders, key=lambda pair: pair[0])[1]
 
 
 def _alike(order: Int[np.ndarray, " n"], other: Int[np.ndarray, " n"], board: CircleGrid) -> bool:

@@ -54,12 +54,14 @@ class Fitted(NamedTuple):
         contrast: `(N,)`, half the step from dark to light; positive where the two edges' sides, both to the left or
             both to the right, are light.
         sigma: `(N,)` px, standard deviation of a coordinate as the grey values' scatter implies it.
+        blur: `(N,)` px, standard deviation of the blur.
     """
 
     corners: Float[np.ndarray, "n 2"]
     misfit: Float[np.ndarray, " n"]
     contrast: Float[np.ndarray, " n"]
     sigma: Float[np.ndarray, " n"]
+    blur: Float[np.ndarray, " n"]
 
 
 def fit_corners(
@@ -134,7 +136,7 @@ def _fit_block(
     moved = base + edges[:, :2]
     failed = ~np.isfinite(misfit) | ~(np.linalg.norm(moved - corners, axis=-1) <= 0.7 * radius)
     moved = np.where(failed[:, None], corners, moved)
-    return Fitted(moved, np.where(failed, np.inf, misfit), solution[:, _CONTRAST], sigma)
+    return Fitted(moved, np.where(failed, np.inf, misfit), solution[:, _CONTRAST], sigma, edges[:, 4])
 
 
 def _judged(

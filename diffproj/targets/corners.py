@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Float32, Int, Shaped
 
-from diffproj.targets.corner_fit import fit_corners
+from diffproj.targets.corner_fit import LARGEST, fit_corners
 
 WINDOW = 0.30
 """Half the side of the window that brings a corner near its place, relative to the distance to its neighbour."""
@@ -25,8 +25,13 @@ WORSE = 1.25
 FAINT = 0.15
 """Least contrast, relative to the median of the view: glare drowns the rest."""
 
-VAGUE = 0.15
-"""Standard deviation in px from which a corner is doubted."""
+VAGUE, VAGUEST = 0.15, 0.5
+"""Standard deviations in px from which a corner is doubted, unless its whole view is vague, and from which none is
+taken: the corners of a vague view may be so far off their neighbours' surface, root mean square."""
+
+WIDE, WIDEST, ROOM = 1 / 6, 1 / 3, 1.2
+"""Blur relative to the largest disc's radius from which a wider one is asked for, and up to which the disc contains it;
+and how much wider a disc the squares must have room for."""
 
 LOOSE, TIGHT = (0.06, 0.15), (0.006, 0.1)
 """Distances from where neighbours put a corner from which it is doubted, for corners that look as good as the others
@@ -65,6 +70,7 @@ class Corners(NamedTuple):
         misfit: the median over the corners; above a third, it is no chessboard.
         begins_dark: whether the square between the first four corners is dark. Each visible corner by itself shows
             which of the squares around it are, and all of them agree: one that does not is hidden.
+        vague: whether it looks like a board, and its corners stay so uncertain that too few are left.
     """
 
     grid: Float[np.ndarray, "rows columns 2"]
@@ -72,6 +78,7 @@ class Corners(NamedTuple):
     visible: Bool[np.ndarray, "rows columns"]
     misfit: float
     begins_dark: bool
+    vague: bool = False
 
     def is_board(self) -> bool:
         """Whether enough of it proves to be a board: half of all corners, and half of those along each side."""
@@ -85,12 +92,84 @@ def refine_grid(image: Shaped[np.ndarray, "h w"], rough: Float[np.ndarray, "rows
     A corner is doubted where four alternating sectors do not explain the grey values around it, or where it lies off
     the smooth surface through its neighbours, of third degree in row and column, which no lens and no tilt fools.
 
+    Within a disc that is hardly wider than the blur, a shift of the corner looks as a gradient of the light does. Where
+    the blur asks for a wider disc, and the squares have room for it, corners are taken from a copy of half the size,
+    whose pixels tell as much of such an image, and so on.
+
     Args:
         image: `(H, W)`, uint8 or float32.
         rough: `(rows, columns, 2)` px, to within a third of a square; NaN where a corner was not found.
     """
     known = np.isfinite(rough[..., 0])
     start = rough if known.all() else np.where(known[..., None], rough, predicted(rough, known).grid)
+    found, blur = _refined(image, start, known)
+    spacing, scale = spacing_of(start), 1
+    while _is_wide(blur, room := REACH * spacing > ROOM * LARGEST * scale):
+        contained = found.visible & (blur < WIDEST * LARGEST)
+        scale *= 2
+        image = _halved(image)
+        wider, blur = _refined(image, (start + 0.5) / scale - 0.5, known)
+        wider = wider._replace(grid=(wider.grid + 0.5) * scale - 0.5, sigma=wider.sigma * scale)
+        # What a wider disc reaches, such as the board's edge seen steeply, may hide a corner that one before shows.
+        found = _joined(np.where(wider.visible, room | ~found.visible, room & ~contained), wider, found)
+    shown = _settled(found, scale > 1)
+    settled = found._replace(grid=np.where(shown[..., None], found.grid, np.nan), visible=shown)
+    return settled._replace(vague=found.is_board() and not settled.is_board())
+
+
+def _settled(found: Corners, blurred: bool) -> Bool[np.ndarray, "rows columns"]:
+    """Which visible corners are known well enough: none of a view, vague or blurred, whose corners scatter by more.
+
+    The grey values' noise alone does not tell how far the corners of such a view stray, their neighbours do: by the
+    surface through them on the board's plane, where a steep view is as smooth as any. Along the board's sides it misses
+    even corners without error where a lens bends strongly.
+    """
+    shown = found.visible & (found.sigma < VAGUEST)
+    if shown.sum() < FEWEST or not (blurred or _median(found.sigma[shown]) > VAGUE):
+        return shown
+    cells = np.indices(shown.shape)[::-1].transpose(1, 2, 0).astype(float)
+    ahead, _ = cv2.findHomography(cells[shown], found.grid[shown])
+    if ahead is None:
+        return shown & False
+    known = np.where(shown[..., None], found.grid, found.grid[shown].mean(axis=0))
+    surface = predicted(cv2.perspectiveTransform(known, np.linalg.inv(ahead)), shown)
+    there = cv2.perspectiveTransform(surface.grid, ahead)
+    off = np.where(shown, _lengths(known - there), 0.0) / surface.spread
+    inner = np.pad(shown[1:-1, 1:-1], 1)
+    inner = inner if inner.sum() >= 4 else shown
+    most = np.maximum(3 * VAGUEST, LOOSE[0] * spacing_of(there))
+    settled = (np.minimum(off, most)[inner] ** 2).sum() < 2 * VAGUEST**2 * inner.sum()
+    return shown & ~(inner & (off > most)) & bool(settled)
+
+
+def _is_wide(blur: Float[np.ndarray, "rows columns"], room: Bool[np.ndarray, "rows columns"]) -> bool:
+    """Whether the usual blur, where neighbours leave room for a wider disc than the largest, asks for one."""
+    return bool(room.any()) and _median(blur[room]) > WIDE * LARGEST
+
+
+def _joined(which: Bool[np.ndarray, "rows columns"], these: Corners, others: Corners) -> Corners:
+    """Some corners of the one, and the rest of the others."""
+    return these._replace(
+        grid=np.where(which[..., None], these.grid, others.grid),
+        sigma=np.where(which, these.sigma, others.sigma),
+        visible=np.where(which, these.visible, others.visible),
+        begins_dark=these.begins_dark if these.visible.any() else others.begins_dark,
+    )
+
+
+def _halved(image: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "_h _w"]:
+    """The means of 2 x 2 pixels, unrounded; an odd last row or column is left out."""
+    height, width = (side // 2 for side in image.shape)
+    whole = image[: 2 * height, : 2 * width].astype(np.float32)
+    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _refined(
+    image: Shaped[np.ndarray, "h w"],
+    start: Float[np.ndarray, "rows columns 2"],
+    known: Bool[np.ndarray, "rows columns"],
+) -> tuple[Corners, Float[np.ndarray, "rows columns"]]:
+    """`refine_grid` in the image as it is, and the blur in px."""
     everywhere = np.ones_like(known)
     fit = _fitted(image, start, everywhere, REACH)
     good = _trusted(image, fit, known)
@@ -105,9 +184,8 @@ def refine_grid(image: Shaped[np.ndarray, "h w"], rough: Float[np.ndarray, "rows
         )
         good = _trusted(image, fit, everywhere)
     begins_dark = bool((_alternated(fit.contrast)[good] > 0).any())
-    return Corners(
-        np.where(good[..., None], fit.grid, np.nan), fit.sigma, good, _median(fit.misfit.ravel()), begins_dark
-    )
+    hidden = np.where(good[..., None], fit.grid, np.nan)
+    return Corners(hidden, fit.sigma, good, _median(fit.misfit.ravel()), begins_dark), fit.blur
 
 
 class _Fit(NamedTuple):
@@ -117,6 +195,7 @@ class _Fit(NamedTuple):
     misfit: Float[np.ndarray, "rows columns"]
     contrast: Float[np.ndarray, "rows columns"]
     sigma: Float[np.ndarray, "rows columns"]
+    blur: Float[np.ndarray, "rows columns"]
 
 
 class Prediction(NamedTuple):
@@ -207,7 +286,7 @@ def _trusted(
     One that looks as good as its fellows is held to its neighbours loosely, so that no lens fools the test: only
     another crossing looks as good. One that looks worse may be drawn aside by an edge nearby, and is held tightly.
     """
-    grid, misfit, contrast, sigma = fit
+    grid, misfit, contrast, sigma, _ = fit
     usual = _median(misfit[known])
     contrast = _alternated(contrast)
     contrast /= _median(contrast[known]) or 1.0
@@ -253,7 +332,7 @@ def _fitted(
     near = _brought_near(image, start[which], spacing)
     angles = np.stack([_directions(start)[which], _directions(start.swapaxes(0, 1)).T[which]], axis=-1)
     found = fit_corners(image, near, angles, spacing, reach)
-    fit = _Fit(start.copy(), *(np.zeros(which.shape) for _ in range(3)))
+    fit = _Fit(start.copy(), *(np.zeros(which.shape) for _ in range(4)))
     for whole, part in zip(fit, found, strict=True):
         whole[which] = part
     return fit

@@ -104,7 +104,8 @@ def detect(
     Returns:
         The views in which the board was found, in float64 pixels, named by their files (`"image 1"`, ... for arrays).
         Photographs without it are left out, each with a `BoardNotFoundWarning` that names it, and the size of a pattern
-        that is there instead.
+        that is there instead. Where the board is seen more than once, the one that covers most of the photograph is
+        taken, with a warning.
 
     Raises:
         BoardNotFoundError: no photograph shows the board.
@@ -208,6 +209,9 @@ def searched(
         if one.grid is None and _sharpness(photograph) is None:
             text = f"{_miss(photograph, one, target)}; photograph skipped"
             warnings.warn(text, BoardNotFoundWarning, stacklevel=stacklevel)
+    repeated = [photograph.label for photograph, one in pairs if one.again]
+    if repeated:
+        warnings.warn(_twice(repeated, target), stacklevel=stacklevel)
     seen = [photograph for photograph, _ in pairs]
     grids = [one.grid for _, one in pairs if one.grid is not None]
     grids = follow(grids, target) if isinstance(target, Chessboard | CircleGrid) else grids
@@ -281,6 +285,16 @@ def _miss(photograph: Photograph, found: Found, target: Board) -> str:
     if found.hint:
         return f"{text}, but {found.hint}"
     return text + (f", but a pattern with {found.seen[0]} x {found.seen[1]}" if _telling(found.seen) else "")
+
+
+def _twice(labels: list[str], target: Board) -> str:
+    """What is said of photographs in which the board is seen more than once."""
+    alone = isinstance(target, Chessboard | CircleGrid)
+    differ = "another number of squares or circles" if alone else "markers of other numbers"
+    return (
+        f"{_named(labels)}: the {target.title} is seen more than once; the one that covers most of the photograph was "
+        f"taken, which need not always be the same one: cover the others, crop them off, or give them {differ}"
+    )
 
 
 def _telling(seen: tuple[int, int]) -> bool:

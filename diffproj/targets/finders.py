@@ -15,6 +15,7 @@ from diffproj.targets.corners import refine_grid
 from diffproj.targets.images import as_8_bit
 from diffproj.targets.marked import find_marked, not_found
 from diffproj.targets.numbering import in_order
+from diffproj.targets.repeated import Taken, covered
 from diffproj.targets.search import find_pattern
 
 ENDS = 2
@@ -34,6 +35,7 @@ class Found(NamedTuple):
         hint: what is there instead of another board, and what to give then; empty for nothing.
         size: `(width, height)` of the photograph, which who reads it fills in.
         beside: what else was made of the photograph.
+        again: whether the board is seen elsewhere in it as well; the larger one was taken.
     """
 
     grid: Float[np.ndarray, "rows columns 2"] | None
@@ -41,6 +43,7 @@ class Found(NamedTuple):
     hint: str = ""
     size: tuple[int, int] = (0, 0)
     beside: object = None
+    again: bool = False
 
 
 def find(image: Shaped[np.ndarray, "h w"], target: Board) -> Found:
@@ -50,8 +53,8 @@ def find(image: Shaped[np.ndarray, "h w"], target: Board) -> Found:
     if isinstance(target, AprilGrid):
         return _april_grid(image, target)
     if isinstance(target, CircleGrid):
-        centres = find_circles(image, as_8_bit(image), target)
-        return Found(None if centres is None else centres.reshape(*target.shape, 2))
+        taken = find_circles(image, as_8_bit(image), target)
+        return Found(None) if taken is None else Found(taken.points.reshape(*target.shape, 2), again=taken.again)
     return _charuco(image, target)
 
 
@@ -59,22 +62,25 @@ def _chessboard(image: Shaped[np.ndarray, "h w"], board: Chessboard) -> Found:
     pattern = find_pattern(as_8_bit(image), board)
     if pattern.grid is None:
         return Found(None, pattern.seen)
-    refined = refine_grid(image, pattern.grid)
-    if not refined.is_board():
-        return Found(None)
-    return Found(in_order(refined.grid, refined.begins_dark, board), board.size)
+    patterns = [refine_grid(image, grid) for grid in (pattern.grid, *pattern.others)]
+    boards = [one for one in patterns if one.is_board()]
+    if not boards:
+        blurred = "one too blurred for its corners to be placed: take it in focus, camera and board at rest"
+        return Found(None, hint=blurred if any(one.vague for one in patterns) else "")
+    refined = max(boards, key=lambda one: covered(one.grid.reshape(-1, 2)))
+    return Found(in_order(refined.grid, refined.begins_dark, board), board.size, again=len(boards) > 1)
 
 
 def _april_grid(image: Shaped[np.ndarray, "h w"], board: AprilGrid) -> Found:
-    corners = find_marked(image, as_8_bit(image), board)
-    if corners is None:
+    taken = find_marked(image, as_8_bit(image), board)
+    if taken is None:
         return Found(None)
-    grid = corners.reshape(*board.shape, 2)
+    grid = taken.points.reshape(*board.shape, 2)
     # Tags are read whatever their distance is said to be: their corners tell what it is.
     spacing = _spacing_of(grid)
     if abs(spacing - board.spacing) > OTHER_SPACING * board.spacing:
         return Found(None, hint=f"one whose tags stand {spacing:.2f} of their side apart: give spacing={spacing:.2f}")
-    return Found(grid)
+    return Found(grid, again=taken.again)
 
 
 def _spacing_of(grid: Float[np.ndarray, "rows columns 2"]) -> float:
@@ -90,22 +96,22 @@ def _spacing_of(grid: Float[np.ndarray, "rows columns 2"]) -> float:
 
 def _charuco(image: Shaped[np.ndarray, "h w"], board: CharucoBoard) -> Found:
     grey = as_8_bit(image)
-    corners, other = find_marked(image, grey, board), with_other_start(board)
-    found = Found(None if corners is None else corners.reshape(*board.shape, 2))
-    if other is None or (corners is not None and board.columns % 2 == 0):
+    taken, other = find_marked(image, grey, board), with_other_start(board)
+    found = Found(None) if taken is None else Found(taken.points.reshape(*board.shape, 2), again=taken.again)
+    if other is None or (taken is not None and board.columns % 2 == 0):
         return found
     # With an odd number of columns, either pattern is the other one square further on, but for the end that is its own.
-    own = _at_its_own_end(corners, board)
+    own = _at_its_own_end(taken, board)
     if own >= ENDS:
         return found
     others = find_marked(image, grey, other)
     if others is None:
         return found
     kind = "legacy" if other.legacy else "ordinary"
-    if corners is None or own < _at_its_own_end(others, other):
+    if taken is None or own < _at_its_own_end(others, other):
         return Found(None, hint=f"one of the {kind} pattern: give legacy={other.legacy}")
     # Where its own end is not in view, it is the pattern that was asked for. Where it should be, and is not, who knows?
-    if own > _at_its_own_end(others, other) or not not_found(image, board, corners, _own_end(board)):
+    if own > _at_its_own_end(others, other) or not not_found(image, board, taken.points, _own_end(board)):
         return found
     return Found(
         None,
@@ -123,6 +129,6 @@ def _own_end(board: CharucoBoard) -> Bool[np.ndarray, " n"]:
     return own.reshape(-1)
 
 
-def _at_its_own_end(corners: Float[np.ndarray, "n 2"] | None, board: CharucoBoard) -> int:
+def _at_its_own_end(taken: Taken | None, board: CharucoBoard) -> int:
     """How many corners were found there."""
-    return 0 if corners is None else int(np.isfinite(corners[_own_end(board), 0]).sum())
+    return 0 if taken is None else int(np.isfinite(taken.points[_own_end(board), 0]).sum())

@@ -17,6 +17,7 @@ from diffproj.targets.codes import contradicted
 from diffproj.targets.corner_fit import Fitted
 from diffproj.targets.dictionaries import dictionary_named
 from diffproj.targets.pattern_fit import LARGEST, SMALLEST, Patches, fit_patches, patches_of
+from diffproj.targets.repeated import Taken, largest
 from diffproj.targets.surface import Limits, off_surface
 
 MISFIT = 0.30
@@ -78,10 +79,8 @@ class Marker(NamedTuple):
     affine: Float[np.ndarray, "2 3"]
 
 
-def find_marked(
-    image: Shaped[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], board: MarkedBoard
-) -> Float[np.ndarray, "n 2"] | None:
-    """The board's corners in px, NaN where not seen; None where too little of it is seen.
+def find_marked(image: Shaped[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], board: MarkedBoard) -> Taken | None:
+    """The board's corners; None where too little of it is seen.
 
     Args:
         image: `(H, W)`, uint8 or float32.
@@ -89,11 +88,13 @@ def find_marked(
         board: the board.
     """
     for border in board.borders:
-        markers = _agreeing(grey, board, border)
-        if len(markers) > 1:
-            corners = _Search(image, board, border).corners(markers)
-            if corners is not None and not contradicted(image, board, border, corners):
-                return corners
+        agreeing = _agreeing(grey, board, border)
+        if agreeing:
+            search = _Search(image, board, border)
+            found = [corners for markers in agreeing if (corners := search.corners(markers)) is not None]
+            taken = largest([corners for corners in found if not contradicted(image, board, border, corners)])
+            if taken is not None:
+                return taken
     return None
 
 
@@ -197,17 +198,33 @@ class _Tried(NamedTuple):
     misfit: Float[np.ndarray, " n"]
 
 
-def _agreeing(grey: UInt8[np.ndarray, "h w"], board: MarkedBoard, border: int) -> list[Marker]:
-    """The largest set of markers that stand to each other as on the board, from the copy that shows most."""
+def _agreeing(grey: UInt8[np.ndarray, "h w"], board: MarkedBoard, border: int) -> list[list[Marker]]:
+    """The largest set of markers that stand to each other as on the board, from the copy that shows most.
+
+    And the next largest, of markers in other places: of a second board. Each has two or more.
+    """
     best: list[Marker] = []
+    others: list[Marker] = []
     for small in _copies(grey):
         found = _read(small, grey, board, border)
         agreed = _consistent(found, board.pitch)
         if len(agreed) > len(best):
-            best = agreed
+            best, others = agreed, _consistent(_elsewhere(found, agreed), board.pitch)
         if len(best) >= min(ENOUGH, 0.5 * len(board.markers)):
             break
-    return best
+    return [markers for markers in (best, others) if markers]
+
+
+def _elsewhere(found: list[Marker], taken: list[Marker]) -> list[Marker]:
+    """The markers that were not read where one was that is taken."""
+    places, sides = np.stack([one.quad.mean(axis=0) for one in taken]), [_side(one) for one in taken]
+    off = [np.linalg.norm(places - one.quad.mean(axis=0), axis=-1) / np.minimum(sides, _side(one)) for one in found]
+    return [one for one, apart in zip(found, off, strict=True) if apart.min() > 0.5]
+
+
+def _side(marker: Marker) -> float:
+    """The mean length in px of a marker's sides."""
+    return float(np.linalg.norm(marker.quad - np.roll(marker.quad, 1, axis=0), axis=-1).mean())
 
 
 def _copies(grey: UInt8[np.ndarray, "h w"]) -> Iterator[UInt8[np.ndarray, "_h _w"]]:

@@ -309,4 +309,5 @@ def _judged(
     failed = ~np.isfinite(moved).all(axis=-1)
     failed |= np.linalg.norm(np.nan_to_num(moved) - corners, axis=-1) > 0.7 * radius
     moved = np.where(failed[:, None], corners, moved)
-    return Fitted(moved, np.where(failed, np.inf, misfit), half.double().numpy(), sigma.numpy())
+    misfit, contrast, blur = np.where(failed, np.inf, misfit), half.double().numpy(), unknowns[:, 6].double().numpy()
+    return Fitted(moved, misfit, contrast, sigma.numpy(), blur)

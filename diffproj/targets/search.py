@@ -45,10 +45,12 @@ class Pattern(NamedTuple):
     Attributes:
         grid: `(rows, columns, 2)` px, to a pixel or so; NaN where a corner is hidden. None where no board fits.
         seen: `(columns, rows)` of the largest pattern in the photograph where no board fits; (0, 0) for none.
+        others: further patterns of the board's size, elsewhere.
     """
 
     grid: Float[np.ndarray, "rows columns 2"] | None
     seen: tuple[int, int] = (0, 0)
+    others: tuple[Float[np.ndarray, "rows columns 2"], ...] = ()
 
 
 def find_pattern(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Pattern:
@@ -57,7 +59,7 @@ def find_pattern(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Pattern:
     Copies of several sizes are searched for patterns of saddle points: one of at most 550 px, which shows most boards,
     then one of twice its size, one of half of it for blurred photographs, and larger ones for small boards. This takes
     a fraction of a second where nothing is found. Where a part of a pattern is found, but no board, OpenCV's two
-    detectors are asked as well.
+    detectors are asked as well. All patterns of the copy that shows the board may be boards.
     """
     if min(image.shape) < NARROWEST:
         return Pattern(None)
@@ -70,20 +72,27 @@ def find_pattern(image: UInt8[np.ndarray, "h w"], board: Chessboard) -> Pattern:
         and extent_of(coarse[0]) == (max(board.size), min(board.size))
         and _is_plain(found, image, half)
     ):
-        return Pattern(found)
+        # A smaller board beside it may have lost corners in this copy.
+        beside = any(_telling(other, board) for other in coarse[1:])
+        boards = [matched(pattern, board) for pattern in _patterns(first, image)] if beside else []
+        return Pattern(found, others=tuple(one for one in boards if one is not None and not _same(one, found)))
     seen, partial, other_boards = (0, 0), None, []
     for patterns in itertools.chain((_patterns(first, image), coarse), _further_patterns(first, image)):
+        boards = []
         for pattern in patterns:
             found = matched(pattern, board)
             # Of another board, another copy may show no more, or no less, than what looks like this one.
             if found is not None and not any(_shadows(other, pattern) for other in other_boards):
-                return Pattern(found)
+                boards.append(found)
+                continue
             extent = extent_of(pattern)
             if _larger(extent, board):
                 other_boards.append(pattern)
             if extent[0] * extent[1] > seen[0] * seen[1]:
                 seen, partial = extent, pattern
-    if partial is None or np.isfinite(partial[..., 0]).sum() < HINT * len(board) or _is_other(seen, partial, board):
+        if boards:
+            return Pattern(boards[0], others=tuple(boards[1:]))
+    if partial is None or not _telling(partial, board) or _is_other(seen, partial, board):
         return Pattern(None, seen)
     return Pattern(_by_opencv(image, partial, board), seen)
 
@@ -93,6 +102,17 @@ def _patterns(small: UInt8[np.ndarray, "h w"], image: UInt8[np.ndarray, "H W"]) 
     saddles = saddle_points(small)
     grids = [_carried(as_grid(cells, saddles.points), small, image) for cells in lattices(saddles)]
     return sorted((grid for grid in grids if _spacing(grid) >= FINEST), key=_area, reverse=True)
+
+
+def _same(one: Float[np.ndarray, "r c 2"], other: Float[np.ndarray, "r c 2"]) -> bool:
+    """Whether two patterns of one size are in one place."""
+    apart = np.nanmean(one, axis=(0, 1)) - np.nanmean(other, axis=(0, 1))
+    return float(np.hypot(*apart)) < _spacing(other)
+
+
+def _telling(pattern: Float[np.ndarray, "r c 2"], board: Chessboard) -> bool:
+    """Whether enough of a pattern is seen for a larger copy to be asked what it is."""
+    return bool(np.isfinite(pattern[..., 0]).sum() >= HINT * len(board))
 
 
 def _is_plain(

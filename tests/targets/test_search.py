@@ -14,7 +14,7 @@ from diffproj.targets.detection import BoardNotFoundError, BoardNotFoundWarning,
 from diffproj.targets.lattice import as_grid, lattices
 from diffproj.targets.numbering import follow
 from diffproj.targets.saddles import saddle_points
-from diffproj.targets.search import extent_of, find_pattern, matched
+from diffproj.targets.search import Pattern, extent_of, find_pattern, matched
 from diffproj.targets.synthetic import photograph
 
 D = torch.float64
@@ -99,13 +99,13 @@ def test_a_board_in_a_photograph_of_any_size():
 
 @pytest.mark.parametrize("shape", [(12, 200), (200, 15), (1, 1)])
 def test_a_strip_has_no_room_for_a_board(shape):
-    assert find_pattern(np.zeros(shape, np.uint8), Chessboard(9, 6)) == (None, (0, 0))
+    assert find_pattern(np.zeros(shape, np.uint8), Chessboard(9, 6)) == Pattern(None, (0, 0))
 
 
 def test_cloth_is_no_board():
     """A pattern as fine as a screen's or a fabric's is not even told as another board."""
     image, _ = straight(40, 30, 4, margin=60)
-    assert find_pattern(image, Chessboard(9, 6)) == (None, (0, 0))
+    assert find_pattern(image, Chessboard(9, 6)) == Pattern(None, (0, 0))
 
 
 def test_a_small_print_beside_a_larger_board_is_none():
@@ -146,7 +146,7 @@ def test_where_no_detector_finds_the_board_the_part_is_told(monkeypatch):
     image, _ = straight(9, 6, 25)
     monkeypatch.setattr(cv2, "findChessboardCorners", lambda *_: (False, None))
     monkeypatch.setattr(cv2, "findChessboardCornersSB", lambda *_, flags: (False, None))
-    assert find_pattern(image, Chessboard(9, 6)) == (None, (9, 6))
+    assert find_pattern(image, Chessboard(9, 6)) == Pattern(None, (9, 6))
 
 
 # --------------------------------------------------------------------------------------------- where no board is
