@@ -112,13 +112,15 @@ def refine_grid(image: Shaped[np.ndarray, "h w"], rough: Float[np.ndarray, "rows
         wider = wider._replace(grid=(wider.grid + 0.5) * scale - 0.5, sigma=wider.sigma * scale)
         # What a wider disc reaches, such as the board's edge seen steeply, may hide a corner that one before shows.
         found = _joined(np.where(wider.visible, room | ~found.visible, room & ~contained), wider, found)
-    shown = _settled(found, scale > 1)
+    shown = _settled(found, _median(blur.ravel()) > WIDE * LARGEST)
     settled = found._replace(grid=np.where(shown[..., None], found.grid, np.nan), visible=shown)
     return settled._replace(vague=found.is_board() and not settled.is_board())
 
 
 def _settled(found: Corners, blurred: bool) -> Bool[np.ndarray, "rows columns"]:
-    """Which visible corners are known well enough: none of a view, vague or blurred, whose corners scatter by more.
+    """Which visible corners are known to `VAGUEST`; none of a view whose corners scatter by more.
+
+    That is asked of views that are vague, or blurred wider than their squares have room for.
 
     The grey values' noise alone does not tell how far the corners of such a view stray, their neighbours do: by the
     surface through them on the board's plane, where a steep view is as smooth as any. Along the board's sides it misses
@@ -183,8 +185,8 @@ def _refined(
             *(np.where(good, old, new) for old, new in zip(fit[1:], tried[1:], strict=True)),
         )
         good = _trusted(image, fit, everywhere)
-    begins_dark = bool((_alternated(fit.contrast)[good] > 0).any())
     hidden = np.where(good[..., None], fit.grid, np.nan)
+    begins_dark = bool((_alternated(fit.contrast)[good] > 0).any())
     return Corners(hidden, fit.sigma, good, _median(fit.misfit.ravel()), begins_dark), fit.blur
 
 
