@@ -47,14 +47,15 @@ class _Estimates(NamedTuple):
 def sharing(found: Sequence[Measurement], batch: Sequence[int]) -> Tensor:
     """For each measurement how many have errors in common with it, itself among them, `(*B, C)`."""
     known = [_Estimates.of(one) for one in found]
-    counts = []
-    for one, ours in zip(found, known, strict=True):
-        common = [
-            torch.as_tensor(one is other or _of_one_source(one, other) or _alike(ours, theirs)).expand(tuple(batch))
-            for other, theirs in zip(found, known, strict=True)
-        ]
-        counts.append(torch.stack([each.to(one.points.device) for each in common]).sum(0))
-    return torch.stack(counts, dim=-1)
+    device = found[0].points.device
+
+    def common(first: int, second: int) -> Tensor:
+        one, other = found[first], found[second]
+        same = one is other or _of_one_source(one, other) or _alike(known[first], known[second])
+        return torch.as_tensor(same, device=device).expand(tuple(batch))
+
+    each = range(len(found))
+    return torch.stack([torch.stack([common(one, other) for other in each]).sum(0) for one in each], dim=-1)
 
 
 def _of_one_source(one: Measurement, other: Measurement) -> bool:
