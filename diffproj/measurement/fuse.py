@@ -47,9 +47,8 @@ from diffproj.measurement.student import normal_reach
 
 MOST_POINTS = 3000
 """Whose joint covariance is inverted for each camera."""
-MOST_STEPS = 10
-STANDS = 1e-4
-"""Deviations by which a further step may move the estimate."""
+MOST_STEPS, STANDS = 10, 1e-4
+"""Steps of linearising anew, and the deviations by which a further one may move the estimate."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,9 +62,6 @@ class FusedMeasurement(Measurement):
             1 where no other saw its points.
         disagrees: which cameras differ by more than chance `(*B, C)`.
         scale: by what the deviations were multiplied, as the cameras disagree, `(*B,)`; 1 where they agree.
-        bent: which points' deviations and intervals mislead, as all cameras together are not sure enough of them for
-            the curve from pixels to the plane to be straight `(*B, N)`.
-        beyond: which were extrapolated by all cameras that saw them `(*B, N)`, where that is known.
     """
 
     names: tuple[str, ...] = ()
@@ -73,20 +69,24 @@ class FusedMeasurement(Measurement):
     chance: Float[Tensor, "*batch c"] | None = None
     disagrees: Bool[Tensor, "*batch c"] | None = None
     scale: Float[Tensor, "*batch"] | None = None
-    bent: Bool[Tensor, "*batch n"] | None = None
-    beyond: Bool[Tensor, "*batch n"] | None = None
+    _bent: Bool[Tensor, "*batch n"] | None = None
+    _beyond: Bool[Tensor, "*batch n"] | None = None
 
     _lie = "measured"
 
     @cached_property
     def nonlinear(self) -> Bool[Tensor, "*batch n"]:
-        """Where deviations and intervals mislead `(*B, N)`: see `bent`."""
-        return torch.zeros_like(self.valid) if self.bent is None else self.bent
+        """Where deviations mislead `(*B, N)`, and `interval`, which is straight here, is not quite symmetric in truth.
+
+        Even together the cameras are not sure enough of such a point for the curve from pixels to the plane to be
+        straight: see `Quantity.nonlinear`.
+        """
+        return torch.zeros_like(self.valid) if self._bent is None else self._bent
 
     @cached_property
     def extrapolated(self) -> Bool[Tensor, "*batch n"] | None:
         """Which points no camera saw within the region that its calibration's corners covered `(*B, N)`."""
-        return self.beyond
+        return self._beyond
 
     def to_dict(self) -> dict[str, list[Any]]:
         """The points as columns of Python's own numbers; `cameras` counts those that measured a point."""
@@ -185,7 +185,7 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
     each = {"names": names, "seen": seen, "chance": chance, "disagrees": disagrees, "scale": scale}
     fused = FusedMeasurement(placed, there, includes, noise, None, told, **each)
     curved = _curved(found, fused) | (moving.unsqueeze(-1) & there)
-    return replace(fused, bent=curved, beyond=_extrapolated(found, seen))
+    return replace(fused, _bent=curved, _beyond=_extrapolated(found, seen))
 
 
 class _Joined(NamedTuple):

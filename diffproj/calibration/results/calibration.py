@@ -63,7 +63,8 @@ class Calibration(Account, Copied, Recorded, Indexed):
         used: which corners were used `(*B, V, N)`: seen, not rejected as outliers, and in a view with at least 4.
         rejected: which corners were rejected as outliers `(*B, V, N)`.
         discounted: which of the used ones a robust loss holds for wrong `(*B, V, N)`: they count less than half, and
-            are further off than four deviations of the noise. `None` without such a loss.
+            are further off than four deviations of the noise, or their view is too noisy for the scale of a loss like
+            Cauchy's. `None` without such a loss, and for the cameras of a rig.
         status: how it ended, `Status` codes `(*B,)`.
         iterations: how many steps the solver tried `(*B,)`.
         bow: how far the middle of the board stands off its edges along x and y `(*B, 2)` in world units, where it was
