@@ -11,6 +11,11 @@ Unlike two cameras of any kind, this costs no parameter, so that it may be judge
 of the residuals and the dispersion, both of the better choice, it is the square of a normal variable's deviations if
 the photographs are not turned. The shape of a target stays as it was found.
 
+The choice itself saves, too: where the errors of each view's corners go together, the views' principal points scatter,
+and those on one side of the middle are always nearer when turned. So along the line from the camera to the turned one
+the views must also be in two heaps, so clearly that these are more likely than one wide heap by more than the number of
+ways to choose so many views. Or else what is saved must be more than any choice among one heap saved.
+
 What is amiss otherwise may look alike: a lens that the model lacks, skew, a bent board or one of a wrong width, two
 cameras, and a prior that does not fit. So `remarks` wants more than these explain (of two cameras, nearly as much), and
 does not ask at all where there is a prior.
@@ -38,6 +43,14 @@ TINY = 1e-10
 """Added to the sum of the bowls, relative to it, for directions of which it tells nothing."""
 CERTAIN, OF_A_VIEW = 5.0, 3.0
 """Deviations of a normal variable beyond which photographs are turned, and each of them is."""
+TWO_HEAPS, BEYOND_CHOICE = 6.0, 5.5
+"""Logarithm of how much more likely two heaps of views are than one, from which on they are told; and what is saved for
+each view, over the variance, from which on nothing else is asked. Where errors of .1 to .3 px went together in views of
+one camera, 381 of 3200 sets were accused without these (82 of 100 where the principal point was the middle), 21 are."""
+
+
+WIDTHS = (0.0, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5, 2.5, 4.0)
+"""Of one heap: its standard deviations, in lengths of the line."""
 
 
 class Turned(NamedTuple):
@@ -74,8 +87,8 @@ def turned_photographs(found: Fit, which: Tensor, sizes: Sequence[tuple[int, int
         Q, pull = of_prior(held, shared)
         choice = _Choice(seen, T, Q[:, :few, :few], pull[:, :few], size, *_turn(task.names[:few], shared, size))
         turned = choice.best(task.used.any(-1))
-        saved, of_each, level, spare = choice.judged(turned, part.degrees_of_freedom())
-        told = (saved > _as_rare(CERTAIN, spare) * level).unsqueeze(-1) & turned
+        saved, of_each, level, spare, two_heaps = choice.judged(turned, task.used.any(-1), part.degrees_of_freedom())
+        told = ((saved > _as_rare(CERTAIN, spare) * level) & two_heaps).unsqueeze(-1) & turned
         told &= of_each > (_as_rare(OF_A_VIEW, spare) * level).unsqueeze(-1)
         total = 2 * seen.c.sum(-1)
     groups = {}
@@ -155,12 +168,12 @@ class _Choice(NamedTuple):
             starts.append(aside)
         return starts
 
-    def judged(self, turned: Tensor, redundant: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What it is worth to turn these views back `(P, V)`.
+    def judged(self, turned: Tensor, used: Tensor, redundant: Tensor) -> tuple[Tensor, ...]:
+        """What it is worth to turn these views back `(P, V)`, of those used `(P, V)`.
 
         Returns:
             What is saved of the sum of squares `(P,)`, and by each of them `(P, V)`; phi s^2 then, and the degrees of
-            freedom that phi is from `(P,)`.
+            freedom that phi is from `(P,)`; and whether it is more than what a choice of views saves anyhow `(P,)`.
         """
         A, b, fixed = self._sum(turned)
         y = _lowest(A, b)
@@ -173,7 +186,32 @@ class _Choice(NamedTuple):
         u = g + (H @ y[:, None, :, None]).squeeze(-1)
         pull = u.sum(1) + b - g.sum(1) + ((A - H.sum(1)) @ y.unsqueeze(-1)).squeeze(-1)
         phi, spare, _ = contradiction(u, H, left[:, None, None, None] * H, torch.ones_like(u[..., 0]), A, pull)
-        return saved, 2 * (costs[0] - costs[1]), phi.clamp(min=1) * left, spare
+        level = phi.clamp(min=1) * left
+        clear = self._two_heaps(x, turned, used, level) > TWO_HEAPS
+        clear |= saved > BEYOND_CHOICE * used.sum(-1) * level
+        return saved, 2 * (costs[0] - costs[1]), level, spare, clear
+
+    def _two_heaps(self, x: Tensor, turned: Tensor, used: Tensor, level: Tensor) -> Tensor:
+        """By how much two heaps of views, at x and at its turned place, are likelier than one `(P,)`, as a logarithm.
+
+        A view's place on the line between both, from the middle and in lengths of the line, is what it costs more at x
+        than turned, over its curvature; this scatters as `level` if not more. One heap is as wide as fits it best.
+        """
+        jump = self.sign * x + self.d - x
+        curvature = torch.einsum("pi,pvij,pj->pv", jump, self.seen.H, jump)
+        told = used & (curvature > 0)
+        curvature, count, some = torch.where(told, curvature, 1.0), told.sum(-1), (turned & told).sum(-1)
+        costs = self._costs(x)
+        place = torch.where(told, (costs[0] - costs[1]) / curvature, 0.0)
+        off = torch.where(told, place - torch.where(turned, 0.5, -0.5), 0.0)
+        within = ((off.square() * curvature).sum(-1) / count.clamp(min=1)).maximum(level)
+        two = _likelihood(off, within.unsqueeze(-1) / curvature, told)
+        variance = (level.unsqueeze(-1) / curvature) + place.new_tensor(WIDTHS).square()[:, None, None]
+        weight = torch.where(told, 1 / variance, 0.0)
+        middle = (weight * place).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-300)
+        one = _likelihood(place - middle, variance, told).amax(0)
+        ways = torch.lgamma(count + 1.0) - torch.lgamma(some + 1.0) - torch.lgamma(count - some + 1.0)
+        return two - one - ways
 
     def _costs(self, x: Tensor) -> Tensor:
         """What each view costs at x `(P, s)`, as it is and turned `(2, P, V)`."""
@@ -197,6 +235,11 @@ class _Choice(NamedTuple):
         A = self.T.mT @ (H.sum(1) + self.Q) @ self.T
         b = ((g.sum(1) + self.pull).unsqueeze(-2) @ self.T).squeeze(-2)
         return A, b, fixed.sum(-1)
+
+
+def _likelihood(off: Tensor, variance: Tensor, told: Tensor) -> Tensor:
+    """The logarithm of how likely normal variables `(*B, V)` with these variances are, up to a constant `(*B,)`."""
+    return -torch.where(told, off.square() / variance + variance.log(), 0.0).sum(-1) / 2
 
 
 def _as_rare(deviations: float, freedom: Tensor) -> Tensor:
