@@ -5,6 +5,10 @@ and the reduction of the cost that they would bring, with all other unknowns fre
 step: Rao's score test, as an F test. With `g` and `S` the gradient and the normal matrix of the added unknowns, all
 others eliminated, the sum of squares would fall by `g^T S^-1 g`.
 
+Where corners err together within each view, unknowns by the dozen take of that what they can. So what the views still
+pull at the added unknowns after the step is compared with what independent corners would: if it is more, it is noise
+that the views have in common, and the effect must stand out of that.
+
 In the image two kinds of fields are added: radial ones, which another lens would explain; and any that are smooth. On
 the board each point may move, alike in all views: a printed board is never quite the grid that it is taken for. This
 test holds the poses, which can do nearly all that a stretched or slanted print does; so such a print has a test of its
@@ -13,7 +17,7 @@ out, for a pattern that is seen over and over would pass for one of the image.
 """
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,8 +32,18 @@ FIELD_ORDER = 4
 """Highest degree of the smooth fields' polynomials, in both coordinates together."""
 FREE = 1e-7
 """Part of an added unknown's effect that must be left when all others are free; below, they can do the same."""
+MOST = 0.5
+"""Part of the sum of squares from which on an effect is none of chance however much views contradict each other: one
+step, which is what it is judged by, does not do away with all of it then."""
 BLOCK_VIEWS = 500
 """Views that are looked at side by side, for the memory's sake."""
+
+
+class Contradiction(NamedTuple):
+    """By how much the variance is larger for views that contradict each other `(n,)`, and its degrees of freedom."""
+
+    excess: Tensor
+    spare: Tensor
 
 
 @dataclass(frozen=True)
@@ -108,6 +122,7 @@ class _Scores:
             weight = weight * task.loss.weight(squared)
         # Views that are alike count as one.
         share = torch.ones_like(weight[..., 0]) if task.shares is None else task.shares
+        self.share = share * task.used.any(-1)
         self.root = (weight * share.unsqueeze(-1)).sqrt()[:, :, None, None]
         panel = panel * self.root
         s = len(task.names)
@@ -133,12 +148,14 @@ class _Scores:
         rest = self.residual - torch.einsum("pvikn,pni->pvkn", self.by_point, moves)
         rings = self._radial()
         known = shape.deviations > shape_deviations
-        radial, smooth, skew = (
-            self._added(columns, self.residual, self.count).besides(
-                self._added(columns, rest, self.count - points), known
-            )
-            for columns in (rings, torch.cat([rings, self._fields()], dim=2), self._skew())
-        )
+
+        def besides_shape(columns: Tensor) -> Effect:
+            whole = self._added(columns, self.residual, self.count)
+            apart = self._added(columns, rest, self.count - points, whole.share > MOST)
+            return whole.besides(apart, known)
+
+        radial, smooth = besides_shape(rings), besides_shape(torch.cat([rings, self._fields()], dim=2))
+        skew = besides_shape(self._skew())
         bow = self._added(self._bow(), self.residual, self.count)
         uneven = self._added(self._uneven_print(), self.residual, self.count)
         return Leftover(radial, smooth, skew, shape, bow, uneven, self._spread(moves))
@@ -179,38 +196,66 @@ class _Scores:
         """Weighted derivatives `(n, V, q, 2, N)` by the strengths of fields `(n, V, N, 2)`."""
         return torch.stack(fields, dim=2).mT * self.root
 
-    def _added(self, columns: Tensor, residual: Tensor, count: Tensor) -> Effect:
-        """What added unknowns with derivatives `(n, V, q, 2, N)` would explain, all others free."""
+    def _added(self, columns: Tensor, residual: Tensor, count: Tensor, sure: Tensor | None = None) -> Effect:
+        """What added unknowns with derivatives `(n, V, q, 2, N)` would explain, all others free.
+
+        That they are none of chance, and views may contradict each other on them, is sure of some cameras `(n,)`.
+        """
         first = self.shared.shape[2]
         rows = torch.cat([self.shared, columns, self.poses, residual.unsqueeze(2)], dim=2).flatten(-2)
         gram = rows @ rows.mT
         k = first + columns.shape[2]
-        U, g = gram[..., :k, :k].sum(1), gram[..., :k, -1:].sum(1)
+        U, g = gram[..., :k, :k], gram[..., :k, -1:]
         E, W, h = gram[..., :k, k:-1], gram[..., k:-1, k:-1], gram[..., k:-1, -1:]
         unused = ~self.task.used.any(-1)[..., None, None] * torch.eye(POSE, dtype=W.dtype, device=W.device)
         F = torch.linalg.solve_ex((W + unused).mT, E.mT)[0].mT
-        S, g = U - (F @ E.mT).sum(1), g - (F @ h).sum(1)
+        scale = U.sum(1).diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt().unsqueeze(-1)
+        of_view, pull = (U - F @ E.mT) * (scale * scale.mT).unsqueeze(1), (g - F @ h) * scale.unsqueeze(1)
+        S, g = of_view.sum(1), pull.sum(1)
         prior = self.task.whole_prior
         if prior is not None:
             precision = prior.whole
             if self.task.basis is not None:
                 precision = self.task.basis.mT @ precision @ self.task.basis
-            S = S + torch.nn.functional.pad(precision, (0, k - first, 0, k - first))
-        scale = U.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt().unsqueeze(-1)
-        S, g = S * scale * scale.mT, g * scale
+            S = S + torch.nn.functional.pad(precision, (0, k - first, 0, k - first)) * scale * scale.mT
         follow = _inverse(S[:, :first, :first], 1e-13) @ S[:, :first, first:]
         X, y = S[:, first:, first:] - S[:, first:, :first] @ follow, g[:, first:] - follow.mT @ g[:, :first]
         size, turn = torch.linalg.eigh(X.nan_to_num(0.0, 0.0, 0.0))
         free = size > FREE
         along, size = (turn.mT @ y).squeeze(-1), torch.where(free, size, 1.0)
         explained = torch.where(free, along.square() / size, 0.0).sum(-1)
-        found = effect(explained, free.sum(-1), _total(residual), count)
         # The residuals are `projected - seen`, so that the added unknowns step by -X^-1 y, and the others follow.
         step = turn @ torch.where(free, along / size, 0.0).unsqueeze(-1)
-        moved = (follow @ step * scale[:, :first]).squeeze(-1)
+        moved = follow @ step
+        whole = torch.cat([moved, -step], dim=1)
+        left = pull + of_view @ whole.unsqueeze(1)
+        left = (turn.mT.unsqueeze(1) @ (left[:, :, first:] - follow.mT.unsqueeze(1) @ left[:, :, :first])).squeeze(-1)
+        left = torch.where(self.share > 0, 1 / self.share, 0.0).unsqueeze(-1) * left.square()
+        between = torch.where(free, left.sum(1) / size, 0.0).sum(-1)
+        unknowns, total = free.sum(-1), _total(residual)
+        contradiction = self._contradiction(between, unknowns, total - explained, count)
+        sure = explained > MOST * total if sure is None else sure
+        contradiction = contradiction._replace(excess=torch.where(sure, 0.0, contradiction.excess))
+        found = effect(explained, unknowns, total, count, contradiction)
+        moved = (moved * scale[:, :first]).squeeze(-1)
         if self.task.basis is not None:
             moved = (self.task.basis @ moved.unsqueeze(-1)).squeeze(-1)
         return replace(found, moved=moved)
+
+    def _contradiction(self, left: Tensor, unknowns: Tensor, rest: Tensor, count: Tensor) -> "Contradiction":
+        """How much more the views contradict each other on added unknowns than independent corners would.
+
+        Args:
+            left: the squares of what the views still pull at these unknowns, over the pulls' curvature `(n,)`.
+            unknowns: how many these are `(n,)`.
+            rest: the sum of squares that is left with them `(n,)`, of `count - unknowns` degrees of freedom.
+            count: degrees of freedom without them.
+        """
+        views = self.share.sum(-1)
+        spare = (unknowns * (views - 1)).clamp(min=1)
+        variance = rest / (count - unknowns).clamp(min=1)
+        excess = (left * views / spare / variance.clamp(min=1e-300) - 1).clamp(min=0)
+        return Contradiction(excess.pow(3) / (excess.square() + 2 / spare), spare)
 
     def _moved_points(self) -> tuple[Tensor, Tensor, Tensor]:
         """What points that move explain `(n,)`, how many unknowns that takes, and the moves `(n, N, 3)`.
@@ -262,16 +307,25 @@ def _chebyshev(x: Tensor, order: int) -> list[Tensor]:
     return waves
 
 
-def effect(explained: Tensor, unknowns: Tensor, total: Tensor, count: Tensor) -> Effect:
+def effect(
+    explained: Tensor, unknowns: Tensor, total: Tensor, count: Tensor, contradiction: Contradiction | None = None
+) -> Effect:
     """The F test: `explained` of the sum of squares `total` by some unknowns, of `count` degrees of freedom.
 
-    The statistic goes to standard deviations by the cube root that makes F nearly normal (Paulson 1942).
+    The variance is that of single corners, and larger by what views contradict each other, of fewer degrees of freedom
+    then (Satterthwaite 1946). The statistic goes to standard deviations by the cube root that makes F nearly normal
+    (Paulson 1942).
     """
     share = torch.where(total > 0, explained / total.clamp(min=1e-300), 0.0).clamp(0, 1 - 1e-12)
     one, two = unknowns.to(share).clamp(min=1), (count - unknowns).to(share)
     enough = (two >= 5) & (unknowns > 0)
     two = two.clamp(min=5)
-    return Effect(share, share, torch.where(enough, f_deviations(share / one / ((1 - share) / two), one, two), 0.0))
+    ratio = share / one / ((1 - share) / two)
+    if contradiction is not None:
+        excess, spare = contradiction
+        ratio = ratio / (1 + excess)
+        two = (1 + excess).square() / (1 / two + excess.square() / spare)
+    return Effect(share, share, torch.where(enough, f_deviations(ratio, one, two), 0.0))
 
 
 def f_deviations(ratio: Tensor, one: Tensor, two: Tensor) -> Tensor:

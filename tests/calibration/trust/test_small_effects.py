@@ -94,6 +94,17 @@ def test_noise_is_none_of_these(views: int, options: dict[str, Any]) -> None:
     assert 0.6 < off(found) < 1.4
 
 
+@pytest.mark.parametrize("views", [8, 20])
+def test_errors_that_go_together_within_a_view_are_none_of_these(views: int) -> None:
+    """Of .2 px, as large as the noise: XX and YY of 20 sets were said to be of a bent or an uneven board, or skew."""
+    exact = photographed(BOARD.points.to(D), views=views, seed=1)
+    x, y = (BOARD.points[:, :2].to(D) / BOARD.points.abs().max()).unbind(-1)
+    bends = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
+    together = bends @ torch.randn(COUNT, views, 6, 2, generator=torch.Generator().manual_seed(1), dtype=D)
+    found = dp.calibrate(dp.Views(exact.pixels + 0.2 * together, size=SIZE), BOARD)
+    assert sum("bent" in said or "wider" in said or "skew" in said for said in found.remarks) <= 1
+
+
 @pytest.mark.parametrize("copies", [2, 4])
 def test_copies_of_views_are_no_evidence(copies: int) -> None:
     """Noise that is seen again in each copy repeats on the board."""
