@@ -37,7 +37,7 @@ from diffproj.calibration.least_squares.losses import slope_and_bend
 from diffproj.calibration.problem.parametrisation import INTRINSICS
 from diffproj.calibration.problem.shape import by_displacement
 
-FEW_VIEWS = 2.5
+FEW_VIEWS = 2.0
 """The excess counts `1 + FEW_VIEWS / (views - 1)` fold."""
 FEW_VIEWS_OF_A_SHAPE = 6.0
 """The same where the target's points are free: what these take from few views is not seen in their residuals. Of
@@ -46,6 +46,8 @@ BELIEF = 4.0
 """Degrees of freedom below which phi counts little: what one or two of them say is mostly chance."""
 SINGULAR = 1e-9
 """Eigenvalue of K_v, relative to the largest, below which the view says nothing in this direction."""
+ALONE = 1e-3
+"""Part of what is known of a direction that is said to be left where the only view that tells it is left out."""
 
 
 def dispersion(found: Fit) -> Tensor:
@@ -61,10 +63,12 @@ def dispersion(found: Fit) -> Tensor:
     few_views = FEW_VIEWS_OF_A_SHAPE if task.free and not task.surveyed else FEW_VIEWS
     with torch.inference_mode():
         if task.free:
-            contradicting = _moved_intrinsics(found, shared, local)
+            factor = believed(_moved_intrinsics(found, shared, local), few_views)
         else:
-            contradicting = _between_over_within(task, shared, local, found.degrees_of_freedom())
-        factor = believed(contradicting, few_views)
+            pulls = _pulls(task, shared, local, found.degrees_of_freedom())
+            factor = believed(contradiction(*pulls), few_views)
+            if task.basis is None or bool((task.basis[:, : len(INTRINSICS)] != 0).any()):
+                factor = factor.maximum(believed(_left_out(pulls, task.basis), few_views))
     return factor.clone()
 
 
@@ -85,8 +89,28 @@ def believed(found: Contradiction, few_views: float = FEW_VIEWS) -> Tensor:
     return torch.where((spare >= 1) & factor.isfinite(), factor, 1.0)
 
 
-def _between_over_within(task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor) -> Contradiction:
-    """How much the views contradict each other; `redundant (P,)` are the degrees of freedom of the fit."""
+class Pulls(NamedTuple):
+    """Where V views of P cameras, whose poses are eliminated, want q shared parameters.
+
+    Attributes:
+        u: their pulls `(P, V, q)`.
+        S: their part of the normal matrix `(P, V, q, q)`.
+        K: the covariance of their pulls if corners err independently `(P, V, q, q)`.
+        share: how much each counts `(P, V)`.
+        total: the normal matrix `(P, q, q)`, with a prior's.
+        pull: the sum of the pulls `(P, q)`, with a prior's.
+    """
+
+    u: Tensor
+    S: Tensor
+    K: Tensor
+    share: Tensor
+    total: Tensor
+    pull: Tensor
+
+
+def _pulls(task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor) -> Pulls:
+    """Those of all views; `redundant (P,)` are the degrees of freedom of the fit."""
     rows, residual, pull_weight, variance = _weighted(task, shared, local, redundant)
     s = shared.shape[-1]
     if task.basis is not None:
@@ -117,20 +141,11 @@ def _between_over_within(task: Task, shared: Tensor, local: tuple[Tensor, ...], 
         Q, off = task.prior.precision, (task.prior.precision @ (shared - task.prior.mean).unsqueeze(-1)).squeeze(-1)
         T = torch.eye(len(Q[0]), dtype=Q.dtype, device=Q.device) if task.basis is None else task.basis
         total, pull = total + T.mT @ Q @ T, pull + (T.mT @ off.unsqueeze(-1)).squeeze(-1)
-    return contradiction(u, S, K, share, total, pull)
+    return Pulls(u, S, K, share, total, pull)
 
 
 def contradiction(u: Tensor, S: Tensor, K: Tensor, share: Tensor, total: Tensor, pull: Tensor) -> Contradiction:
-    """How much views contradict each other, whose poses are eliminated.
-
-    Args:
-        u: their pulls `(P, V, q)`.
-        S: their part of the normal matrix `(P, V, q, q)`.
-        K: the covariance of their pulls if corners err independently `(P, V, q, q)`.
-        share: how much each counts `(P, V)`.
-        total: the normal matrix `(P, q, q)`, with a prior's.
-        pull: the sum of the pulls `(P, q)`, with a prior's.
-    """
+    """How much views contradict each other on all parameters together; the arguments are those of `Pulls`."""
     data = (share[..., None, None] * S).sum(1)
     inverse = torch.linalg.pinv(total, hermitian=True)
     u = u - (S @ (inverse @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
@@ -144,6 +159,32 @@ def contradiction(u: Tensor, S: Tensor, K: Tensor, share: Tensor, total: Tensor,
     squares, told = (share * squares).sum(-1), share.unsqueeze(-1) * told
     spare = (told.sum((-2, -1)) - spent).clamp(min=1e-9)
     return Contradiction(squares / spare, spare, told.amax(-1).sum(-1))
+
+
+def _left_out(pulls: Pulls, basis: Tensor | None) -> Contradiction:
+    """How much views contradict each other on the focal lengths and the principal point, by leaving each out."""
+    u, S, K, share, total, pull = pulls
+    scale = total.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+    values, vectors = torch.linalg.eigh((total * scale.unsqueeze(-1) * scale.unsqueeze(-2)).nan_to_num(0.0, 0.0, 0.0))
+    known = values > SINGULAR * values[:, -1:].clamp(min=1e-300)
+    roots = torch.where(known, torch.where(known, values, 1.0).rsqrt(), 0.0)
+    W = scale.unsqueeze(-1) * vectors * roots.unsqueeze(-2)  # in whose units the normal matrix is 1
+    across = W.mT.unsqueeze(1)
+    S, K = across @ S @ W.unsqueeze(1), across @ K @ W.unsqueeze(1)
+    u = (across @ u.unsqueeze(-1)).squeeze(-1) - (S @ (W.mT @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
+    of_all = (share[..., None, None] * K).sum(1, keepdim=True)
+    K = K - K @ S - S @ K + S @ of_all @ S  # what the fit leaves of it
+    others = (1 + ALONE) * torch.eye(S.shape[-1], dtype=S.dtype, device=S.device) - S
+    to_intrinsics = (W if basis is None else basis @ W)[:, : len(INTRINSICS)].unsqueeze(1)
+    moves = to_intrinsics @ torch.linalg.inv_ex(others)[0]
+    moved = share.unsqueeze(-1) * (moves @ u.unsqueeze(-1)).squeeze(-1).square()
+    expected = share.unsqueeze(-1) * ((moves @ K) * moves).sum(-1)
+    moved, expected = moved.sum(1), expected.sum(1)
+    free = expected > 0
+    phi = torch.where(free, moved / torch.where(free, expected, 1.0), 0.0).sum(-1) / free.sum(-1).clamp(min=1)
+    told = S.diagonal(dim1=-2, dim2=-1).sum(-1) > 0
+    spare = _directions(basis) * ((share * told).sum(-1) - 1)
+    return Contradiction(phi, torch.where(free.any(-1), spare, 0.0).clamp(min=1e-9), told.sum(-1))
 
 
 def _moved_intrinsics(found: Fit, shared: Tensor, local: tuple[Tensor, ...]) -> Contradiction:
