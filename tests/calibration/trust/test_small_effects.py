@@ -94,15 +94,18 @@ def test_noise_is_none_of_these(views: int, options: dict[str, Any]) -> None:
     assert 0.6 < off(found) < 1.4
 
 
-@pytest.mark.parametrize("views", [8, 20])
-def test_errors_that_go_together_within_a_view_are_none_of_these(views: int) -> None:
-    """Of .2 px, as large as the noise: XX and YY of 20 sets were said to be of a bent or an uneven board, or skew."""
-    exact = photographed(BOARD.points.to(D), views=views, seed=1)
+def test_errors_that_go_together_within_a_view_are_none_of_these() -> None:
+    """Of .4 px, twice the noise: 13 of 60 sets were said to be of a bent or an uneven board, or of skew; now one or none."""
+    exact = photographed(BOARD.points.to(D), seed=1).pixels
     x, y = (BOARD.points[:, :2].to(D) / BOARD.points.abs().max()).unbind(-1)
     bends = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
-    together = bends @ torch.randn(COUNT, views, 6, 2, generator=torch.Generator().manual_seed(1), dtype=D)
-    found = dp.calibrate(dp.Views(exact.pixels + 0.2 * together, size=SIZE), BOARD)
-    assert sum("bent" in said or "wider" in said or "skew" in said for said in found.remarks) <= 1
+    told = 0
+    for seed in range(3):
+        shape, generator = (COUNT, 20, 6, 2), torch.Generator().manual_seed(seed)
+        together = bends @ torch.randn(shape, generator=generator, dtype=D)
+        found = dp.calibrate(dp.Views(exact + 0.4 * together, size=SIZE), BOARD)
+        told += sum("bent" in said or "wider" in said or "skew" in said for said in found.remarks)
+    assert told <= 2
 
 
 @pytest.mark.parametrize("copies", [2, 4])
