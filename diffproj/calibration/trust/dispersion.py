@@ -44,10 +44,12 @@ FEW_VIEWS_OF_A_SHAPE = 6.0
 surveyed landmarks it is, which stay near where they were surveyed."""
 BELIEF = 4.0
 """Degrees of freedom below which phi counts little: what one or two of them say is mostly chance."""
+FAR_VIEWS = 2.0
+"""How many times larger the variance of such ratios is than for independent corners: a few views err most."""
+STANDS_OUT = 25.0
+"""Variances of phi, for independent corners, by which it must exceed 1 for half of what the intrinsics tell."""
 SINGULAR = 1e-9
 """Eigenvalue of K_v, relative to the largest, below which the view says nothing in this direction."""
-ALONE = 1e-3
-"""Part of what is known of a direction that is said to be left where the only view that tells it is left out."""
 
 
 def dispersion(found: Fit) -> Tensor:
@@ -66,9 +68,10 @@ def dispersion(found: Fit) -> Tensor:
             factor = believed(_moved_intrinsics(found, shared, local), few_views)
         else:
             pulls = _pulls(task, shared, local, found.degrees_of_freedom())
-            factor = believed(contradiction(*pulls), few_views)
+            told = contradiction(*pulls)
             if task.basis is None or bool((task.basis[:, : len(INTRINSICS)] != 0).any()):
-                factor = factor.maximum(believed(_left_out(pulls, task.basis), few_views))
+                told = _more(told, _of_intrinsics(pulls, task.basis))
+            factor = believed(told, few_views)
     return factor.clone()
 
 
@@ -161,9 +164,19 @@ def contradiction(u: Tensor, S: Tensor, K: Tensor, share: Tensor, total: Tensor,
     return Contradiction(squares / spare, spare, told.amax(-1).sum(-1))
 
 
-def _left_out(pulls: Pulls, basis: Tensor | None) -> Contradiction:
-    """How much views contradict each other on the focal lengths and the principal point, by leaving each out."""
-    u, S, K, share, total, pull = pulls
+def _more(told: Contradiction, of_intrinsics: Contradiction) -> Contradiction:
+    """What all parameters tell, and more where these stand out of chance and the intrinsics alone tell clearly more."""
+    beyond = (told.phi - 1).clamp(min=0).square()
+    excess = (of_intrinsics.phi / told.phi.clamp(min=1) - 1).clamp(min=0)
+    by_chance = FAR_VIEWS * (2 / of_intrinsics.spare + 2 / told.spare)
+    more = excess.pow(3) / (excess.square() + by_chance) * beyond / (beyond + STANDS_OUT * 2 / told.spare)
+    return told._replace(phi=told.phi * (1 + more))
+
+
+def _of_intrinsics(pulls: Pulls, basis: Tensor | None) -> Contradiction:
+    """How much views contradict each other on the focal lengths and the principal point, whatever a prior says."""
+    u, S, K, share = pulls[:4]
+    total, pull = (share[..., None, None] * S).sum(1), (share.unsqueeze(-1) * u).sum(1)
     scale = total.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
     values, vectors = torch.linalg.eigh((total * scale.unsqueeze(-1) * scale.unsqueeze(-2)).nan_to_num(0.0, 0.0, 0.0))
     known = values > SINGULAR * values[:, -1:].clamp(min=1e-300)
@@ -174,17 +187,16 @@ def _left_out(pulls: Pulls, basis: Tensor | None) -> Contradiction:
     u = (across @ u.unsqueeze(-1)).squeeze(-1) - (S @ (W.mT @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
     of_all = (share[..., None, None] * K).sum(1, keepdim=True)
     K = K - K @ S - S @ K + S @ of_all @ S  # what the fit leaves of it
-    others = (1 + ALONE) * torch.eye(S.shape[-1], dtype=S.dtype, device=S.device) - S
-    to_intrinsics = (W if basis is None else basis @ W)[:, : len(INTRINSICS)].unsqueeze(1)
-    moves = to_intrinsics @ torch.linalg.inv_ex(others)[0]
-    moved = share.unsqueeze(-1) * (moves @ u.unsqueeze(-1)).squeeze(-1).square()
-    expected = share.unsqueeze(-1) * ((moves @ K) * moves).sum(-1)
-    moved, expected = moved.sum(1), expected.sum(1)
-    free = expected > 0
+    moves = (W if basis is None else basis @ W)[:, : len(INTRINSICS)].unsqueeze(1)
+    moved = (share.unsqueeze(-1) * (moves @ u.unsqueeze(-1)).squeeze(-1).square()).sum(1)
+    of_view = share.unsqueeze(-1) * ((moves @ K) * moves).sum(-1).clamp(min=0)
+    expected, free = of_view.sum(1), (of_view > 0).any(1)
     phi = torch.where(free, moved / torch.where(free, expected, 1.0), 0.0).sum(-1) / free.sum(-1).clamp(min=1)
-    told = S.diagonal(dim1=-2, dim2=-1).sum(-1) > 0
-    spare = _directions(basis) * ((share * told).sum(-1) - 1)
-    return Contradiction(phi, torch.where(free.any(-1), spare, 0.0).clamp(min=1e-9), told.sum(-1))
+    # Views tell these parameters unequally: the fewer do, the more is chance (Satterthwaite 1946).
+    alike = torch.where(share > 0, 1 / share, 0.0).unsqueeze(-1)
+    equal = torch.where(free, expected.square() / (alike * of_view.square()).sum(1).clamp(min=1e-300), torch.inf)
+    spare = _directions(basis) * (equal.amin(-1) - 1)
+    return Contradiction(phi, torch.where(free.any(-1), spare, 0.0).clamp(min=1e-9), equal.amin(-1))
 
 
 def _moved_intrinsics(found: Fit, shared: Tensor, local: tuple[Tensor, ...]) -> Contradiction:
