@@ -20,7 +20,7 @@ _LINE = re.compile(r"([A-Za-z][\w ]*?)\s*:\s*(.*)")
 
 def recognises(document: Document) -> bool:
     """Whether it has lines `P0:` or `P_rect_00:` of 12 numbers."""
-    return re.search(r"^(P[0-3]|P_rect_\d\d):(\s+[-+.\deE]+){3}", document.text or "", re.MULTILINE) is not None
+    return re.search(r"^(P[0-3]|P_rect_\d\d):([ \t]+[-+.\deE]+){3}", document.text or "", re.MULTILINE) is not None
 
 
 def read(document: Document) -> Found:

@@ -1,9 +1,9 @@
 """Settings of ORB-SLAM, stella and VINS, and other files with `fx fy cx cy` and `k1 k2 p1 p2 [k3]` one by one.
 
-ORB-SLAM writes them flat (`Camera.fx`, `Camera1.fx`), stella in a mapping `Camera`, VINS in `projection_parameters` and
-`distortion_parameters`. Integer pixel centres. A fisheye only where the file says so: `KannalaBrandt8`, `fisheye`,
-VINS's `KANNALA_BRANDT` with k2 to k5. `Stereo.T_c1_c2` and `Tlr` take the second camera to the first, the world; poses
-in a body are not taken.
+ORB-SLAM writes them flat (`Camera.fx`, `Camera1.fx`; of some pairs `Camera.fx` and `Camera2.fx`), stella in a mapping
+`Camera`, VINS in `projection_parameters` and `distortion_parameters`. Integer pixel centres. A fisheye only where the
+file says so: `KannalaBrandt8`, `fisheye`, VINS's `KANNALA_BRANDT` with k2 to k5. `Stereo.T_c1_c2` and `Tlr` take the
+second camera to the first, the world; poses in a body are not taken.
 """
 
 import re
@@ -48,7 +48,7 @@ def read(document: Document) -> Found:
     """
     tree = document.mapping
     fields = _cameras(tree)
-    common = fields.pop("Camera", {}) if len(fields) > 1 else {}
+    common = _common(fields)
     cameras = {name: _camera(common | own, None) for name, own in fields.items()}
     poses = [key for key in SECOND_TO_FIRST if key in tree]
     if len(cameras) == 2 and poses:
@@ -71,6 +71,14 @@ def _cameras(tree: dict[str, Any]) -> dict[str, dict[str, Any]]:
     if isinstance(tree.get("projection_parameters"), dict) and "model_type" in tree:
         return {"camera": tree}
     return {"camera": tree} if _is_whole(tree) else {}
+
+
+def _common(fields: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """What holds for every camera: of `Camera`, taken out where it is none, all but focal lengths and lens."""
+    if len(fields) == 1 or "Camera" not in fields:
+        return {}
+    common = fields["Camera"] if _is_whole(fields["Camera"]) else fields.pop("Camera")
+    return {key: value for key, value in common.items() if key not in (*FOCAL, *ORDER)}
 
 
 def _is_whole(fields: dict[str, Any]) -> bool:

@@ -1,0 +1,120 @@
+"""Odd features of real files, each read as its program means it, or refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import diffproj as dp
+from tests.files.samples import SAMPLES, mat
+from tests.files.test_readers import load, numbers, poses
+
+TURN = [[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]]
+
+ORB_PAIR = """%YAML:1.0
+Camera.type: "PinHole"
+Camera.fx: 190.5
+Camera.fy: 191.5
+Camera.cx: 254.5
+Camera.cy: 256.5
+Camera.k1: 0.1
+Camera.k2: 0.2
+Camera.p1: 0.01
+Camera.p2: 0.02
+Camera.k3: 0.3
+Camera2.fx: 180.5
+Camera2.fy: 181.5
+Camera2.cx: 252.5
+Camera2.cy: 253.5
+Camera2.k1: -0.1
+Camera2.k2: -0.2
+Camera2.p1: -0.01
+Camera2.p2: -0.02
+Tlr: !!opencv-matrix
+  rows: 3
+  cols: 4
+  dt: f
+  data:[ 0.6, -0.8, 0, 0.1,
+         0.8, 0.6, 0, 0.2,
+         0, 0, 1, 0.3]
+Camera.width: 512
+Camera.height: 500
+Viewer.PointSize:2
+"""
+
+
+def test_settings_of_a_pair_whose_first_camera_has_no_number(tmp_path: Path) -> None:
+    first, second = (load(tmp_path, "pair.yaml", ORB_PAIR, camera=i) for i in (0, 1))
+    assert numbers(first) == ([190.5, 191.5, 254.5, 256.5], [0.1, 0.2, 0.01, 0.02, 0.3])
+    assert numbers(second) == ([180.5, 181.5, 252.5, 253.5], [-0.1, -0.2, -0.01, -0.02])  # and not the first one's k3
+    assert first.size == second.size == (512, 500)
+    left_from_right = np.vstack([np.column_stack([TURN, [0.1, 0.2, 0.3]]), [0, 0, 0, 1]])
+    np.testing.assert_allclose(poses(second), np.linalg.inv(left_from_right), atol=1e-15)
+    assert torch.equal(first.t, torch.zeros(3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("comment", [" # the type has to be said at the top", "\t#", "  "])
+def test_a_comment_behind_opencvs_directive(tmp_path: Path, comment: str) -> None:
+    camera = load(tmp_path, "camchain.yaml", f"%YAML:1.0{comment}\n" + SAMPLES["camchain.yaml"].decode(), camera="cam0")
+    assert torch.equal(camera.K, load(tmp_path, "camchain.yaml", camera="cam0").K)
+
+
+def test_kitti_is_told_by_lines(tmp_path: Path) -> None:
+    """A plain YAML of a stereo pair has `P1:` too, with lists in the lines below it."""
+    rows = "".join(f"- - {row[0]}\n  - {row[1]}\n  - {row[2]}\n" for row in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    text = f"P1:\n{rows}- - 0.0\n  - 0.0\n  - 1.0\n" + "camera_matrix: [[500, 0, 320], [0, 500, 240], [0, 0, 1]]\n"
+    assert numbers(load(tmp_path, "stereo.yaml", text)) == ([500.0, 500.0, 320.0, 240.0], [])
+
+
+@pytest.mark.parametrize(("said", "kind"), [("0.", dp.BrownConrady), ("1.", dp.KannalaBrandt)])
+def test_a_flag_that_is_written_with_a_point(tmp_path: Path, said: str, kind: type) -> None:
+    text = f"fisheye_model: {said}\nK: [[500, 0, 320], [0, 500, 240], [0, 0, 1]]\nD: [0.1, 0.01, 0.001, 0.002]\n"
+    assert type(load(tmp_path, "camera.yml", text).distortion) is kind
+
+
+def test_four_coefficients_of_bouguets_may_be_a_fisheyes(tmp_path: Path) -> None:
+    five, four = "0.1 ; -0.2 ; 0.001 ; 0.002 ; 0 ]", "0.1 ; -0.2 ; 0.001 ; 0.002 ]"
+    text = f"fc = [ 500 ; 501 ];\ncc = [ 320 ; 240 ];\nkc = [ {five};\nnx = 640;\nny = 480;\n"
+    assert numbers(load(tmp_path, "Calib_Results.m", text))[1] == [0.1, -0.2, 0.001, 0.002, 0.0]
+    with pytest.raises(ValueError, match="kc: want 5 coefficients, got 4, which may be those of the toolbox's fisheye"):
+        load(tmp_path, "Calib_Results.m", text.replace(five, four))
+    assert numbers(load(tmp_path, "Calib_Results.m", text.replace(five, "0 ; 0 ; 0 ; 0 ]")))[1] == [0.0] * 4
+
+
+def test_matlabs_stereo_pair_stands_as_it_says(tmp_path: Path) -> None:
+    def camera(focal: float) -> dict[str, object]:
+        return {
+            "RadialDistortion": [-0.3, 0.1],
+            "TangentialDistortion": [0.001, 0.002],
+            "ImageSize": [480, 640],
+            "IntrinsicMatrix": [[focal, 0.0, 0.0], [0.0, focal, 0.0], [321.0, 241.0, 1.0]],
+        }
+
+    R, t = np.array(TURN), [-120.0, 1.0, 2.0]
+    pair: dict[str, object] = {
+        "CameraParameters1": camera(700.0),
+        "CameraParameters2": camera(710.0),
+        "RotationOfCamera2": R.T.tolist(),
+        "TranslationOfCamera2": t,
+    }
+    nested: dict[str, object] = {"stereoParams": pair}
+    for name, content in (
+        ("a.json", json.dumps(pair)),
+        ("b.json", json.dumps(nested)),
+        ("a.mat", mat(pair)),
+        ("b.mat", mat(nested)),
+    ):
+        first, second = (load(tmp_path, name, content, camera=f"CameraParameters{i}") for i in (1, 2))
+        assert (numbers(first)[0][0], numbers(second)[0][0]) == (700.0, 710.0)
+        # MATLAB multiplies from the left: [x y z] R + t
+        X = np.array([0.3, -0.2, 4.0])
+        at_second = X @ R.T + t
+        np.testing.assert_allclose(second.R.numpy() @ X + second.t.numpy(), at_second, atol=1e-12)
+        assert not first.t.any()
+    del pair["TranslationOfCamera2"]
+    with pytest.raises(ValueError, match="TranslationOfCamera2: want it beside RotationOfCamera2, got none"):
+        load(tmp_path, "a.json", json.dumps(pair))
+    del pair["RotationOfCamera2"]
+    assert not load(tmp_path, "a.json", json.dumps(pair)).t.any()
