@@ -3,7 +3,8 @@
 ORB-SLAM writes them flat (`Camera.fx`, `Camera1.fx`; of some pairs `Camera.fx` and `Camera2.fx`), stella in a mapping
 `Camera`, VINS in `projection_parameters` and `distortion_parameters`. Integer pixel centres. A fisheye only where the
 file says so: `KannalaBrandt8`, `fisheye`, VINS's `KANNALA_BRANDT` with k2 to k5. `Stereo.T_c1_c2` and `Tlr` take the
-second camera to the first, the world; poses in a body are not taken.
+second camera to the first, the world; poses in a body are not taken. Where a pair stands beside the camera as it is
+before rectification (`stereo_rectifier`), those are the cameras, and `"rectified"` is asked for by its name.
 """
 
 import re
@@ -14,6 +15,7 @@ from diffproj.files.found import Found
 from diffproj.files.lenses import brown, fisheye, kind_of
 from diffproj.files.named import check_no_lens, check_no_lens_key, holds_matrix
 from diffproj.files.numbers import camera_of, focal_lengths, image_size, inverse, number, rigid
+from diffproj.files.stereo_rectifier import raw_cameras, raw_sides
 from diffproj.geometry.camera import Camera
 from diffproj.lens.protocol import Lens
 
@@ -37,11 +39,12 @@ SECOND_TO_FIRST = ("Stereo.T_c1_c2", "Tlr")
 
 def recognises(document: Document) -> bool:
     """Whether it has focal lengths and principal point one by one."""
-    return bool(_cameras(document.mapping)) and not holds_matrix(document.mapping)
+    tree = document.mapping
+    return bool(_cameras(tree)) and (bool(raw_sides(tree)) or not holds_matrix(tree))
 
 
 def read(document: Document) -> Found:
-    """The cameras, the second of a stereo pair beside the first.
+    """The cameras, the second of a stereo pair beside the first; those before rectification where there are any.
 
     Raises:
         ValueError: something is missing or not understood.
@@ -50,6 +53,9 @@ def read(document: Document) -> Found:
     fields = _cameras(tree)
     common = _common(fields)
     cameras = {name: _camera(common | own, None) for name, own in fields.items()}
+    if raw_sides(tree) and len(cameras) == 1:
+        ((name, rectified),) = cameras.items()
+        return Found(raw_cameras(tree, fields[name], rectified), {"rectified": rectified})
     poses = [key for key in SECOND_TO_FIRST if key in tree]
     if len(cameras) == 2 and poses:
         second = list(cameras)[1]

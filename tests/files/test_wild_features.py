@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -118,3 +119,65 @@ def test_matlabs_stereo_pair_stands_as_it_says(tmp_path: Path) -> None:
         load(tmp_path, "a.json", json.dumps(pair))
     del pair["RotationOfCamera2"]
     assert not load(tmp_path, "a.json", json.dumps(pair)).t.any()
+
+
+def _rectified_pair() -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """R and T of a pair, and R1 R2 P1 P2 of OpenCV's rectification."""
+    K = np.array([[450.0, 0, 370], [0, 451, 245], [0, 0, 1]])
+    R, T = cv2.Rodrigues(np.array([0.02, -0.03, 0.01]))[0], np.array([-0.11, 0.004, -0.002])
+    found = cv2.stereoRectify(K, np.zeros(5), K, np.zeros(5), (752, 480), R, T[:, None])
+    return R, T, [np.asarray(one) for one in found[:4]]
+
+
+def _orb_before_rectification(turns: list[np.ndarray], P: np.ndarray, shift: float) -> str:
+    def block(key: str, values: np.ndarray) -> str:
+        rows, columns = np.atleast_2d(values).shape
+        data = ", ".join(map(repr, np.ravel(values).tolist()))
+        return f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data:[{data}]\n"
+
+    lines = f"%YAML:1.0\nCamera.fx: {P[0, 0]}\nCamera.fy: {P[1, 1]}\nCamera.cx: {P[0, 2]}\nCamera.cy: {P[1, 2]}\n"
+    lines += "Camera.k1: 0.0\nCamera.k2: 0.0\nCamera.p1: 0.0\nCamera.p2: 0.0\n"
+    lines += f"Camera.width: 752\nCamera.height: 480\nCamera.bf: {shift}\nLEFT.width: 752\nLEFT.height: 480\n"
+    for side, focal, turn in (("LEFT", 458.5, turns[0]), ("RIGHT", 457.5, turns[1])):
+        lines += block(f"{side}.K", np.array([[focal, 0, 367], [0, focal + 1, 248], [0, 0, 1]]))
+        lines += block(f"{side}.D", np.array([-0.28, 0.07, 0.0002, 1e-05, 0.0])) + block(f"{side}.R", turn)
+    return lines
+
+
+def _stella_before_rectification(turns: list[np.ndarray], P: np.ndarray, shift: float, model: str) -> str:
+    camera = {"fx": P[0, 0], "fy": P[1, 1], "cx": P[0, 2], "cy": P[1, 2], "cols": 752, "rows": 480}
+    camera |= {"model": "perspective", "focal_x_baseline": shift, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "k3": 0.0}
+    raw: dict[str, object] = {"model": model}
+    for side, focal, turn in (("left", 458.5, turns[0]), ("right", 457.5, turns[1])):
+        raw[f"K_{side}"] = [focal, 0, 367, 0, focal + 1, 248, 0, 0, 1]
+        raw[f"D_{side}"] = [-0.28, 0.07, 0.0002, 1e-05, 0.0][: 4 if model == "fisheye" else 5]
+        raw[f"R_{side}"] = turn.ravel().tolist()
+    return json.dumps({"Camera": camera, "StereoRectifier": raw})
+
+
+@pytest.mark.parametrize("model", ["orb", "perspective", "fisheye"])
+def test_settings_of_a_rectified_pair_have_the_cameras_before_it(tmp_path: Path, model: str) -> None:
+    R, T, (R1, R2, P1, P2) = _rectified_pair()
+    if model == "orb":
+        text = _orb_before_rectification([R1, R2], P1, -P2[0, 3])
+    else:
+        text = _stella_before_rectification([R1, R2], P1, -P2[0, 3], model)
+    left, right, rectified = (load(tmp_path, "pair.yaml", text, camera=name) for name in ("left", "right", "rectified"))
+    assert (numbers(left)[0], numbers(right)[0]) == ([458.5, 459.5, 367.0, 248.0], [457.5, 458.5, 367.0, 248.0])
+    assert type(left.distortion) is (dp.KannalaBrandt if model == "fisheye" else dp.BrownConrady)
+    assert left.size == right.size == (752, 480)
+    np.testing.assert_allclose(poses(left), np.eye(4))
+    np.testing.assert_allclose(poses(right)[:3], np.column_stack([R, T]), atol=1e-12)
+    np.testing.assert_allclose(rectified.K.numpy(), P1[:, :3])
+    assert not rectified.t.any()
+
+
+@pytest.mark.parametrize(
+    ("old", "message"),
+    [("Camera.bf: ", "want bf, baseline times focal length"), ("RIGHT.R: ", "right camera: want K, D and R before")],
+)
+def test_a_pair_before_rectification_is_whole(tmp_path: Path, old: str, message: str) -> None:
+    _, _, (R1, R2, P1, P2) = _rectified_pair()
+    text = _orb_before_rectification([R1, R2], P1, -P2[0, 3])
+    with pytest.raises(ValueError, match=message):
+        load(tmp_path, "pair.yaml", text.replace(old, f"Other{old}"))
