@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from diffproj.calibration.results.calibration import Calibration
-from diffproj.files import named
+from diffproj.files import named, poses_beside
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.geometry.camera import Camera
@@ -39,10 +39,16 @@ def read(document: Document) -> Found:
         return named.read(tree if isinstance(tree, dict) else {})
     named.check_no_lens(document.tree, list(holders.values()))
     cameras: dict[str, Camera] = {}
+    unread: list[str] = []
     for name, holder in holders.items():
-        for inner, camera in named.read(holder).cameras.items():
+        found = named.read(holder)
+        for inner, camera in found.cameras.items():
             cameras[name if inner == "camera" else f"{name} {inner}"] = camera
-    return Found(cameras)
+        unread += [f"{name}.{key}" for key in found.unread]
+    if isinstance(document.tree, dict):
+        cameras, keys = named.posed(cameras, document.tree)
+        unread += poses_beside.unread(document.tree, keys | set(holders))
+    return Found(cameras, unread=tuple(unread))
 
 
 def _holders(tree: Any) -> dict[str, dict[str, Any]]:
