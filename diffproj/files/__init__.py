@@ -35,7 +35,7 @@ What each says, where it differs from here:
 | `"kalibr"` | | IMU, or the camera before, to camera | `radtan` 4, `equidistant` 4 |
 | `"numpy"` | | | 4 need `camera_model` |
 | `"kitti"` | | t = K^-1 P[:, 3]; raw: camera 0 to camera | none; raw: 5 |
-| `"nuscenes"` | | sensor to vehicle | none; Argoverse: k1 k2 k3 |
+| `"nuscenes"` | | sensor to vehicle | none; nuImages: 5; Argoverse: k1 k2 k3 |
 | `"open3d"` | | | matrices column by column |
 | `"settings"` | | second camera to first; none in a body | by the type; VINS's fisheye k2 to k5 |
 | `"mrcal"` | | reference to camera | |

@@ -77,8 +77,8 @@ def found_in(document: Document, format: FormatName | None = None) -> Found:  # 
             _check_size(one, own=own_json.recognises(document))
     except DAMAGE as error:
         raise _refusal(document, error) from error
-    if found.unread:
-        warn_caller(f"{document.path}: {poses_beside.remark(found.unread)}")
+    for remark in (*found.remarks, *([poses_beside.remark(found.unread)] if found.unread else [])):
+        warn_caller(f"{document.path}: {remark}")
     return found
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from diffproj.calibration.results.calibration import Calibration
+from diffproj.files import poses_beside
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import coefficients, is_fisheye, kind_of, lens_of
@@ -110,7 +111,8 @@ def _camera(fields: dict[str, Any]) -> Found:
         if P[0, 0] > 0:
             K_rectified = intrinsics("projection_matrix", P[:, :3])
             aside["rectified"] = camera_of(K_rectified, None, size, (np.eye(3), np.linalg.solve(K_rectified, P[:, 3])))
-    return Found({"camera": camera_of(K, lens_of(kind, found), size)}, aside)
+    unread = tuple(poses_beside.unread(fields, set()))
+    return Found({"camera": camera_of(K, lens_of(kind, found), size)}, aside, unread)
 
 
 def _of_old(fields: dict[str, Any]) -> bool:

@@ -10,7 +10,7 @@ import pytest
 
 import diffproj as dp
 from diffproj import cli
-from tests.files.samples import npz
+from tests.files.samples import ROS, npz
 from tests.files.test_readers import load, poses
 
 K = [[500.0, 0.0, 320.0], [0.0, 501.0, 240.0], [0.0, 0.0, 1.0]]
@@ -93,3 +93,9 @@ def test_the_command_line_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert cli.main([command, *(str(tmp_path / name) for name in files)]) == 0
         assert "R, T: a pose that is not read" in capsys.readouterr().err
     assert dp.load_camera(tmp_path / "b.json").size is None
+
+
+def test_a_pose_beside_a_camera_info_is_not_dropped_in_silence(tmp_path: Path) -> None:
+    pose = f"T_cam_lidar: {[*RT, [0, 0, 0, 1]]}\n"
+    with pytest.warns(UserWarning, match="T_cam_lidar: a pose that is not read"):
+        load(tmp_path, "ost.yaml", ROS + pose)

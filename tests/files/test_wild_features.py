@@ -181,3 +181,30 @@ def test_a_pair_before_rectification_is_whole(tmp_path: Path, old: str, message:
     text = _orb_before_rectification([R1, R2], P1, -P2[0, 3])
     with pytest.raises(ValueError, match=message):
         load(tmp_path, "pair.yaml", text.replace(old, f"Other{old}"))
+
+
+def test_nuimages_has_lenses(tmp_path: Path) -> None:
+    sensors = json.loads(SAMPLES["calibrated_sensor.json"])
+    D = [-0.3, 0.1, 0.001, 0.002, 0.03]
+    for given in (D, [*D, 0.0], []):
+        sensors[1]["camera_distortion"] = given
+        assert numbers(load(tmp_path, "calibrated_sensor.json", json.dumps(sensors)))[1] == given[:5]
+    sensors[1]["camera_distortion"] = [*D, 0.01]
+    with pytest.raises(ValueError, match=r"camera_distortion, k4: want 0, got 0\.01: it is a factor of r\^8"):
+        load(tmp_path, "calibrated_sensor.json", json.dumps(sensors))
+
+
+def test_kittis_tracking_set_has_lines_without_a_colon(tmp_path: Path) -> None:
+    lines = SAMPLES["calib.txt"].decode().splitlines()[:4]
+    lines += ["R_rect 9.99e-01 9.8e-03 -7.4e-03 -9.8e-03 9.99e-01 -4.2e-03 7.4e-03 4.3e-03 9.99e-01", "Tr_velo_cam 1 2"]
+    got = load(tmp_path, "calib.txt", "\n".join(lines) + "\n", camera="P2")
+    assert torch.equal(got.K, load(tmp_path, "calib.txt", camera="P2").K)
+    with pytest.raises(ValueError, match="want lines of a name, a colon and numbers, got 'R_rect left right'"):
+        load(tmp_path, "calib.txt", "\n".join([*lines[:4], "R_rect left right"]))
+
+
+def test_metashape_says_which_cameras_of_a_rig_it_leaves_out(tmp_path: Path) -> None:
+    follower = '<camera id="7" sensor_id="0" master_id="0" label="right_1"/></cameras>'
+    text = SAMPLES["cameras.xml"].decode().replace("</cameras>", follower)
+    with pytest.warns(UserWarning, match=r"cameras: 1 follow the first camera of a rig, such as right_1, and are not"):
+        load(tmp_path, "cameras.xml", text, camera="DJI_0001")
