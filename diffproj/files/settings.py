@@ -10,6 +10,7 @@ before rectification (`stereo_rectifier`), those are the cameras, and `"rectifie
 import re
 from typing import Any
 
+from diffproj.files import poses_beside
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import brown, fisheye, kind_of
@@ -60,7 +61,8 @@ def read(document: Document) -> Found:
     if len(cameras) == 2 and poses:
         second = list(cameras)[1]
         cameras[second] = _camera(common | fields[second], inverse(rigid(poses[0], tree[poses[0]])))
-    return Found(cameras)
+    plain = list(fields) == ["camera"] and fields["camera"] is tree
+    return Found(cameras, unread=tuple(poses_beside.unread(tree, set())) if plain else ())
 
 
 def _cameras(tree: dict[str, Any]) -> dict[str, dict[str, Any]]:

@@ -99,3 +99,20 @@ def test_a_pose_beside_a_camera_info_is_not_dropped_in_silence(tmp_path: Path) -
     pose = f"T_cam_lidar: {[*RT, [0, 0, 0, 1]]}\n"
     with pytest.warns(UserWarning, match="T_cam_lidar: a pose that is not read"):
         load(tmp_path, "ost.yaml", ROS + pose)
+
+
+def test_cameras_in_a_list_stand_where_they_say(tmp_path: Path) -> None:
+    cameras = [{"name": f"00_0{i}", "K": K, "distCoef": D, "resolution": [640, 480]} for i in range(3)]
+    posed = [camera | {"R": R, "t": [[x] for x in T]} for camera in cameras]
+    for tree in (posed, {"calibDataSource": "a", "cameras": posed}):
+        every = load(tmp_path, "plain.json", json.dumps(tree))
+        assert every.batch_shape == (3,)
+        np.testing.assert_allclose(poses(load(tmp_path, "plain.json", json.dumps(tree), camera="00_02"))[:3], RT)
+    with pytest.raises(ValueError, match="want the lens in the same mapping"):
+        load(tmp_path, "plain.json", json.dumps({"cameras": [{"name": "a", "K": K}], "distCoef": D}))
+
+
+def test_a_pose_beside_numbers_one_by_one_is_not_dropped_in_silence(tmp_path: Path) -> None:
+    tree = {"fx": 500.0, "fy": 501.0, "cx": 320.0, "cy": 240.0, "rvec": [0.1, -0.2, 0.3], "tvec": T}
+    with pytest.warns(UserWarning, match="rvec, tvec: a pose that is not read"):
+        load(tmp_path, "plain.json", json.dumps(tree))
