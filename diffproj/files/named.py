@@ -97,6 +97,15 @@ def holds_matrix(mapping: dict[str, Any]) -> bool:
     return any(_is_matrix(*_parted(key), value) for key, value in mapping.items())
 
 
+def misfit(mapping: dict[str, Any]) -> str:
+    """What stands under a name of K and is none, in words; empty where there is nothing of the kind."""
+    for key, value in mapping.items():
+        core = _parted(key)[1]
+        if core in MATRICES and len(core) > 2 and (value is None or isinstance(value, str | int | float)):
+            return f"{key}: want 3 x 3 numbers, got {described(value)}"
+    return ""
+
+
 def _is_matrix(label: str, core: str, value: Any) -> bool:
     """Whether a key and what it holds may be K; lists of mappings are cameras of other programs."""
     if core not in MATRICES or (core == "m" and not label):

@@ -208,3 +208,11 @@ def test_metashape_says_which_cameras_of_a_rig_it_leaves_out(tmp_path: Path) -> 
     text = SAMPLES["cameras.xml"].decode().replace("</cameras>", follower)
     with pytest.warns(UserWarning, match=r"cameras: 1 follow the first camera of a rig, such as right_1, and are not"):
         load(tmp_path, "cameras.xml", text, camera="DJI_0001")
+
+
+@pytest.mark.parametrize(
+    ("given", "said"), [(0, "0"), (None, "nothing"), ("calib.npz", r"'calib\.npz' in quotes"), (float("nan"), "nan")]
+)
+def test_what_is_no_camera_matrix_under_its_name_is_named(tmp_path: Path, given: object, said: str) -> None:
+    with pytest.raises(ValueError, match=rf"camera_matrix: want 3 x 3 numbers, got {said}$"):
+        load(tmp_path, "plain.json", json.dumps({"camera_matrix": given, "distortion_coefficients": 0}))
