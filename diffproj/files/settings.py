@@ -3,12 +3,15 @@
 ORB-SLAM writes them flat (`Camera.fx`, `Camera1.fx`; of some pairs `Camera.fx` and `Camera2.fx`), stella in a mapping
 `Camera`, VINS in `projection_parameters` and `distortion_parameters`. Integer pixel centres. A fisheye only where the
 file says so: `KannalaBrandt8`, `fisheye`, VINS's `KANNALA_BRANDT` with k2 to k5. `Stereo.T_c1_c2` and `Tlr` take the
-second camera to the first, the world; poses in a body are not taken. Where a pair stands beside the camera as it is
-before rectification (`stereo_rectifier`), those are the cameras, and `"rectified"` is asked for by its name.
+second camera to the first, the world; so does `Stereo.b`, along x, where both are rectified. Poses in a body are not
+taken. Where a pair stands beside the camera as it is before rectification (`stereo_rectifier`), those are the cameras,
+and `"rectified"` is asked for by its name.
 """
 
 import re
 from typing import Any
+
+import numpy as np
 
 from diffproj.files import poses_beside
 from diffproj.files.document import Document
@@ -36,6 +39,8 @@ SIZES = (("width", "height"), ("image_width", "image_height"), ("cols", "rows"))
 TYPES = ("type", "model", "model_type", "camera_model")
 PERSPECTIVE = ("pinhole", "perspective", "rectified")
 SECOND_TO_FIRST = ("Stereo.T_c1_c2", "Tlr")
+BASELINE = "Stereo.b"
+"""Of a rectified pair, to the right."""
 
 
 def recognises(document: Document) -> bool:
@@ -58,9 +63,10 @@ def read(document: Document) -> Found:
         ((name, rectified),) = cameras.items()
         return Found(raw_cameras(tree, fields[name], rectified), {"rectified": rectified})
     poses = [key for key in SECOND_TO_FIRST if key in tree]
-    if len(cameras) == 2 and poses:
+    if len(cameras) == 2 and (poses or BASELINE in tree):
         second = list(cameras)[1]
-        cameras[second] = _camera(common | fields[second], inverse(rigid(poses[0], tree[poses[0]])))
+        pose = inverse(rigid(poses[0], tree[poses[0]])) if poses else (np.eye(3), _along_x(tree[BASELINE]))
+        cameras[second] = _camera(common | fields[second], pose)
     plain = list(fields) == ["camera"] and fields["camera"] is tree
     return Found(cameras, unread=tuple(poses_beside.unread(tree, set())) if plain else ())
 
@@ -79,6 +85,11 @@ def _cameras(tree: dict[str, Any]) -> dict[str, dict[str, Any]]:
     if isinstance(tree.get("projection_parameters"), dict) and "model_type" in tree:
         return {"camera": tree}
     return {"camera": tree} if _is_whole(tree) else {}
+
+
+def _along_x(baseline: Any) -> np.ndarray:
+    """The translation to a right camera that stands so far to the right."""
+    return np.array([-number(BASELINE, baseline), 0.0, 0.0])
 
 
 def _common(fields: dict[str, dict[str, Any]]) -> dict[str, Any]:

@@ -216,3 +216,13 @@ def test_metashape_says_which_cameras_of_a_rig_it_leaves_out(tmp_path: Path) -> 
 def test_what_is_no_camera_matrix_under_its_name_is_named(tmp_path: Path, given: object, said: str) -> None:
     with pytest.raises(ValueError, match=rf"camera_matrix: want 3 x 3 numbers, got {said}$"):
         load(tmp_path, "plain.json", json.dumps({"camera_matrix": given, "distortion_coefficients": 0}))
+
+
+def test_a_rectified_pair_stands_apart_by_its_baseline(tmp_path: Path) -> None:
+    intrinsics = {"fx": 500.0, "fy": 501.0, "cx": 320.0, "cy": 240.0}
+    lines = ["%YAML:1.0", 'Camera.type: "Rectified"', "Camera.width: 640", "Camera.height: 480", "Stereo.b: 0.54"]
+    lines += [f"Camera{i}.{key}: {x}" for i in (1, 2) for key, x in intrinsics.items()]
+    both = load(tmp_path, "pair.yaml", "\n".join(lines))
+    assert both.t.tolist() == [[0.0, 0.0, 0.0], [-0.54, 0.0, 0.0]]
+    assert both.distortion is None
+    assert both.size == (640, 480)
