@@ -160,7 +160,7 @@ def _sections(text: str) -> dict[str, dict[str, Any]]:
     for line in lines:
         if line[0] == "[":
             if line in sections:
-                raise ValueError(f"{line}: want the section once, got it twice")
+                raise ValueError(f"{line}: want the section once, got it twice; split the file by cameras")
             section = sections[line] = {}
         elif re.fullmatch(r"[a-z ]+", line):
             if line in section:
