@@ -97,6 +97,11 @@ def holds_matrix(mapping: dict[str, Any]) -> bool:
     return any(_is_matrix(*_parted(key), value) for key, value in mapping.items())
 
 
+def holds_lens(mapping: dict[str, Any]) -> bool:
+    """Whether a lens stands in a mapping under one of the names."""
+    return any(_parted(key)[1] in LENSES for key in mapping)
+
+
 def misfit(mapping: dict[str, Any]) -> str:
     """What stands under a name of K and is none, in words; empty where there is nothing of the kind."""
     for key, value in mapping.items():

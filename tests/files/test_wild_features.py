@@ -226,3 +226,12 @@ def test_a_rectified_pair_stands_apart_by_its_baseline(tmp_path: Path) -> None:
     assert both.t.tolist() == [[0.0, 0.0, 0.0], [-0.54, 0.0, 0.0]]
     assert both.distortion is None
     assert both.size == (640, 480)
+
+
+def test_a_rectification_beside_k_makes_no_camera_info(tmp_path: Path) -> None:
+    K = [[500.0, 0, 320], [0, 501, 240], [0, 0, 1]]
+    tree = {"K": K, "dist": [0.1, -0.2, 0.001, 0.002, 0.0], "R": np.eye(3).tolist(), "P": [[*row, 0] for row in K]}
+    assert numbers(load(tmp_path, "plain.json", json.dumps(tree))) == ([500.0, 501.0, 320.0, 240.0], tree["dist"])
+    del tree["dist"]
+    with pytest.raises(ValueError, match="want distortion_coefficients and distortion_model in a camera_info"):
+        load(tmp_path, "plain.json", json.dumps(tree))
