@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
         "aside": aside,
         "calibration": None if calibration is None else _of_calibration(calibration),
     }
-    doubts = [doubt for camera in told["cameras"].values() if camera is not None for doubt in camera["doubts"]]
+    doubts = _doubts(told["cameras"])
     if options.json:
         as_json({**told, "warnings": [*options.warned, *doubts]})
     else:
@@ -61,6 +61,16 @@ def run(options: argparse.Namespace) -> int:
     for doubt in doubts:
         alert(doubt)
     return 0
+
+
+def _doubts(cameras: dict[str, Any]) -> list[str]:
+    """What looks wrong, each once: frames of one camera have the same doubts."""
+    names: dict[str, list[str]] = {}
+    for name, camera in cameras.items():
+        for doubt in () if camera is None else camera["doubts"]:
+            names.setdefault(doubt.removeprefix(f"{name}: "), []).append(name)
+    others = {doubt: f" and {len(which) - 1} more" * (len(which) > 1) for doubt, which in names.items()}
+    return [f"{which[0]}{others[doubt]}: {doubt}" for doubt, which in names.items()]
 
 
 def _of_calibration(calibration: Calibration) -> dict[str, Any]:

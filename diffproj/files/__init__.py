@@ -20,7 +20,7 @@ or not at all.
 | `"open3d"` | `PinholeCameraIntrinsic`, `...Parameters` | K, size, pose; no lens | |
 | `"settings"` | ORB-SLAM, stella, VINS: `fx`, `k1`, ... one by one | K, lens, size; a stereo pair | |
 | `"mrcal"` | `.cameramodel` | PINHOLE, OPENCV4 to 12, with pose | |
-| `"matlab"` | `toStruct` in `.mat`, JSON; Bouguet's | K, lens, size | |
+| `"matlab"` | `toStruct` in `.mat`, JSON; Bouguet's | K, lens, size; a stereo pair | |
 | `"metashape"` | XML of cameras, or of one calibration | frame sensors, poses by label | |
 
 What each says, where it differs from here:
@@ -35,11 +35,11 @@ What each says, where it differs from here:
 | `"kalibr"` | | IMU, or the camera before, to camera | `radtan` 4, `equidistant` 4 |
 | `"numpy"` | | | 4 need `camera_model` |
 | `"kitti"` | | t = K^-1 P[:, 3]; raw: camera 0 to camera | none; raw: 5 |
-| `"nuscenes"` | | sensor to vehicle | none; Argoverse: k1 k2 k3 |
+| `"nuscenes"` | | sensor to vehicle | none; nuImages: 5; Argoverse: k1 k2 k3 |
 | `"open3d"` | | | matrices column by column |
 | `"settings"` | | second camera to first; none in a body | by the type; VINS's fisheye k2 to k5 |
 | `"mrcal"` | | reference to camera | |
-| `"matlab"` | first centre at 1; Bouguet's as here | none; Bouguet's: left to right | radial, tangential |
+| `"matlab"` | first centre at 1; Bouguet's as here | of a pair: left to right | radial, tangential |
 | `"metashape"` | from the image's middle | camera to chunk to world | P1 is p2, P2 is p1 |
 
 Pickles are never opened, and `cv2.FileStorage` reads nothing here. Files of other programs that are known and not read

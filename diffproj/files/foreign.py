@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 
+from diffproj.files import named
 from diffproj.files.document import Document
 
 CANNOT = "; build dp.Camera(K, R, t, lens, size) from its numbers"
@@ -43,6 +44,9 @@ def explanation(document: Document) -> str:
     for matches, what in KNOWN:
         if matches(document):
             return f"want a format that is read here, got {what}"
+    wrong = named.misfit(document.mapping)
+    if wrong:
+        return wrong
     if problem:
         return f"want a camera file, got one that is no format known here: {problem}"
     keys = [str(key) for key in tree if not str(key).startswith("<")] if isinstance(tree, dict) else []

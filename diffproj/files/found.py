@@ -19,10 +19,14 @@ class Found:
     Attributes:
         cameras: by name, in the file's order. One of them may be a batch, as the own JSON holds.
         aside: cameras that are to be asked for by name, such as the rectified one of a ROS file.
+        unread: what in the file holds poses that were not read.
+        remarks: what else is to be said of the file, in sentences.
     """
 
     cameras: dict[str, Camera]
     aside: dict[str, Camera] = field(default_factory=dict)
+    unread: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     def chosen(self, camera: str | int | None) -> Camera:
         """One camera, or a batch of all where they have one lens model and size.

@@ -1,4 +1,4 @@
-"""KITTI: `calib.txt` of the odometry and object sets, and `calib_cam_to_cam.txt` of the raw ones.
+"""KITTI: `calib.txt` of the odometry, object and tracking sets, and `calib_cam_to_cam.txt` of the raw ones.
 
 `P0` to `P3` are of rectified images: K is the left 3 x 3 numbers, there is no lens, and `t = K^-1 P[:, 3]` from the
 rectified camera 0, the world. In the raw sets `K_0x` and `D_0x` hold for raw images, with the pose `R_0x T_0x` from
@@ -15,12 +15,13 @@ from diffproj.files.lenses import brown
 from diffproj.files.numbers import camera_of, image_size, intrinsics, rigid, square, vector
 from diffproj.geometry.camera import Camera
 
-_LINE = re.compile(r"([A-Za-z][\w ]*?)\s*:\s*(.*)")
+_LINE = re.compile(r"([A-Za-z][\w ]*?)\s*:\s*(.*)|([A-Za-z]\w*)((?:\s+[-+.\deE]+)+)")
+"""A name, a colon and what follows, or as in the tracking set's `R_rect` and `Tr_velo_cam`, numbers without a colon."""
 
 
 def recognises(document: Document) -> bool:
     """Whether it has lines `P0:` or `P_rect_00:` of 12 numbers."""
-    return re.search(r"^(P[0-3]|P_rect_\d\d):(\s+[-+.\deE]+){3}", document.text or "", re.MULTILINE) is not None
+    return re.search(r"^(P[0-3]|P_rect_\d\d):([ \t]+[-+.\deE]+){3}", document.text or "", re.MULTILINE) is not None
 
 
 def read(document: Document) -> Found:
@@ -36,9 +37,10 @@ def read(document: Document) -> Found:
             if line.strip():
                 raise ValueError(f"want lines of a name, a colon and numbers, got {line[:60]!r}")
             continue
-        if parts[1] in fields:
-            raise ValueError(f"{parts[1]}: want the line once, got it twice")
-        fields[parts[1]] = _floats(parts[1], parts[2])
+        name, content = parts[1] or parts[3], parts[2] or parts[4] or ""
+        if name in fields:
+            raise ValueError(f"{name}: want the line once, got it twice")
+        fields[name] = _floats(name, content)
     for name in fields:
         if re.fullmatch(r"[DRT]_\d\d", name) and f"K_{name[2:]}" not in fields:
             raise ValueError(f"K_{name[2:]}: want the camera matrix beside {name}, got none")

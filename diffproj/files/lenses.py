@@ -51,7 +51,7 @@ def kind_of(name: str, value: object) -> Kind | None:
     Raises:
         ValueError: a model that is none of this package's.
     """
-    if isinstance(value, bool) or (isinstance(value, int) and value in (0, 1)):  # fisheye_model: 0
+    if isinstance(value, bool | int | float) and value in (0, 1):  # fisheye_model: 0
         return "fisheye" if value else "brown"
     model = str(value).strip().lower().replace("-", "_").replace(" ", "_")
     if model in PERSPECTIVE:

@@ -10,7 +10,7 @@ from diffproj._core.arguments import called, file_path
 from diffproj._core.warn import warn_caller
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.rigs.result import RigCalibration
-from diffproj.files import own_json
+from diffproj.files import own_json, poses_beside
 from diffproj.files.document import Document
 from diffproj.files.formats import FormatName, PathLike, format_of
 from diffproj.files.found import Found, NotOneCameraError
@@ -77,6 +77,8 @@ def found_in(document: Document, format: FormatName | None = None) -> Found:  # 
             _check_size(one, own=own_json.recognises(document))
     except DAMAGE as error:
         raise _refusal(document, error) from error
+    for remark in (*found.remarks, *([poses_beside.remark(found.unread)] if found.unread else [])):
+        warn_caller(f"{document.path}: {remark}")
     return found
 
 

@@ -2,7 +2,8 @@
 
 `IntrinsicMatrix` is transposed, `K` is not; both are one-based: 1 is taken off the principal point. `RadialDistortion`
 is k1 k2 and perhaps k3, `TangentialDistortion` p1 p2, `ImageSize` height, width. Bouguet's `fc cc kc alpha_c nx ny` are
-zero-based, with OpenCV's coefficients; `om` and `T` place the right camera beside the left one.
+zero-based, with OpenCV's coefficients; `om` and `T` place the right camera beside the left one. Those of
+`toStruct(stereoParams)` are `RotationOfCamera2`, which is transposed too, and `TranslationOfCamera2`.
 """
 
 import re
@@ -15,10 +16,13 @@ from diffproj.files import mat5
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import brown
-from diffproj.files.numbers import camera_of, focal_lengths, image_size, intrinsics, matrix, vector
+from diffproj.files.numbers import camera_of, focal_lengths, image_size, intrinsics, matrix, rigid, square, vector
 from diffproj.geometry.camera import Camera
 
 HDF5 = b"\x89HDF"
+PAIR = ("CameraParameters1", "CameraParameters2")
+"""The cameras of `toStruct(stereoParams)`."""
+
 TO_STRUCT = "s = toStruct(cameraParams); save('camera.mat', '-struct', 's', '-v7')"
 
 
@@ -27,11 +31,12 @@ def recognises(document: Document) -> bool:
     if document.data.startswith((b"MATLAB", HDF5)):
         return True
     tree = document.mapping
-    return _is_struct(tree) or any(_is_struct(value) for value in tree.values()) or _is_bouguet_text(document)
+    found = any(_is_struct(value) or _is_stereo(value) for value in (tree, *tree.values()))
+    return found or _is_bouguet_text(document)
 
 
 def read(document: Document) -> Found:
-    """The camera, or Bouguet's stereo pair.
+    """The camera, or the stereo pair.
 
     Raises:
         ValueError: it holds MATLAB's objects, or something is missing or not understood.
@@ -46,6 +51,9 @@ def read(document: Document) -> Found:
         fields = document.mapping
     if "fc" in fields or "fc_left" in fields:
         return _bouguet(fields)
+    stereo = next((holder for holder in (fields, *fields.values()) if _is_stereo(holder)), None)
+    if stereo is not None:
+        return Found(_pair(stereo))
     structs = {name: value for name, value in {"": fields, **fields}.items() if _is_struct(value)}
     if not structs:
         if any(isinstance(value, mat5.Unreadable) for value in fields.values()):
@@ -57,6 +65,24 @@ def read(document: Document) -> Found:
 
 def _is_struct(fields: Any) -> bool:
     return isinstance(fields, dict) and "RadialDistortion" in fields
+
+
+def _is_stereo(fields: Any) -> bool:
+    return isinstance(fields, dict) and all(_is_struct(fields.get(name)) for name in PAIR)
+
+
+def _pair(fields: dict[str, Any]) -> dict[str, Camera]:
+    """The two cameras of `stereoParameters`, the second at its place beside the first where the file has it."""
+    first, second = (_camera(fields[name]) for name in PAIR)
+    turn, shift = "RotationOfCamera2", "TranslationOfCamera2"  # for rows of points times the rotation: transposed
+    missing = [key for key in (turn, shift) if key not in fields]
+    if len(missing) == 1:
+        raise ValueError(f"{missing[0]}: want it beside {turn if missing[0] == shift else shift}, got none")
+    if not missing:
+        R, t = square(turn, fields[turn], 3, 3).T, vector(shift, fields[shift], (3,))
+        pose = rigid(turn, np.column_stack([R, t]))
+        second = camera_of(second.K.numpy(), second.distortion, second.size, pose)
+    return {PAIR[0]: first, PAIR[1]: second}
 
 
 def _is_bouguet_text(document: Document) -> bool:
@@ -104,9 +130,14 @@ def _bouguet_camera(fields: dict[str, Any], side: str, pose: Any) -> Camera:
     skew = _scalar("alpha_c", fields.get("alpha_c" + side, 0.0)) * f_x
     width, height = (None if key not in fields else _scalar(key, fields[key]) for key in ("nx", "ny"))
     size = image_size(width, height)
-    return camera_of(
-        focal_lengths(f_x, f_y, c_x, c_y, skew), brown(vector("kc", fields["kc" + side], (4, 5))), size, pose
-    )
+    kc = vector("kc" + side, fields["kc" + side], (4, 5))
+    if len(kc) == 4 and any(kc):
+        raise ValueError(
+            f"kc{side}: want 5 coefficients, got 4, which may be those of the toolbox's fisheye model, or k1 k2 p1 p2 "
+            "of an early version; behind the latter put a 0, of the former build "
+            "dp.Camera(K, distortion=dp.KannalaBrandt(kc))"
+        )
+    return camera_of(focal_lengths(f_x, f_y, c_x, c_y, skew), brown(kc), size, pose)
 
 
 def _scalar(name: str, value: Any) -> float:

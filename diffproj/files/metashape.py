@@ -4,7 +4,8 @@ The principal point is measured from the middle of the image, whose first pixel 
 `c_here = side / 2 + c - 0.5`. `p1` is OpenCV's p2 and `p2` its p1; `b1` widens f_x, `b2` is skew; `k4` has no
 counterpart. A camera's `transform` is camera to chunk in OpenCV's axes; that of its component, or the chunk's own where
 it has none, with its scale, leads to the world: the geocentric one where the chunk's reference is in degrees. The names
-are the labels, with the id behind where several have one label. Only frame sensors have these equations.
+are the labels, with the id behind where several have one label. Only frame sensors have these equations. Cameras of a
+rig that follow its first one are not read, which is said.
 """
 
 from collections import Counter
@@ -58,9 +59,11 @@ def read(document: Document) -> Found:
     by_id = {str(fields["id"]): (name, fields) for name, fields in listed.items()}
     calibrated = {name: _calibrated(name, fields) for name, fields in listed.items() if fields.get("calibration")}
     posed: dict[str, Camera] = {}
+    followers: list[str] = []
     places = _Places(chunk)
     for name, fields in _named(chunk.get("cameras"), "camera").items():
         if fields.get("transform") is None:
+            followers += [name] * ("master_id" in fields)
             continue
         if str(fields.get("sensor_id")) not in by_id:
             raise ValueError(f"camera {name}: want the sensor_id of a sensor, got {fields.get('sensor_id')}")
@@ -70,8 +73,18 @@ def read(document: Document) -> Found:
             sensor.K.numpy(), sensor.distortion, sensor.size, _pose(name, fields, places.of(fields))
         )
     if posed:
-        return Found(posed, calibrated)
+        return Found(posed, calibrated, remarks=_of_followers(followers))
     return Found(calibrated or {name: _calibrated(name, fields) for name, fields in listed.items()})
+
+
+def _of_followers(names: list[str]) -> tuple[str, ...]:
+    """What is said of cameras of a rig whose place follows from that of its first camera: it is not read."""
+    if not names:
+        return ()
+    return (
+        f"cameras: {len(names)} follow the first camera of a rig, such as {names[0]}, and are not read, for the file "
+        "has no place of their own; their sensors are here by name, and camera.at(R, t) places them",
+    )
 
 
 def _named(tree: Any, tag: str) -> dict[str, dict[str, Any]]:

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from diffproj.files import poses_beside
 from diffproj.files.found import Found
 from diffproj.files.lenses import Kind, brown, kind_of, lens_of
-from diffproj.files.numbers import camera_of, described, image_size, intrinsics, matrix, rigid, shape_of, square
+from diffproj.files.numbers import camera_of, described, image_size, intrinsics, matrix, shape_of
 from diffproj.geometry.camera import Camera
 from diffproj.lens.brown_conrady import BrownConrady
 
@@ -87,12 +88,27 @@ def read(mapping: dict[str, Any], four_is_brown: bool = True) -> Found:
         raise ValueError(
             f"{strays[0]}: want a camera matrix to this lens, got {', '.join(n for n, _ in matrices.values())}"
         )
-    return Found(_posed(found, mapping))
+    cameras, keys = posed(found, mapping)
+    return Found(cameras, unread=tuple(poses_beside.unread(mapping, keys)))
 
 
 def holds_matrix(mapping: dict[str, Any]) -> bool:
     """Whether K stands in a mapping under one of the names."""
     return any(_is_matrix(*_parted(key), value) for key, value in mapping.items())
+
+
+def holds_lens(mapping: dict[str, Any]) -> bool:
+    """Whether a lens stands in a mapping under one of the names."""
+    return any(_parted(key)[1] in LENSES for key in mapping)
+
+
+def misfit(mapping: dict[str, Any]) -> str:
+    """What stands under a name of K and is none, in words; empty where there is nothing of the kind."""
+    for key, value in mapping.items():
+        core = _parted(key)[1]
+        if core in MATRICES and len(core) > 2 and (value is None or isinstance(value, str | int | float)):
+            return f"{key}: want 3 x 3 numbers, got {described(value)}"
+    return ""
 
 
 def _is_matrix(label: str, core: str, value: Any) -> bool:
@@ -251,26 +267,19 @@ def _plausible(size: tuple[int, int] | None, K: np.ndarray) -> tuple[int, int] |
     return size
 
 
-def _posed(cameras: dict[str, Camera], mapping: dict[str, Any]) -> dict[str, Camera]:
-    """The second camera of a stereo pair at its place beside the first, one camera at the pose beside its K."""
-    names = list(cameras)
-    if len(names) == 2 and ("R" in mapping or "T" in mapping):
-        if not ("R" in mapping and "T" in mapping):
-            raise ValueError("want R and T from the first camera to the second, got only one of them")
-        R, t = square("R", mapping["R"], 3, 3), matrix("T", mapping["T"]).ravel()
-        if t.size != 3:
-            raise ValueError(f"T: want 3 numbers, got {t.size}")
-        R, t = rigid("R", np.column_stack([R, t]))
-        second = cameras[names[1]]
-        return {
-            names[0]: cameras[names[0]],
-            names[1]: camera_of(second.K.numpy(), second.distortion, second.size, (R, t)),
-        }
-    if len(names) == 1 and "R" in mapping and "t" in mapping:
-        pose = rigid("R", np.column_stack([square("R", mapping["R"], 3, 3), square("t", mapping["t"], 3, 1)]))
-        only = cameras[names[0]]
-        return {names[0]: camera_of(only.K.numpy(), only.distortion, only.size, pose)}
-    return cameras
+def posed(cameras: dict[str, Camera], mapping: dict[str, Any]) -> tuple[dict[str, Camera], set[str]]:
+    """The second of two cameras at its place beside the first, or the only one at its pose, and the keys of the pose.
+
+    Raises:
+        ValueError: the pose is none, or there in part.
+    """
+    find = {1: poses_beside.of_one, 2: poses_beside.of_pair}.get(len(cameras))
+    pose, keys = (None, set[str]()) if find is None else find(mapping)
+    if pose is None:
+        return cameras, set()
+    last = list(cameras)[-1]
+    camera = cameras[last]
+    return cameras | {last: camera_of(camera.K.numpy(), camera.distortion, camera.size, pose)}, keys
 
 
 def _nothing(mapping: dict[str, Any]) -> str:

@@ -226,7 +226,8 @@ def camera_of(
         ValueError: the numbers are no camera.
     """
     R, t = (None, None) if pose is None else map(as_tensor, pose)
-    return Camera(as_tensor(K), R, t, lens, size)
+    camera = Camera(as_tensor(K), R, t, lens)
+    return Camera.unchecked(camera.K, camera.R, camera.t, camera.distortion, size)  # `load` looks at the sides
 
 
 def as_tensor(numbers: Any) -> Tensor:

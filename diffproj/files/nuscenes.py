@@ -1,8 +1,9 @@
 """nuScenes' `calibrated_sensor.json`, and Argoverse's `vehicle_calibration_info.json`.
 
 Rotation (w x y z) and translation are sensor to vehicle, so that the world is the vehicle. nuScenes' images are
-undistorted, and 1600 x 900, which the file does not say; other sensors have no `camera_intrinsic`. Argoverse's lens has
-three radial coefficients; its image size is not in the file either.
+undistorted, and 1600 x 900, which the file does not say; other sensors have no `camera_intrinsic`. nuImages, whose
+images are as they were taken, adds `camera_distortion`: k1 k2 p1 p2 k3, and of fisheyes a sixth, a factor of r^8, which
+OpenCV's lens lacks. Argoverse's lens has three radial coefficients; its image size is not in the file either.
 """
 
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 
 from diffproj.files.document import Document
 from diffproj.files.found import Found, one_or_more
-from diffproj.files.lenses import brown
+from diffproj.files.lenses import brown, unused
 from diffproj.files.numbers import camera_of, focal_lengths, from_quaternion, intrinsics, inverse, vector
 from diffproj.geometry.camera import Camera
 
@@ -55,7 +56,14 @@ def _nuscenes(name: str, fields: dict[str, Any]) -> Camera:
         if key not in fields:
             raise ValueError(f"{name}: want {key}, got none")
     pose = _pose(fields["rotation"], fields["translation"])
-    return camera_of(intrinsics("camera_intrinsic", fields["camera_intrinsic"], skew=True), None, None, pose)
+    lens = None
+    if fields.get("camera_distortion"):
+        found = vector("camera_distortion", fields["camera_distortion"], (5, 6))
+        unused(
+            "camera_distortion, k4", found[5] if len(found) == 6 else None, "it is a factor of r^8, as no lens here has"
+        )
+        lens = brown(found[:5])
+    return camera_of(intrinsics("camera_intrinsic", fields["camera_intrinsic"], skew=True), lens, None, pose)
 
 
 def _argoverse(fields: dict[str, Any]) -> Camera:

@@ -1,8 +1,8 @@
 """OpenCV's YAML, XML and JSON, and the same without OpenCV's tags: K, lens and size under the names of `named.py`.
 
 Written are the keys that OpenCV's own calibration program writes. Read are also those of its stereo program, whose `R`
-and `T` place the second camera beside the first, and of files that hold cameras in mappings of their own. Integer pixel
-centres; coefficients in OpenCV's order; a fisheye lens only where the file says so.
+and `T` place the second camera beside the first, and of files that hold cameras in mappings of their own, or in a list
+of them. Integer pixel centres; coefficients in OpenCV's order; a fisheye lens only where the file says so.
 """
 
 from pathlib import Path
@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from diffproj.calibration.results.calibration import Calibration
-from diffproj.files import named
+from diffproj.files import named, poses_beside
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.geometry.camera import Camera
@@ -39,10 +39,16 @@ def read(document: Document) -> Found:
         return named.read(tree if isinstance(tree, dict) else {})
     named.check_no_lens(document.tree, list(holders.values()))
     cameras: dict[str, Camera] = {}
+    unread: list[str] = []
     for name, holder in holders.items():
-        for inner, camera in named.read(holder).cameras.items():
+        found = named.read(holder)
+        for inner, camera in found.cameras.items():
             cameras[name if inner == "camera" else f"{name} {inner}"] = camera
-    return Found(cameras)
+        unread += [f"{name}.{key}" for key in found.unread]
+    if isinstance(document.tree, dict):
+        cameras, keys = named.posed(cameras, document.tree)
+        unread += poses_beside.unread(document.tree, keys | set(holders))
+    return Found(cameras, unread=tuple(unread))
 
 
 def _holders(tree: Any) -> dict[str, dict[str, Any]]:
@@ -50,7 +56,10 @@ def _holders(tree: Any) -> dict[str, dict[str, Any]]:
     if isinstance(tree, dict):
         if named.holds_matrix(tree):
             return {"": tree}
-        return {str(key): value for key, value in tree.items() if isinstance(value, dict) and named.holds_matrix(value)}
+        held = {str(key): value for key, value in tree.items() if isinstance(value, dict) and named.holds_matrix(value)}
+        if held or not isinstance(tree.get("cameras"), list):
+            return held
+        tree = tree["cameras"]
     items = enumerate(tree) if isinstance(tree, list) else ()
     found = ((str(item.get("name", item.get("id", i))), item) for i, item in items if isinstance(item, dict))
     holders: dict[str, dict[str, Any]] = {}

@@ -167,7 +167,8 @@ def _camera(fields: Any) -> Camera:
         lens = fields["lens"]
         distortion = None if lens is None else KINDS[lens["model"]](_tensor(lens, "coefficients", dtype))
         size = None if fields["size"] is None else _size(fields["size"])
-        return Camera(K, R, t, distortion, size)
+        camera = Camera(K, R, t, distortion)
+        return Camera.unchecked(camera.K, camera.R, camera.t, camera.distortion, size)  # `load` looks at the sides
     except DAMAGE as error:
         raise ValueError(f"the camera in this file is damaged ({_said(error)})") from error
 

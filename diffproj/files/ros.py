@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from diffproj.calibration.results.calibration import Calibration
+from diffproj.files import named, poses_beside
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import coefficients, is_fisheye, kind_of, lens_of
@@ -29,13 +30,17 @@ COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,),
 
 
 def recognises(document: Document) -> bool:
-    """Whether it has a `distortion_model` or `projection_matrix` beside K without OpenCV's tags, or is an `ost.txt`."""
+    """Whether it has a `distortion_model` or `projection_matrix` beside K without OpenCV's tags, or is an `ost.txt`.
+
+    `P` stands beside K and a lens of another name too, in files of `cv2.stereoRectify`.
+    """
     if _is_ini(document):
         return True
     fields = document.mapping
     plain = not any(isinstance(value, dict) and "type_id" in value for value in fields.values())
-    named = "distortion_model" in fields or any(key in fields for key in RECTIFIED[:2])
-    return plain and named and any(key in fields for key in MATRIX) and "<root>" not in fields
+    told = "distortion_model" in fields or any(key in fields for key in RECTIFIED[:2])
+    own = "distortion_model" in fields or any(key in fields for key in LENS) or not named.holds_lens(fields)
+    return plain and told and own and any(key in fields for key in MATRIX) and "<root>" not in fields
 
 
 def read(document: Document) -> Found:
@@ -110,7 +115,8 @@ def _camera(fields: dict[str, Any]) -> Found:
         if P[0, 0] > 0:
             K_rectified = intrinsics("projection_matrix", P[:, :3])
             aside["rectified"] = camera_of(K_rectified, None, size, (np.eye(3), np.linalg.solve(K_rectified, P[:, 3])))
-    return Found({"camera": camera_of(K, lens_of(kind, found), size)}, aside)
+    unread = tuple(poses_beside.unread(fields, set()))
+    return Found({"camera": camera_of(K, lens_of(kind, found), size)}, aside, unread)
 
 
 def _of_old(fields: dict[str, Any]) -> bool:
@@ -158,7 +164,7 @@ def _sections(text: str) -> dict[str, dict[str, Any]]:
     for line in lines:
         if line[0] == "[":
             if line in sections:
-                raise ValueError(f"{line}: want the section once, got it twice")
+                raise ValueError(f"{line}: want the section once, got it twice; split the file by cameras")
             section = sections[line] = {}
         elif re.fullmatch(r"[a-z ]+", line):
             if line in section:

@@ -1,19 +1,25 @@
 """Settings of ORB-SLAM, stella and VINS, and other files with `fx fy cx cy` and `k1 k2 p1 p2 [k3]` one by one.
 
-ORB-SLAM writes them flat (`Camera.fx`, `Camera1.fx`), stella in a mapping `Camera`, VINS in `projection_parameters` and
-`distortion_parameters`. Integer pixel centres. A fisheye only where the file says so: `KannalaBrandt8`, `fisheye`,
-VINS's `KANNALA_BRANDT` with k2 to k5. `Stereo.T_c1_c2` and `Tlr` take the second camera to the first, the world; poses
-in a body are not taken.
+ORB-SLAM writes them flat (`Camera.fx`, `Camera1.fx`; of some pairs `Camera.fx` and `Camera2.fx`), stella in a mapping
+`Camera`, VINS in `projection_parameters` and `distortion_parameters`. Integer pixel centres. A fisheye only where the
+file says so: `KannalaBrandt8`, `fisheye`, VINS's `KANNALA_BRANDT` with k2 to k5. `Stereo.T_c1_c2` and `Tlr` take the
+second camera to the first, the world; so does `Stereo.b`, along x, where both are rectified. Poses in a body are not
+taken. Where a pair stands beside the camera as it is before rectification (`stereo_rectifier`), those are the cameras,
+and `"rectified"` is asked for by its name.
 """
 
 import re
 from typing import Any
 
+import numpy as np
+
+from diffproj.files import poses_beside
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import brown, fisheye, kind_of
 from diffproj.files.named import check_no_lens, check_no_lens_key, holds_matrix
 from diffproj.files.numbers import camera_of, focal_lengths, image_size, inverse, number, rigid
+from diffproj.files.stereo_rectifier import raw_cameras, raw_sides
 from diffproj.geometry.camera import Camera
 from diffproj.lens.protocol import Lens
 
@@ -33,28 +39,36 @@ SIZES = (("width", "height"), ("image_width", "image_height"), ("cols", "rows"))
 TYPES = ("type", "model", "model_type", "camera_model")
 PERSPECTIVE = ("pinhole", "perspective", "rectified")
 SECOND_TO_FIRST = ("Stereo.T_c1_c2", "Tlr")
+BASELINE = "Stereo.b"
+"""Of a rectified pair, to the right."""
 
 
 def recognises(document: Document) -> bool:
     """Whether it has focal lengths and principal point one by one."""
-    return bool(_cameras(document.mapping)) and not holds_matrix(document.mapping)
+    tree = document.mapping
+    return bool(_cameras(tree)) and (bool(raw_sides(tree)) or not holds_matrix(tree))
 
 
 def read(document: Document) -> Found:
-    """The cameras, the second of a stereo pair beside the first.
+    """The cameras, the second of a stereo pair beside the first; those before rectification where there are any.
 
     Raises:
         ValueError: something is missing or not understood.
     """
     tree = document.mapping
     fields = _cameras(tree)
-    common = fields.pop("Camera", {}) if len(fields) > 1 else {}
+    common = _common(fields)
     cameras = {name: _camera(common | own, None) for name, own in fields.items()}
+    if raw_sides(tree) and len(cameras) == 1:
+        ((name, rectified),) = cameras.items()
+        return Found(raw_cameras(tree, fields[name], rectified), {"rectified": rectified})
     poses = [key for key in SECOND_TO_FIRST if key in tree]
-    if len(cameras) == 2 and poses:
+    if len(cameras) == 2 and (poses or BASELINE in tree):
         second = list(cameras)[1]
-        cameras[second] = _camera(common | fields[second], inverse(rigid(poses[0], tree[poses[0]])))
-    return Found(cameras)
+        pose = inverse(rigid(poses[0], tree[poses[0]])) if poses else (np.eye(3), _along_x(tree[BASELINE]))
+        cameras[second] = _camera(common | fields[second], pose)
+    plain = list(fields) == ["camera"] and fields["camera"] is tree
+    return Found(cameras, unread=tuple(poses_beside.unread(tree, set())) if plain else ())
 
 
 def _cameras(tree: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -71,6 +85,19 @@ def _cameras(tree: dict[str, Any]) -> dict[str, dict[str, Any]]:
     if isinstance(tree.get("projection_parameters"), dict) and "model_type" in tree:
         return {"camera": tree}
     return {"camera": tree} if _is_whole(tree) else {}
+
+
+def _along_x(baseline: Any) -> np.ndarray:
+    """The translation to a right camera that stands so far to the right."""
+    return np.array([-number(BASELINE, baseline), 0.0, 0.0])
+
+
+def _common(fields: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """What holds for every camera: of `Camera`, taken out where it is none, all but focal lengths and lens."""
+    if len(fields) == 1 or "Camera" not in fields:
+        return {}
+    common = fields["Camera"] if _is_whole(fields["Camera"]) else fields.pop("Camera")
+    return {key: value for key, value in common.items() if key not in (*FOCAL, *ORDER)}
 
 
 def _is_whole(fields: dict[str, Any]) -> bool:

@@ -64,9 +64,9 @@ def yaml_tree(text: str) -> Any:
     Raises:
         ValueError: it is not YAML, is nested too deeply, refers to itself, or has a key twice.
     """
-    if re.match(r"\s*%YAML:", text):  # OpenCV's dialect, which takes `PointSize:2` for a key and a number
-        text = re.sub(r"\A(\s*)%YAML:[\d.]+[ \t]*$", r"\1", text, flags=re.MULTILINE)
-        text = re.sub(r"^(\s*[A-Za-z][\w.]*):(?=[-+.\d])", r"\1: ", text, flags=re.MULTILINE)
+    if re.match(r"\s*%YAML:", text):  # OpenCV's dialect, which takes `PointSize:2` and `data:[0]` for keys and values
+        text = re.sub(r"\A(\s*)%YAML:[\d.]+[ \t]*(#.*)?$", r"\1", text, flags=re.MULTILINE)
+        text = re.sub(r"^(\s*[A-Za-z][\w.]*):(?=[-+.\d\[])", r"\1: ", text, flags=re.MULTILINE)
     events = yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     try:
         for event in events:

@@ -39,6 +39,7 @@ from diffproj.geometry.changed_images import ChangedImages
 from diffproj.geometry.exchange import Exchange
 from diffproj.geometry.float32 import looks_at_rounding, warn_of_rounded_pixels
 from diffproj.geometry.grid import checked_size, inside
+from diffproj.geometry.image_sides import warn_of_exchanged
 from diffproj.geometry.intrinsics import check_intrinsics, normalised, through_pinhole
 from diffproj.geometry.placement import Placed
 from diffproj.geometry.rotations import check_pose
@@ -97,7 +98,8 @@ class Camera(
             R: rotation world to camera `(*B, 3, 3)`; the identity if left out.
             t: translation world to camera `(*B, 3)`; zero if left out.
             distortion: `BrownConrady(...)`, `KannalaBrandt(...)` or another `Lens`.
-            size: image size `(width, height)` in pixels.
+            size: image size `(width, height)` in pixels; a warning says so where it is portrait
+                and the principal point that of a landscape image with these sides.
 
         Raises:
             TypeError: no floating-point tensors, or mixed dtypes.
@@ -113,6 +115,7 @@ class Camera(
             check_intrinsics(K)
             check_pose(R, t)
         self._assign(K, R, t, distortion, checked_size(size))
+        warn_of_exchanged(K, self.size)
 
     def _assign(self, K: Tensor, R: Tensor, t: Tensor, distortion: Lens | None, size: tuple[int, int] | None) -> None:
         check_same_kind(K=K, R=R, t=t, distortion=distortion)

@@ -1,5 +1,6 @@
 """`diffproj convert` and `diffproj info`."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -129,3 +130,13 @@ def test_help_fits_a_terminal(command: str, capsys: pytest.CaptureFixture[str]) 
     with pytest.raises(SystemExit, match="0"):
         main([command, "--help"])
     assert all(len(line) <= 80 for line in capsys.readouterr().out.splitlines())
+
+
+def test_info_doubts_frames_of_one_camera_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frames = [{"file_path": f"{i}.png", "transform_matrix": torch.eye(4).tolist()} for i in range(5)]
+    tree = {"fl_x": 500.0, "fl_y": 600.0, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480, "frames": frames}
+    (folder / "frames.json").write_text(json.dumps(tree))
+    assert main(["info", str(folder / "frames.json")]) == 0
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "0.png and 4 more: the focal lengths 500 and 600 px differ" in said

@@ -61,7 +61,9 @@ def test_turned_cameras_keep_their_sides(tmp_path: Path):
 def test_the_own_file_is_loaded_and_warned_of(tmp_path: Path):
     """It keeps whatever camera there is."""
     K = torch.tensor([[900.0, 0, 648], [0, 900, 487], [0, 0, 1]])
-    dp.save_camera(tmp_path / "a.json", dp.Camera(K, size=(960, 1280)))
+    with pytest.warns(UserWarning, match="looks like height and width"):
+        camera = dp.Camera(K, size=(960, 1280))
+    dp.save_camera(tmp_path / "a.json", camera)
     with pytest.warns(UserWarning, match="looks like height and width"):
         assert dp.load_camera(tmp_path / "a.json").size == (960, 1280)
 

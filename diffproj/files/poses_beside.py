@@ -1,0 +1,138 @@
+"""Poses that stand beside camera matrices: which of them place a camera, and which are not read, which is said.
+
+Of two cameras `R` and `T`, or `rotation_matrix` and `translation_vector`, as `cv2.stereoCalibrate` calls them, lead
+from the first to the second. Of one camera, `R` and `t` are those that this package writes, world to camera. What
+others mean their programs know: `rvec` and `tvec` of a board, `extrinsics` from a lidar or to a vehicle, either way.
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from diffproj.files.numbers import matrix, rigid, square
+
+Pose = tuple[np.ndarray, np.ndarray]
+
+PAIRS = (("R", "T"), ("rotation_matrix", "translation_vector"))
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+TURNS = _words("r rot rotation rotationmatrix rotationvector rotmat rmat rmatrix rvec quaternion orientation")
+SHIFTS = _words("t trans translation translationvector translationmatrix tvec tvector")
+WHOLE = _words("rt extrinsic extrinsics cameraextrinsic cameraextrinsics pose camerapose transform transformation")
+"""Names in lower case, without what stands between words. Of 4 x 4 and 3 x 4 numbers with a rotation any will do."""
+
+LARGEST = 16
+"""Numbers of a pose, at most."""
+
+MOST_NAMES = 4
+"""Keys in a remark."""
+
+
+def of_pair(mapping: dict[str, Any]) -> tuple[Pose | None, set[str]]:
+    """The pose from the first of two cameras to the second, and the keys that it was read from.
+
+    Raises:
+        ValueError: it is there in part, or is none.
+    """
+    for names in PAIRS:
+        found = [key for name in names for key in mapping if _named(key, name)]
+        if not found:
+            continue
+        if len(found) != 2:
+            raise ValueError(f"want {' and '.join(names)} from the first camera to the second, got {', '.join(found)}")
+        turn, shift = found
+        R, t = square(turn, mapping[turn], 3, 3), matrix(shift, mapping[shift]).ravel()
+        if t.size != 3:
+            raise ValueError(f"{shift}: want 3 numbers, got {t.size}")
+        return rigid(turn, np.column_stack([R, t])), {turn, shift}
+    return None, set()
+
+
+def of_one(mapping: dict[str, Any]) -> tuple[Pose | None, set[str]]:
+    """The pose of the only camera, as this package writes it, and the keys that it was read from.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if "R" not in mapping or "t" not in mapping:
+        return None, set()
+    return rigid("R", np.column_stack([square("R", mapping["R"], 3, 3), square("t", mapping["t"], 3, 1)])), {"R", "t"}
+
+
+def unread(mapping: dict[str, Any], read: set[str]) -> list[str]:
+    """The keys of poses that nobody reads; empty where there is none, as where a rotation stands alone.
+
+    Args:
+        mapping: what to look through, and the mappings right in it.
+        read: keys that were read, or that others look through.
+    """
+    found = [(key, kind) for key, value in mapping.items() if key not in read for kind in _kinds(key, value)]
+    return [key for key, _ in found] if any(kind != "turn" for _, kind in found) else []
+
+
+def remark(names: Sequence[str]) -> str:
+    """What is said of poses that are not read."""
+    listed = ", ".join(names[:MOST_NAMES]) + " and more" * (len(names) > MOST_NAMES)
+    return (
+        f"{listed}: a pose that is not read, for it is not known from where to where it leads; "
+        "camera.at(R, t), world to camera, places a camera"
+    )
+
+
+def _kinds(key: str, value: Any) -> Iterator[str]:
+    """Whether a key holds a `"turn"`, a `"shift"` or a whole `"pose"`."""
+    plain = _plain(key)
+    if isinstance(value, dict) and "data" not in value:
+        inside = {kind for inner, item in value.items() for kind in _kinds(inner, item)}
+        if plain in TURNS | SHIFTS:  # x, y, z by their names
+            yield "turn" if plain in TURNS else "shift"
+        elif inside - {"turn"}:
+            yield "pose"
+        return
+    numbers = _numbers(key, value)
+    if numbers is None:
+        return
+    if _is_rigid(numbers) or (plain in WHOLE and numbers.size in (6, 7)):
+        yield "pose"
+    elif plain in TURNS and numbers.size in (3, 4, 9):
+        yield "turn"
+    elif plain in SHIFTS and numbers.size == 3:
+        yield "shift"
+
+
+def _numbers(key: str, value: Any) -> np.ndarray | None:
+    content = value.get("data") if isinstance(value, dict) else value
+    if not isinstance(content, list | np.ndarray) or len(content) > LARGEST:
+        return None
+    try:
+        return matrix(key, value)
+    except ValueError:
+        return None
+
+
+def _is_rigid(numbers: np.ndarray) -> bool:
+    """Whether these are 4 x 4 or 3 x 4 numbers, with a rotation."""
+    if numbers.shape not in ((4, 4), (3, 4), (16,)):
+        return False
+    rows = numbers.reshape(-1, 4)
+    last = len(rows) == 3 or rows[3].tolist() == [0, 0, 0, 1]
+    return last and bool(np.abs(rows[:3, :3].T @ rows[:3, :3] - np.eye(3)).max() < 1e-2)
+
+
+def _named(key: str, name: str) -> bool:
+    """Whether a key is that name; of a long one in any case, and with anything between words."""
+    return key == name or (len(name) > 1 and re.sub("[^a-z]", "", key.lower()) == name.replace("_", ""))
+
+
+def _plain(key: str) -> str:
+    """A key in lower case, without what stands between words, and without a label of its camera."""
+    words = re.sub(r"[\s.\-]+", "_", re.sub(r"(?<=[a-z])([LR])$", r"_\1", key.strip())).lower()
+    return re.sub(r"^(left|right|cam\d*|camera\d*|stereo)_(?=.)|(?<=.)_?(\d+|_left|_right|_l|_r)$", "", words).replace(
+        "_", ""
+    )

@@ -1,0 +1,118 @@
+"""Poses beside camera matrices: those of a pair are read, and of others it is said that they are not."""
+
+import json
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import diffproj as dp
+from diffproj import cli
+from tests.files.samples import ROS, npz
+from tests.files.test_readers import load, poses
+
+K = [[500.0, 0.0, 320.0], [0.0, 501.0, 240.0], [0.0, 0.0, 1.0]]
+D = [0.1, -0.2, 0.001, 0.002, 0.0]
+R = cv2.Rodrigues(np.array([0.1, -0.2, 0.3]))[0].tolist()
+T = [0.12, 0.01, -0.02]
+RT = [[*row, t] for row, t in zip(R, T, strict=True)]
+ONE = {"camera_matrix": K, "dist_coeffs": D}
+PAIR = {"K1": K, "D1": D, "K2": K, "D2": D}
+
+
+@pytest.mark.parametrize(
+    ("pose", "named"),
+    [
+        ({"R": R, "T": T}, "R, T"),
+        ({"R": R, "T": [[x] for x in T]}, "R, T"),
+        ({"rvec": [0.1, -0.2, 0.3], "tvec": T}, "rvec, tvec"),
+        ({"rotation_matrix": R, "translation_vector": T}, "rotation_matrix, translation_vector"),
+        ({"rotation": {"x": 0, "y": 0, "z": 0, "w": 1}, "translation": {"x": 1, "y": 2, "z": 3}}, "rotation, trans"),
+        ({"CameraExtrinsicMat": [*RT, [0, 0, 0, 1]]}, "CameraExtrinsicMat"),
+        ({"anything": RT}, "anything"),
+        ({"extrinsics": {"rotation": R, "translation": T}}, "extrinsics"),
+        ({"extrinsics": [0.1, -0.2, 0.3, *T]}, "extrinsics"),
+        ({"stereo": {"R": R, "T": T}}, "stereo"),
+    ],
+)
+def test_a_pose_of_unknown_meaning_is_not_dropped_in_silence(
+    tmp_path: Path, pose: dict[str, object], named: str
+) -> None:
+    with pytest.warns(UserWarning, match=rf"plain\.json: {named}.*a pose that is not read.*camera\.at\(R, t\)"):
+        camera = load(tmp_path, "plain.json", json.dumps(ONE | pose))
+    np.testing.assert_array_equal(poses(camera), np.eye(4))
+    with pytest.warns(UserWarning, match=rf"cam0\.{named.split(',')[0]}.*a pose that is not read"):
+        load(tmp_path, "plain.json", json.dumps({"cam0": ONE | pose, "cam1": ONE | pose}))
+
+
+@pytest.mark.parametrize(
+    "beside",
+    [
+        {},
+        {"rvecs": [[0.1, 0.2, 0.3]] * 9, "tvecs": [T] * 9},
+        {"extrinsic_parameters": [[0.1, 0.2, 0.3, *T]] * 9},
+        {"R": R},  # of a rectification
+        {"R1": R, "P1": [[*row, 0.0] for row in K], "Q": np.diag([1.0, 1, 0, 0.1]).tolist(), "E": R, "F": R},
+        {"newcameramtx": K, "roi": [0, 0, 640, 480], "T": 25.5, "pose": "front", "transform": None},
+    ],
+)
+def test_what_is_no_pose_is_not_taken_for_one(tmp_path: Path, beside: dict[str, object]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load(tmp_path, "plain.json", json.dumps(ONE | beside))
+        load(tmp_path, "plain.json", json.dumps(PAIR | beside | {"R": R, "T": T}))
+
+
+@pytest.mark.parametrize(
+    "names", [("R", "T"), ("rotation_matrix", "translation_vector"), ("RotationMatrix", "TranslationVector")]
+)
+def test_a_pair_is_placed_by_what_opencv_calls_r_and_t(tmp_path: Path, names: tuple[str, str]) -> None:
+    pose = dict(zip(names, (R, T), strict=True))
+    sides = dict.fromkeys(("left", "right"), ONE)
+    for tree in (PAIR | pose, sides | pose):
+        both = load(tmp_path, "plain.json", json.dumps(tree))
+        np.testing.assert_allclose(poses(both[0]), np.eye(4))
+        np.testing.assert_allclose(poses(both[1])[:3], RT, atol=1e-15)
+    arrays = {key: np.array(value) for key, value in (PAIR | pose).items()}
+    np.testing.assert_allclose(poses(load(tmp_path, "pair.npz", npz(**arrays))[1])[:3], RT, atol=1e-15)
+    with pytest.raises(ValueError, match=f"from the first camera to the second, got {names[0]}"):
+        load(tmp_path, "plain.json", json.dumps(PAIR | {names[0]: R}))
+
+
+def test_three_cameras_have_no_pair_s_pose(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="R, T: a pose that is not read"):
+        both = load(tmp_path, "plain.json", json.dumps(PAIR | {"K3": K, "D3": D, "R": R, "T": T}))
+    assert not both.t.any()
+
+
+def test_the_command_line_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.json").write_text(json.dumps(ONE | {"R": R, "T": T}))
+    for command, *files in (["info", "a.json"], ["convert", "a.json", "b.json"]):
+        assert cli.main([command, *(str(tmp_path / name) for name in files)]) == 0
+        assert "R, T: a pose that is not read" in capsys.readouterr().err
+    assert dp.load_camera(tmp_path / "b.json").size is None
+
+
+def test_a_pose_beside_a_camera_info_is_not_dropped_in_silence(tmp_path: Path) -> None:
+    pose = f"T_cam_lidar: {[*RT, [0, 0, 0, 1]]}\n"
+    with pytest.warns(UserWarning, match="T_cam_lidar: a pose that is not read"):
+        load(tmp_path, "ost.yaml", ROS + pose)
+
+
+def test_cameras_in_a_list_stand_where_they_say(tmp_path: Path) -> None:
+    cameras = [{"name": f"00_0{i}", "K": K, "distCoef": D, "resolution": [640, 480]} for i in range(3)]
+    posed = [camera | {"R": R, "t": [[x] for x in T]} for camera in cameras]
+    for tree in (posed, {"calibDataSource": "a", "cameras": posed}):
+        every = load(tmp_path, "plain.json", json.dumps(tree))
+        assert every.batch_shape == (3,)
+        np.testing.assert_allclose(poses(load(tmp_path, "plain.json", json.dumps(tree), camera="00_02"))[:3], RT)
+    with pytest.raises(ValueError, match="want the lens in the same mapping"):
+        load(tmp_path, "plain.json", json.dumps({"cameras": [{"name": "a", "K": K}], "distCoef": D}))
+
+
+def test_a_pose_beside_numbers_one_by_one_is_not_dropped_in_silence(tmp_path: Path) -> None:
+    tree = {"fx": 500.0, "fy": 501.0, "cx": 320.0, "cy": 240.0, "rvec": [0.1, -0.2, 0.3], "tvec": T}
+    with pytest.warns(UserWarning, match="rvec, tvec: a pose that is not read"):
+        load(tmp_path, "plain.json", json.dumps(tree))
