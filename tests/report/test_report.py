@@ -185,6 +185,19 @@ def test_what_is_not_trusted_are_the_remarks(calibration: dp.Calibration, page: 
     assert "nothing speaks against" not in page
 
 
+def test_nothing_of_a_camera_that_was_not_found_is_trusted() -> None:
+    """The page said that the residuals, 36 px here, were those of noise, and that nothing spoke against the numbers."""
+    views = dp.example_views("left")
+    pixels = views.pixels.clone()
+    pixels[3] = pixels[3, torch.randperm(54, generator=torch.Generator().manual_seed(0))]
+    found = dp.calibrate(dp.Views(pixels, size=views.size), BOARD, throw=False)
+    for failed in (found, not_converged()):
+        assert failed.judgement.word == "Not usable"
+        text = words(verdict_part(Facts(failed, (640, 480))).html)
+        assert "nothing speaks against" not in text
+        assert "What not to trust Any of the numbers" in text
+
+
 def test_uses_are_what_measure_gives(calibration: dp.Calibration) -> None:
     facts = Facts(calibration, (640, 480))
     view = facts.usual_view
