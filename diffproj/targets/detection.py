@@ -14,7 +14,7 @@ from jaxtyping import Float, Shaped
 
 from diffproj._core.arguments import function, whole_number
 from diffproj.targets.april_grid import AprilGrid
-from diffproj.targets.boards import Board, as_target
+from diffproj.targets.boards import Board, as_target, with_article
 from diffproj.targets.charuco import CharucoBoard
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.circle_grid import CircleGrid
@@ -315,7 +315,7 @@ def _advice(labels: list[str], found: list[Found], target: Board) -> str:
     if hints:
         there = f" There is {hints[0]}."
     return (
-        f"photographs: want a {target.title}, found none in {_named(labels)}.{there} Check target, and that "
+        f"photographs: want {with_article(target)}, found none in {_named(labels)}.{there} Check target, and that "
         f"{_CHECKS[type(target)]}"
     )
 

@@ -3,6 +3,7 @@
 import io
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -41,6 +42,9 @@ MARGIN = 10.0
 FOOT = 14.0
 """Height in mm of the ruler and the words below the board."""
 
+FINEST = 0.1
+"""Width in mm below which parts of a board blur on paper: two dots of a printer of 600 dpi are .085 mm."""
+
 INCH = UNITS["in"]
 
 
@@ -56,7 +60,8 @@ def draw_target(
 
     Below the board are a ruler, to check by measuring that nothing was scaled on the way to the paper, and the target's
     own description. A margin of 10 mm stays white. The page is turned where the board fits better so. Print at 100 %
-    ("actual size"), glue the print to something flat, and measure a long distance on it.
+    ("actual size"), glue the print to something flat, and measure a long distance on it. A warning says where parts are
+    finer than printers print, as those of a board in metres that is taken to be in millimetres.
 
     Args:
         target: the board.
@@ -90,7 +95,21 @@ def draw_target(
     dpi = number("dpi", dpi, "pixels per inch, from 50 to 5000", least=50, most=5000)
     scale = UNITS[choice("unit", unit, UNITS)]
     page = _page(target, paper, scale)
+    finest = _finest(target) * scale
+    if finest < FINEST:
+        warnings.warn(
+            f"target: its finest parts are {finest:.2g} mm wide, finer than printers print; is it described in {unit}?",
+            stacklevel=2,
+        )
     write_whole(file, _drawn(target, page, scale, unit, file.suffix.lower()[1:], dpi))
+
+
+def _finest(target: Board) -> float:
+    """Width of the narrowest cell or disc of the print, in world units."""
+    art = target.artwork
+    if len(art.discs):
+        return float(2 * art.discs[:, 2].min())
+    return float(min(np.diff(art.x).min(), np.diff(art.y).min()))
 
 
 def _page(target: Board, paper: str | Sequence[float], scale: float) -> tuple[float, float]:

@@ -262,3 +262,12 @@ def test_the_smallest_board_is_found():
     found = dp.detect(photographed(camera, board), board)
     assert int(found.visible.sum()) == 4
     assert errors(found, camera, board)[0].max() < 0.1
+
+
+def test_what_is_not_found_has_its_article():
+    for board, words in (
+        (dp.AprilGrid(6, 6, 22.0, 0.3), "an AprilGrid"),
+        (dp.CircleGrid(4, 11, 20.0, 9.0, True), "an asym"),
+    ):
+        with pytest.raises(dp.BoardNotFoundError, match=f"photographs: want {words}"):
+            dp.detect(np.zeros((60, 80), np.uint8), board)

@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -67,6 +68,16 @@ def test_units(tmp_path):
         dp.draw_target(board, tmp_path / f"{unit}.png", dpi=60, unit=unit)
     mm, m = (cv2.imread(str(tmp_path / f"{unit}.png"), 0)[:600] for unit in ("mm", "m"))
     assert np.abs(mm.astype(int) - m).max() <= 1
+
+
+@pytest.mark.parametrize("kind", BOARDS)
+def test_a_board_finer_than_printers_print_is_told(tmp_path, kind):
+    """Sides in metres, taken to be in mm, gave a page with a dot, and nothing was said."""
+    sides = ("square", "marker", "tag", "diameter", *(["spacing"] if kind == "circles" else []))
+    small = replace(BOARDS[kind], **{k: getattr(BOARDS[kind], k) / 1000 for k in sides if hasattr(BOARDS[kind], k)})
+    with pytest.warns(UserWarning, match=r"finest parts are 0\.0[\d]+ mm wide, .* is it described in mm\?"):
+        dp.draw_target(small, tmp_path / "board.svg")
+    dp.draw_target(small, tmp_path / "board.svg", unit="m")
 
 
 def test_what_does_not_fit_is_refused_with_what_does(tmp_path):
