@@ -68,9 +68,10 @@ def detect(
 
     A `CircleGrid` is found as dark ellipses on a lattice, or light ones on dark, of which up to a quarter may be
     hidden; those that glare or a shadow draws aside are. The pixels are the middles of the ellipses; `calibrate` knows
-    that a centre is seen elsewhere. Its order is never mirrored, and where the board looks the same when turned
-    (`CircleGrid.turns`), the rule for chessboards holds. Where it does so only since some circles are hidden, it counts
-    as not found.
+    that a centre is seen elsewhere, by as much as the diameter says: circles that are clearly of another one count as
+    not found, and the message says how wide they are. Its order is never mirrored, and where the board looks the same
+    when turned (`CircleGrid.turns`), the rule for chessboards holds. Where it does so only since some circles are
+    hidden, it counts as not found.
 
     A `Chessboard` is found as a pattern of saddle points of brightness, in copies of several sizes, and where only a
     part of it is found so, by OpenCV's detectors. Its dark and light may be exchanged, as in thermal images. Each
