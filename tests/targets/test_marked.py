@@ -256,8 +256,13 @@ def test_another_spacing_of_tags_is_told(given, true):
         dp.detect(photo, dp.AprilGrid(4, 3, tag=20.0, spacing=given))
 
 
-def test_the_smallest_board_is_found():
-    board = dp.CharucoBoard(3, 3, square=20.0, marker=15.0, dictionary="4X4_50")
+@pytest.mark.parametrize(
+    "board",
+    [dp.CharucoBoard(3, 3, square=20.0, marker=15.0, dictionary="4X4_50"), dp.AprilGrid(1, 1, tag=20.0, spacing=0.3)],
+    ids=["charuco", "april"],
+)
+def test_the_smallest_board_is_found(board):
+    """An AprilGrid of one tag was accepted and printed, and never found."""
     camera = camera_before(board, 2, side_px=40, tilt_deg=20)
     found = dp.detect(photographed(camera, board), board)
     assert int(found.visible.sum()) == 4
