@@ -23,6 +23,7 @@ from diffproj.cli.inputs import HAND
 from diffproj.cli.measure_document import REASONS, between, listed
 from diffproj.cli.measure_plane import equation
 from diffproj.cli.measure_tables import coordinate, shown
+from diffproj.cli.measuring import length_in_words
 from diffproj.cli.photographs import warn_if_shown_turned
 from diffproj.measurement.choices import HAND_PX
 from diffproj.targets.images import decoded
@@ -474,6 +475,14 @@ def test_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     blank = cv2.imread(str(file))
     assert blank is not None
     assert blank.mean() > image.mean()  # no photograph is there
+
+
+def test_lengths_in_a_picture_say_where_they_are_not_known() -> None:
+    """In the picture a length without a finite deviation, 702.393 mm, looked surer than all others."""
+    told = {"value": 90.23733, "deviation": 0.35345, "interval_95": [89.5, 90.9]}
+    assert length_in_words(told, "mm") == "90.24 ± 0.35 mm"
+    assert length_in_words({"value": 702.3931, "deviation": None, "interval_95": None}, "mm") == "702.393 ± unknown mm"
+    assert length_in_words({"value": None, "deviation": None, "interval_95": None}, "mm") == ""
 
 
 def test_hand_picked_lengths_are_covered() -> None:
