@@ -22,8 +22,10 @@ ENDS = 2
 """Corners at the end of a ChArUco board that only its own pattern has from which no other is thought of. Of 90 views of
 the other pattern none showed one."""
 
-OTHER_SPACING = 0.15
-"""How far the gaps between tags may be from what was given, relative to it."""
+OTHER_SPACING = 0.08
+"""How far the gaps between tags may be from what was given, relative to it. Of 2900 simulated views with a noise of
+0.15 px, most of them close up through wide lenses, 98.6 % were within it; nearly all others were of boards of two to
+nine tags at the edges of a barrel lens."""
 
 OTHER_DIAMETER, EDGES = 0.2, 2.0
 """How far circles' diameters may be from what was given, relative to them and in px: by both, they are others. Of 740
@@ -91,13 +93,19 @@ def _april_grid(image: Shaped[np.ndarray, "h w"], board: AprilGrid) -> Found:
 
 
 def _spacing_of(grid: Float[np.ndarray, "rows columns 2"]) -> float:
-    """The gaps between tags relative to the sides of the tags beside them: the median; NaN where no pair is seen."""
-    ratios = []
+    """The gaps between tags relative to their sides: the median over neighbours; NaN where no pair is seen.
+
+    By the cross-ratio of the four corners of two tags along a line, which no perspective changes: with the gap s,
+    `(1 + s)^2 / ((1 + s)^2 - 1)`.
+    """
+    found = []
     for lines in (grid, grid.swapaxes(0, 1)):
-        steps = np.linalg.norm(np.diff(lines, axis=1), axis=-1)
-        ratios.append((2 * steps[:, 1::2] / (steps[:, :-2:2] + steps[:, 2::2])).ravel())
-    known = np.concatenate(ratios)
-    known = known[np.isfinite(known)]
+        a, b, c, d = (lines[:, k : lines.shape[1] - 3 + k : 2] for k in range(4))
+        ac, bd, bc, ad = (np.linalg.norm(one - other, axis=-1) for one, other in ((a, c), (b, d), (b, c), (a, d)))
+        ratio = (ac * bd / (bc * ad)).ravel()
+        ratio = ratio[ratio > 1]  # not where one is hidden: NaN
+        found.append(np.sqrt(ratio / (ratio - 1)) - 1)
+    known = np.concatenate(found)
     return float(np.median(known)) if len(known) else float("nan")
 
 
