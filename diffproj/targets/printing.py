@@ -45,6 +45,9 @@ FOOT = 14.0
 FINEST = 0.1
 """Width in mm below which parts of a board blur on paper: two dots of a printer of 600 dpi are .085 mm."""
 
+MOST_PIXELS = 6e8
+"""Pixels of a .png, each of which takes four bytes of memory while it is drawn: A0 at 600 dpi has 5.6e8."""
+
 INCH = UNITS["in"]
 
 
@@ -72,8 +75,8 @@ def draw_target(
 
     Raises:
         TypeError: an argument is of the wrong kind.
-        ValueError: the board does not fit on the paper (the message names the largest that does), or the paper, the
-            unit or the file's ending is unknown.
+        ValueError: the board does not fit on the paper (the message names the largest that does), a .png would have
+            more than 600 million pixels, or the paper, the unit or the file's ending is unknown.
         OSError: the file cannot be written.
         ModuleNotFoundError: matplotlib is missing.
 
@@ -95,6 +98,8 @@ def draw_target(
     dpi = number("dpi", dpi, "pixels per inch, from 50 to 5000", least=50, most=5000)
     scale = UNITS[choice("unit", unit, UNITS)]
     page = _page(target, paper, scale)
+    if file.suffix.lower() == ".png":
+        _check_pixels(page, dpi)
     finest = _finest(target) * scale
     if finest < FINEST:
         warnings.warn(
@@ -102,6 +107,21 @@ def draw_target(
             stacklevel=2,
         )
     write_whole(file, _drawn(target, page, scale, unit, file.suffix.lower()[1:], dpi))
+
+
+def _check_pixels(page: tuple[float, float], dpi: float) -> None:
+    """Check that a picture fits into memory.
+
+    Raises:
+        ValueError: it does not.
+    """
+    width, height = page
+    most = math.floor(math.sqrt(MOST_PIXELS / (width * height)) * INCH)
+    if dpi > most:
+        raise ValueError(
+            f"dpi: want at most {most} for a .png of {width:g} x {height:g} mm, got {dpi:g}; a .pdf or .svg has no "
+            "pixels"
+        )
 
 
 def _finest(target: Board) -> float:

@@ -88,3 +88,13 @@ def test_what_does_not_fit_is_refused_with_what_does(tmp_path):
         dp.draw_target(dp.Chessboard(), tmp_path / "board.pdf", "B4")
     with pytest.raises(ValueError, match="path: want a file ending in .pdf, .svg, .png, got"):
         dp.draw_target(dp.Chessboard(), tmp_path / "board.jpg")
+
+
+def test_a_picture_that_no_memory_holds_is_refused(tmp_path):
+    """A0 at 5000 dpi ended in a MemoryError."""
+    with pytest.raises(
+        ValueError, match=r"dpi: want at most 622 for a \.png of 1189 x 841 mm, got 5000; a \.pdf or \.svg"
+    ):
+        dp.draw_target(dp.Chessboard(), tmp_path / "board.png", "A0", dpi=5000)
+    assert not list(tmp_path.iterdir())
+    dp.draw_target(dp.Chessboard(), tmp_path / "board.svg", "A0", dpi=5000)
