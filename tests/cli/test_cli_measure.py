@@ -20,6 +20,7 @@ import diffproj as dp
 from diffproj import synthetic
 from diffproj.cli import shielded
 from diffproj.cli.inputs import HAND
+from diffproj.cli.measure_csv import as_csv
 from diffproj.cli.measure_document import REASONS, between, listed
 from diffproj.cli.measure_plane import equation
 from diffproj.cli.measure_tables import coordinate, shown
@@ -455,6 +456,19 @@ def test_tables_for_spreadsheets(capsys: pytest.CaptureFixture[str]) -> None:
         *length["interval_95"],
     ]
     assert (first["name"], first["unit"], rows[-1]["unit"], rows[-1]["value"]) == ("1, 2", "mm", "mm^2", "")
+
+
+def test_the_table_says_what_is_doubtful(capsys: pytest.CaptureFixture[str]) -> None:
+    """What is measured by another camera stood there like everything else: doubts were on standard error alone."""
+    options = ("photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS, "-9000,100", "--json")
+    document = json.loads(run(capsys, *options)[1])
+    for doubts, remark in ((None, ""), ("another camera, zoom or focus?", "DOUBTFUL")):
+        rows = list(csv.DictReader(io.StringIO(as_csv(document | {"doubts": doubts}))))
+        there = [row for row in rows if row["x"] or row["value"]]
+        assert {row["what"] for row in there} == {"point", "length"}
+        assert {remark in row["remark"] for row in there} == {True}
+        assert all("DOUBTFUL" not in row["remark"] for row in rows if row not in there)
+        assert all(row["remark"] in ("", remark) for row in there)
 
 
 def test_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
