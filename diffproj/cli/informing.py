@@ -117,7 +117,8 @@ def _say(told: dict[str, Any]) -> None:
         result(f"to be asked for by --camera: {', '.join(told['aside'])}")
     if told["calibration"] is not None:
         rms = ", ".join(f"{value:.4f}" for value in told["calibration"]["rms"][:4])
-        result(f"a calibration of {told['calibration']['views']} views, RMS {rms} px")
+        views = told["calibration"]["views"]
+        result(f"a calibration of {views} view{'s' * (views != 1)}, RMS {rms} px")
 
 
 def _say_camera(name: str, camera: dict[str, Any]) -> None:

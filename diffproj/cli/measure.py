@@ -2,6 +2,7 @@
 
 import argparse
 import functools
+from pathlib import Path
 
 from diffproj.cli.common_options import (
     add_camera,
@@ -16,6 +17,9 @@ from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import DETECTOR, HAND, numbers, some_path
 from diffproj.cli.measure_page import page_file
 from diffproj.cli.which_board import check_board
+
+TABLES = (".csv", ".tsv", ".txt")
+"""Endings of files that somebody may have points in."""
 
 DESCRIPTION = """\
 Turns pixels of a photograph into points on a plane, and prints them with the
@@ -34,8 +38,8 @@ pixels:
   be negative or lie outside the photograph; one without a point on the plane is
   named, and is no failure. Each is taken to be off by 0.5 px,
   as points picked by hand are: --pixel-sigma tells another noise. A file of
-  points has a line name,u,v for each, or u,v; titles and empty lines are
-  passed over.
+  points has a line name,u,v for each, or u,v; a first line of titles, such as
+  v,u or row,column, gives another order.
 
 the plane:
   It is the board's face, unless --height or --plane say another. Heights count
@@ -124,8 +128,10 @@ def add_options(command: argparse.ArgumentParser) -> None:
 def _pixel(text: str) -> tuple[float, ...]:
     values = numbers(text, 2)
     if values is None:
+        kind = Path(text.strip()).suffix.lower()
+        hint = "a file of them goes with --points-file" if kind in TABLES else "the photograph comes first"
         raise argparse.ArgumentTypeError(
-            f"want pixels as u,v without a space, such as 320.5,240, got {text.strip()!r}; the photograph comes first"
+            f"want pixels as u,v without a space, such as 320.5,240, got {text.strip()!r}; {hint}"
         )
     return values
 

@@ -98,15 +98,14 @@ def _draw(path: Path, scene: Scene, found: dict[str, Any]) -> None:
         scene.view,
         [row["pixel"] for row in found["points"]],
         [row["name"] if row["valid"] else f"{row['name']} (not on the plane)" for row in found["points"]],
-        [_length_in_words(length, scene.square.unit) for length in found["lengths"]],
+        [length_in_words(length, scene.square.unit) for length in found["lengths"]],
         photograph=None if scene.photograph is None else grey(scene.photograph),
         title=f"{found['view']}: {found['plane_in_words']}",
     )
     write_drawing(path, figure)
 
 
-def _length_in_words(length: dict[str, Any], unit: str | None) -> str:
-    """`199.9 ± 0.2 mm`; empty where the length is not known."""
+def length_in_words(length: dict[str, Any], unit: str | None) -> str:
+    """`199.9 ± 0.2 mm`, or `199.9 ± unknown mm`; empty where there is no length."""
     value, deviation, _ = shown(length)
-    known = f" ± {deviation}" if length["deviation"] is not None else ""
-    return "" if length["value"] is None else f"{value}{known}" + (f" {unit}" if unit else "")
+    return "" if length["value"] is None else f"{value} ± {deviation}" + (f" {unit}" if unit else "")

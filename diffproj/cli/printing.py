@@ -20,7 +20,7 @@ def run(options: argparse.Namespace) -> int:
             draw_target(board, options.file, options.paper, dpi=options.dpi, unit=unit)
         except ValueError as error:
             text = str(error)
-            raise ValueError(f"--{text}" if text.startswith("paper") else text) from None
+            raise ValueError(f"--{text}" if text.startswith(("paper", "dpi")) else text) from None
     if options.json:
         told = {"file": str(options.file), "kind": kind_of(options), "board": repr(board), "paper": options.paper}
         as_json({**told, "unit": unit, "warnings": options.warned})

@@ -45,6 +45,7 @@ def accuracy_part(facts: Facts) -> Part:
     html = render(
         "accuracy.html",
         view=facts.names[view],
+        board=facts.planar,
         distance=f"{svg.plain(float(facts.distances[view]), 3)} {facts.unit}",
         sigma=svg.plain(facts.sigma),
         figures=[_image_figure(facts, over_image), _plane_figure(facts, over_plane, plane)],
@@ -89,20 +90,23 @@ def _image_figure(facts: Facts, found: AccuracyMap) -> Markup:
         axes.drawn("u, px", "v, px", grid=False),
         _bar(axes, values, facts.unit),
     ]
-    caption = "Over the image: standard deviation of a point on the board's plane along its worst direction."
+    plane = "the board's plane" if facts.planar else "that plane"
+    caption = f"Over the image: standard deviation of a point on {plane} along its worst direction."
     return svg.figure(svg.picture(axes.width, axes.height, _label("the image", values, facts.unit), *drawn), caption)
 
 
 def _plane_figure(facts: Facts, found: AccuracyMap, plane: Plane) -> Markup:
     calibration = facts.calibration
     x, y, x2, y2 = _extent(calibration)
-    wide = svg.WIDTH - svg.LEFT - svg.RIGHT
     y_range = (y2, y) if float(calibration.cameras.R[..., 2, 2].detach().mean()) > 0 else (y, y2)
+    left = svg.room_beside(y_range)
+    wide = svg.WIDTH - left - svg.RIGHT
     axes = svg.Axes(
         (x, x2),
         y_range,
         svg.WIDTH + BAR_ROOM,
         svg.TOP + svg.BOTTOM + wide * min(1.5, (y2 - y) / (x2 - x)),
+        left=left,
         right=svg.RIGHT + BAR_ROOM,
     )
     values = found.deviation.numpy(force=True)
@@ -125,9 +129,9 @@ def _plane_figure(facts: Facts, found: AccuracyMap, plane: Plane) -> Markup:
         axes.drawn(f"x, {facts.unit}", f"y, {facts.unit}", grid=False),
         _bar(axes, values, facts.unit),
     ]
-    caption = "Over the board's plane, in its own x and y" + (
-        "; the thin rectangle is the board." if facts.planar else "."
-    )
+    caption = "Over that plane, in the landmarks' x and y."
+    if facts.planar:
+        caption = "Over the board's plane, in its own x and y; the thin rectangle is the board."
     return svg.figure(svg.picture(axes.width, axes.height, _label("the plane", values, facts.unit), *drawn), caption)
 
 

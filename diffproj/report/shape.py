@@ -34,12 +34,13 @@ def _figure(facts: Facts) -> tuple[Markup, str]:
     low, high = nominal[:, :2].min(0), nominal[:, :2].max(0)
     side = float((high - low).max())
     room = 0.1 * side
-    wide = svg.WIDTH - svg.LEFT - svg.RIGHT
     x, y = (low - room).tolist()
     x2, y2 = (high + room).tolist()
     y_range = (y2, y) if float(calibration.cameras.R[..., 2, 2].detach().mean()) > 0 else (y, y2)
+    left = svg.room_beside(y_range)
+    wide = svg.WIDTH - left - svg.RIGHT
     height = svg.TOP + svg.BOTTOM + wide * min(1.6, (y2 - y) / (x2 - x))
-    axes = svg.Axes((x, x2), y_range, height=height)
+    axes = svg.Axes((x, x2), y_range, height=height, left=left)
     within = float(np.sqrt((off[:, :2] ** 2).sum(-1).mean()))
     times = float(f"{ARROW * side / within:.2g}") if within > 0 else 1.0
     most = float(np.abs(off[:, 2]).max())

@@ -20,6 +20,10 @@ STYLE = asset("figures.css")
 WIDTH, HEIGHT = 420.0, 300.0
 LEFT, RIGHT, TOP, BOTTOM = 50.0, 12.0, 10.0, 42.0
 """What axes leave for ticks and labels."""
+DIGIT = 7.0
+"""Width of a digit at an axis."""
+BESIDE = 22.0
+"""What the label of an upright axis and the gaps beside the names of its ticks take."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +79,12 @@ class Axes:
         left, top, width, height = self.field
         x_ticks = ticks(*self.x_range) if x_ticks is None else x_ticks
         y_ticks = ticks(*self.y_range) if y_ticks is None else y_ticks
-        for value, name in zip(x_ticks, tick_names(x_ticks), strict=True):
+        names = tick_names(x_ticks)
+        shown = self._named(x_ticks, names)
+        for k, (value, name) in enumerate(zip(x_ticks, names, strict=True)):
             x = self.x(value)
-            parts.append(text(x, top + height + 15, name, "middle", "tick"))
+            if k % shown == 0:
+                parts.append(text(x, top + height + 15, name, "middle", "tick"))
             if grid:
                 parts.append(line(x, top, x, top + height, "rule"))
         for value, name in zip(y_ticks, tick_names(y_ticks), strict=True):
@@ -95,6 +102,23 @@ class Axes:
                 ).format(_n(y), y_label)
             )
         return Markup("").join(parts)
+
+    def _named(self, values: Sequence[float], names: Sequence[str]) -> int:
+        """Of how many ticks across one is named, so that no name runs into the next."""
+        if len(values) < 2:
+            return 1
+        apart = abs(self.x(values[1]) - self.x(values[0]))
+        return max(1, math.ceil(DIGIT * (max(map(len, names)) + 0.5) / apart))
+
+
+def room_beside(y_range: tuple[float, float]) -> float:
+    """The left margin that an axis of such values needs for the names of its ticks, `LEFT` where they are short.
+
+    Example:
+        >>> room_beside((0, 300)), room_beside((8303980, 8304060))
+        (50.0, 71.0)
+    """
+    return max([LEFT, *(BESIDE + DIGIT * len(name) for name in tick_names(ticks(*y_range)))])
 
 
 def image_axes(size: tuple[int, int]) -> Axes:
@@ -213,8 +237,18 @@ def ticks(low: float, high: float, count: int = 5) -> list[float]:
 
 
 def tick_names(values: Sequence[float]) -> list[str]:
-    """Numbers at an axis, with a minus as typeset."""
-    return [f"{value:.6g}".replace("-", "\N{MINUS SIGN}") for value in values]
+    """Numbers at an axis, with a minus as typeset: all their digits, or with a power of ten where that is shorter.
+
+    Example:
+        >>> tick_names([8303980.0, 8304000.0]), tick_names([0.1, 1e7])
+        (['8303980', '8304000'], ['0.1', '1e+07'])
+    """
+    found = []
+    for value in values:
+        whole, short = f"{value:.12g}", f"{value:.6g}"
+        name = short if float(short) == value and len(short) < len(whole) else whole
+        found.append(name.replace("-", "\N{MINUS SIGN}"))
+    return found
 
 
 def reach(values: Iterable[float], least: float = 1e-9) -> float:

@@ -33,6 +33,16 @@ def faces_away(board: Board) -> bool:
     return float(right[0] * down[1] - right[1] * down[0]) > 0
 
 
+def with_article(board: Board) -> str:
+    """What a board is, in words that can stand after "want".
+
+    Example:
+        >>> with_article(AprilGrid(6, 6, 22.0, 0.3)), with_article(Chessboard())
+        ('an AprilGrid with 6 x 6 tags', 'a board with 9 x 6 inner corners')
+    """
+    return f"{'an' if board.title[0] in 'aA' else 'a'} {board.title}"
+
+
 def origin_doubt(board: Chessboard | CircleGrid) -> str:
     """What to know about a board that looks the same when turned: which point is the first is not seen.
 
@@ -44,9 +54,9 @@ def origin_doubt(board: Chessboard | CircleGrid) -> str:
     if isinstance(board, CircleGrid):
         what, other = "circle", "an asymmetric one of an odd number of lines, such as 11 x 4"
     return (
-        f"{'an' if board.title[0] == 'a' else 'a'} {board.title} looks the same when turned by {360 // board.turns} "
-        f"degrees: the first {what}, and with it the origin of the world, is one nearest to the photograph's top left, "
-        f"and may be another in the next photograph; keep the board as it is, or use {other}"
+        f"{with_article(board)} looks the same when turned by {360 // board.turns} degrees: the first {what}, and with "
+        f"it the origin of the world, is one nearest to the photograph's top left, and may be another in the next "
+        f"photograph; keep the board as it is, or use {other}"
     )
 
 

@@ -3,6 +3,7 @@
 import itertools
 from collections import Counter
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -51,6 +52,9 @@ ROUNDS = 6
 LONGEST = 1600
 """Longer side in px of the copy in which circles are sought first."""
 
+BESIDE = 2.1
+"""How far from a circle those lie that tell the scale there, in distances between nearest ones."""
+
 _BASES = [
     basis
     for entries in itertools.product((-1, 0, 1), repeat=4)
@@ -59,7 +63,21 @@ _BASES = [
 """Bases of a lattice of whole numbers: seen at a slant, its nearest points need not be those along rows and columns."""
 
 
-def find_circles(image: Shaped[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], board: CircleGrid) -> Taken | None:
+class Circles(NamedTuple):
+    """A circle grid in a photograph.
+
+    Attributes:
+        taken: the middles of the circles' images.
+        diameter: of the circles, as their images and the distances between these tell it, in world units.
+        diameter_px: the same in px.
+    """
+
+    taken: Taken
+    diameter: float
+    diameter_px: float
+
+
+def find_circles(image: Shaped[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], board: CircleGrid) -> Circles | None:
     """The middles of the circles' images in px, in the board's order; None where it is not there.
 
     They may be light on dark as well. Of orders that look alike, the one whose first circle is nearest the image's top
@@ -78,9 +96,10 @@ def find_circles(image: Shaped[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"
             if len(ellipses.centres) < WHOLE * len(board):
                 continue
             refined = [_refined(whole, ellipses, numbers, board) for numbers in _numbered(ellipses, board)]
-            taken = largest([middles for middles in refined if middles is not None])
+            boards = [one for one in refined if one is not None]
+            taken = largest([middles for middles, _ in boards])
             if taken is not None:
-                return taken
+                return Circles(taken, *next(sizes for middles, sizes in boards if middles is taken.points))
     return None
 
 
@@ -247,8 +266,11 @@ def _first(places: Int[np.ndarray, "n 2"], seen: Float[np.ndarray, "n 2"]) -> Fl
 
 def _refined(
     image: Shaped[np.ndarray, "h w"], ellipses: Ellipses, numbers: Int[np.ndarray, " n"], board: CircleGrid
-) -> Float[np.ndarray, "n 2"] | None:
-    """The circles' middles to a hundredth of a pixel; those that do not look like circles, or lie off, are hidden."""
+) -> tuple[Float[np.ndarray, "n 2"], tuple[float, float]] | None:
+    """The circles' middles to a hundredth of a pixel; those that do not look like circles, or lie off, are hidden.
+
+    And the diameter that their images have, in world units and in px.
+    """
     there = np.flatnonzero(numbers >= 0)
     start = ellipses.only(numbers[there])
     apart = np.linalg.norm(start.centres[:, None] - start.centres[None], axis=-1)
@@ -281,4 +303,24 @@ def _refined(
             break
         seen &= excess <= max(1.0, 0.5 * excess.max())
     known[~seen] = np.nan
-    return known if _whole(seen, board) else None
+    if not _whole(seen, board):
+        return None
+    axes = np.full((len(board), 2, 2), np.nan)
+    axes[there] = fit.ellipses.axes
+    return known, _diameter(known, axes, board)
+
+
+def _diameter(
+    known: Float[np.ndarray, "n 2"], axes: Float[np.ndarray, "n 2 2"], board: CircleGrid
+) -> tuple[float, float]:
+    """The circles' diameter in world units and in px: the area of their images, and of a world unit between them."""
+    places = board.places * board.spacing
+    seen = np.flatnonzero(np.isfinite(known[:, 0]))
+    area = 1 / np.linalg.det(axes[seen])  # of an ellipse, over pi
+    scale = np.full(len(seen), np.nan)
+    for i, k in enumerate(seen):
+        near = seen[np.linalg.norm(places[seen] - places[k], axis=-1) < BESIDE * board.apart]
+        across, off = places[near] - places[k], known[near] - known[k]
+        if np.linalg.matrix_rank(across) == across.shape[1]:
+            scale[i] = abs(np.linalg.det(np.linalg.lstsq(across, off, rcond=None)[0]))
+    return float(2 * np.sqrt(np.nanmedian(area / scale))), float(2 * np.sqrt(np.median(area)))

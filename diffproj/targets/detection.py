@@ -14,7 +14,7 @@ from jaxtyping import Float, Shaped
 
 from diffproj._core.arguments import function, whole_number
 from diffproj.targets.april_grid import AprilGrid
-from diffproj.targets.boards import Board, as_target
+from diffproj.targets.boards import Board, as_target, with_article
 from diffproj.targets.charuco import CharucoBoard
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.circle_grid import CircleGrid
@@ -68,9 +68,10 @@ def detect(
 
     A `CircleGrid` is found as dark ellipses on a lattice, or light ones on dark, of which up to a quarter may be
     hidden; those that glare or a shadow draws aside are. The pixels are the middles of the ellipses; `calibrate` knows
-    that a centre is seen elsewhere. Its order is never mirrored, and where the board looks the same when turned
-    (`CircleGrid.turns`), the rule for chessboards holds. Where it does so only since some circles are hidden, it counts
-    as not found.
+    that a centre is seen elsewhere, by as much as the diameter says: circles that are clearly of another one count as
+    not found, and the message says how wide they are. Its order is never mirrored, and where the board looks the same
+    when turned (`CircleGrid.turns`), the rule for chessboards holds. Where it does so only since some circles are
+    hidden, it counts as not found.
 
     A `Chessboard` is found as a pattern of saddle points of brightness, in copies of several sizes, and where only a
     part of it is found so, by OpenCV's detectors. Its dark and light may be exchanged, as in thermal images. Each
@@ -315,7 +316,7 @@ def _advice(labels: list[str], found: list[Found], target: Board) -> str:
     if hints:
         there = f" There is {hints[0]}."
     return (
-        f"photographs: want a {target.title}, found none in {_named(labels)}.{there} Check target, and that "
+        f"photographs: want {with_article(target)}, found none in {_named(labels)}.{there} Check target, and that "
         f"{_CHECKS[type(target)]}"
     )
 

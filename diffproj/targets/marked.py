@@ -201,15 +201,15 @@ class _Tried(NamedTuple):
 def _agreeing(grey: UInt8[np.ndarray, "h w"], board: MarkedBoard, border: int) -> list[list[Marker]]:
     """The largest set of markers that stand to each other as on the board, from the copy that shows most.
 
-    And the next largest, of markers in other places: of a second board. Each has two or more.
+    And the next largest, of markers in other places: of a second board. Each has two or more, unless the board has one.
     """
     best: list[Marker] = []
     others: list[Marker] = []
     for small in _copies(grey):
         found = _read(small, grey, board, border)
-        agreed = _consistent(found, board.pitch)
+        agreed = _consistent(found, board)
         if len(agreed) > len(best):
-            best, others = agreed, _consistent(_elsewhere(found, agreed), board.pitch)
+            best, others = agreed, _consistent(_elsewhere(found, agreed), board)
         if len(best) >= min(ENOUGH, 0.5 * len(board.markers)):
             break
     return [markers for markers in (best, others) if markers]
@@ -259,18 +259,22 @@ def _read(
     return found
 
 
-def _consistent(found: list[Marker], pitch: float) -> list[Marker]:
-    """The largest set of markers in which each is where a neighbour puts it, and puts that where it is."""
-    if len(found) < 2:
+def _consistent(found: list[Marker], board: MarkedBoard) -> list[Marker]:
+    """The largest set of markers in which each is where a neighbour puts it, and puts that where it is.
+
+    Of a board of one marker that one, which has no neighbours.
+    """
+    pitch, fewest = board.pitch, min(2, len(board.markers))
+    if len(found) < fewest:
         return []
-    board = np.stack([one.board.mean(axis=0) for one in found])
+    places = np.stack([one.board.mean(axis=0) for one in found])
     seen = np.stack([one.quad.mean(axis=0) for one in found])
     affine = np.stack([one.affine for one in found])
-    put = affine[:, None, :, :2] @ board[None, :, :, None]
+    put = affine[:, None, :, :2] @ places[None, :, :, None]
     put = put[..., 0] + affine[:, None, :, 2]
     size = np.sqrt(np.abs(np.linalg.det(affine[:, :, :2]))) * pitch
     off = np.linalg.norm(put - seen[None], axis=-1)
-    distance = np.linalg.norm(board[:, None] - board[None], axis=-1) / pitch
+    distance = np.linalg.norm(places[:, None] - places[None], axis=-1) / pitch
     near = (distance < NEAR) & (distance > 0)
     agree = near & (off < AGREED * np.maximum(distance, 1) * np.minimum(size[:, None], size[None]))
     agree &= agree.T
@@ -285,7 +289,7 @@ def _consistent(found: list[Marker], pitch: float) -> list[Marker]:
         if len({found[k].number for k in group}) > len({found[k].number for k in best}):
             best = group
     members = sorted(best)
-    if len({found[k].number for k in members}) < 2:
+    if len({found[k].number for k in members}) < fewest:
         return []
     # Markers amid the group that stand elsewhere on the board: it is another board that has some places in common.
     apart = np.linalg.norm(seen[:, None] - seen[None, members], axis=-1) / size[None, members]

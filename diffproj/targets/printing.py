@@ -3,6 +3,7 @@
 import io
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -41,6 +42,12 @@ MARGIN = 10.0
 FOOT = 14.0
 """Height in mm of the ruler and the words below the board."""
 
+FINEST = 0.1
+"""Width in mm below which parts of a board blur on paper: two dots of a printer of 600 dpi are .085 mm."""
+
+MOST_PIXELS = 6e8
+"""Pixels of a .png, each of which takes four bytes of memory while it is drawn: A0 at 600 dpi has 5.6e8."""
+
 INCH = UNITS["in"]
 
 
@@ -56,7 +63,8 @@ def draw_target(
 
     Below the board are a ruler, to check by measuring that nothing was scaled on the way to the paper, and the target's
     own description. A margin of 10 mm stays white. The page is turned where the board fits better so. Print at 100 %
-    ("actual size"), glue the print to something flat, and measure a long distance on it.
+    ("actual size"), glue the print to something flat, and measure a long distance on it. A warning says where parts are
+    finer than printers print, as those of a board in metres that is taken to be in millimetres.
 
     Args:
         target: the board.
@@ -67,8 +75,8 @@ def draw_target(
 
     Raises:
         TypeError: an argument is of the wrong kind.
-        ValueError: the board does not fit on the paper (the message names the largest that does), or the paper, the
-            unit or the file's ending is unknown.
+        ValueError: the board does not fit on the paper (the message names the largest that does), a .png would have
+            more than 600 million pixels, or the paper, the unit or the file's ending is unknown.
         OSError: the file cannot be written.
         ModuleNotFoundError: matplotlib is missing.
 
@@ -90,7 +98,38 @@ def draw_target(
     dpi = number("dpi", dpi, "pixels per inch, from 50 to 5000", least=50, most=5000)
     scale = UNITS[choice("unit", unit, UNITS)]
     page = _page(target, paper, scale)
+    if file.suffix.lower() == ".png":
+        _check_pixels(page, dpi)
+    finest = _finest(target) * scale
+    if finest < FINEST:
+        warnings.warn(
+            f"target: its finest parts are {finest:.2g} mm wide, finer than printers print; is it described in {unit}?",
+            stacklevel=2,
+        )
     write_whole(file, _drawn(target, page, scale, unit, file.suffix.lower()[1:], dpi))
+
+
+def _check_pixels(page: tuple[float, float], dpi: float) -> None:
+    """Check that a picture fits into memory.
+
+    Raises:
+        ValueError: it does not.
+    """
+    width, height = page
+    most = math.floor(math.sqrt(MOST_PIXELS / (width * height)) * INCH)
+    if dpi > most:
+        raise ValueError(
+            f"dpi: want at most {most} for a .png of {width:g} x {height:g} mm, got {dpi:g}; a .pdf or .svg has no "
+            "pixels"
+        )
+
+
+def _finest(target: Board) -> float:
+    """Width of the narrowest cell or disc of the print, in world units."""
+    art = target.artwork
+    if len(art.discs):
+        return float(2 * art.discs[:, 2].min())
+    return float(min(np.diff(art.x).min(), np.diff(art.y).min()))
 
 
 def _page(target: Board, paper: str | Sequence[float], scale: float) -> tuple[float, float]:

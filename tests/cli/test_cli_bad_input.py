@@ -169,6 +169,7 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
     ((*VIEW, "--points"), 2, "--points: expected at least one argument"),
     ((*VIEW, "--points", "1;2"), 2, "--points: want pixels as u,v without a space"),
     ((*VIEW, "--points", "inf,2"), 2, "--points: want pixels as u,v"),
+    ((*VIEW, "--points", "short.csv"), 2, "got 'short.csv'; a file of them goes with --points-file"),
     ((*VIEW, "--points", "1e300,2"), 2, "--points: want pixels as u,v"),
     ((*VIEW, *POINTS, "--points-file", "short.csv"), 2, "--points-file: not allowed with argument --points"),
     *(

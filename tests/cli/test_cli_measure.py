@@ -20,9 +20,11 @@ import diffproj as dp
 from diffproj import synthetic
 from diffproj.cli import shielded
 from diffproj.cli.inputs import HAND
+from diffproj.cli.measure_csv import as_csv
 from diffproj.cli.measure_document import REASONS, between, listed
 from diffproj.cli.measure_plane import equation
 from diffproj.cli.measure_tables import coordinate, shown
+from diffproj.cli.measuring import length_in_words
 from diffproj.cli.photographs import warn_if_shown_turned
 from diffproj.measurement.choices import HAND_PX
 from diffproj.targets.images import decoded
@@ -456,6 +458,19 @@ def test_tables_for_spreadsheets(capsys: pytest.CaptureFixture[str]) -> None:
     assert (first["name"], first["unit"], rows[-1]["unit"], rows[-1]["value"]) == ("1, 2", "mm", "mm^2", "")
 
 
+def test_the_table_says_what_is_doubtful(capsys: pytest.CaptureFixture[str]) -> None:
+    """What is measured by another camera stood there like everything else: doubts were on standard error alone."""
+    options = ("photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS, "-9000,100", "--json")
+    document = json.loads(run(capsys, *options)[1])
+    for doubts, remark in ((None, ""), ("another camera, zoom or focus?", "DOUBTFUL")):
+        rows = list(csv.DictReader(io.StringIO(as_csv(document | {"doubts": doubts}))))
+        there = [row for row in rows if row["x"] or row["value"]]
+        assert {row["what"] for row in there} == {"point", "length"}
+        assert {remark in row["remark"] for row in there} == {True}
+        assert all("DOUBTFUL" not in row["remark"] for row in rows if row not in there)
+        assert all(row["remark"] in ("", remark) for row in there)
+
+
 def test_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "measured.png"
     points = ("--points", *CORNERS, "-60,200", "-9000,100", "-2000,-4000.5")
@@ -474,6 +489,14 @@ def test_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     blank = cv2.imread(str(file))
     assert blank is not None
     assert blank.mean() > image.mean()  # no photograph is there
+
+
+def test_lengths_in_a_picture_say_where_they_are_not_known() -> None:
+    """In the picture a length without a finite deviation, 702.393 mm, looked surer than all others."""
+    told = {"value": 90.23733, "deviation": 0.35345, "interval_95": [89.5, 90.9]}
+    assert length_in_words(told, "mm") == "90.24 ± 0.35 mm"
+    assert length_in_words({"value": 702.3931, "deviation": None, "interval_95": None}, "mm") == "702.393 ± unknown mm"
+    assert length_in_words({"value": None, "deviation": None, "interval_95": None}, "mm") == ""
 
 
 def test_hand_picked_lengths_are_covered() -> None:

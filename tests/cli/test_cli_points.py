@@ -33,6 +33,34 @@ def test_points_without_names_have_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "v,u\n2,1\n4,3\n",
+        "row,col\n2,1\n4,3\n",
+        "u,v,name\n1,2,1\n3,4,2\n",
+        "u,name,v\n1,1,2\n3,2,4\n",
+        "Point;Y [px];X [px]\n1;2,0;1,0\n2;4,0;3,0\n",
+        "v,u\n1,2,1\n2,4,3\n",
+        "name,v,u\n2,1\n4,3\n",
+        "Punkt,Spalte,Zeile\n1,1,2\n2,3,4\n",
+    ],
+)
+def test_titles_tell_the_order(text: str, tmp_path: Path) -> None:
+    """A table of v and u was read as one of u and v, and one of u, v, name with its names as pixels."""
+    file = tmp_path / "points.csv"
+    file.write_text(text)
+    assert read_points(file) == [Pixel("1", 1, 2), Pixel("2", 3, 4)]
+
+
+@pytest.mark.parametrize("titles", ["u,Zeile", "name,u,u", "name,x,height", "v,y"])
+def test_titles_that_tell_half_are_refused(titles: str, tmp_path: Path) -> None:
+    file = tmp_path / "points.csv"
+    file.write_text(f"{titles}\n1,2\n")
+    with pytest.raises(ValueError, match=r"--points-file: want the titles name, u and v, got .* in the first line"):
+        read_points(file)
+
+
+@pytest.mark.parametrize(
     ("text", "square"),
     [
         ("25", Length(25.0)),

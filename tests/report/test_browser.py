@@ -353,3 +353,15 @@ def test_fingers_put_points_and_pinch(file: Path, opened: Callable[..., Page]) -
     page.wait_for_timeout(100)
     assert page.evaluate("document.getElementById('m-photo').toDataURL().length") != before
     assert len(points(page)) == 2
+
+
+def test_a_reports_tables_fit_on_a_telephone(calibration: dp.Calibration, chromium: Any, tmp_path: Path) -> None:
+    """How well one measures, the table that most look for, was cut off on the right where no unit was known."""
+    path = tmp_path / "report.html"
+    dp.write_report(path, calibration, folds=3)
+    page = chromium.new_page(viewport={"width": 390, "height": 844}, offline=True)
+    page.goto(path.as_uri())
+    tables = page.locator(".scroll:visible").evaluate_all("all => all.map((one) => [one.scrollWidth, one.clientWidth])")
+    page.close()
+    assert len(tables) >= 3
+    assert all(needed <= there for needed, there in tables)

@@ -19,6 +19,7 @@ import torch
 
 import diffproj as dp
 from diffproj.calibration.results.region import in_region
+from diffproj.report import svg
 from diffproj.report.accuracy import accuracy_part
 from diffproj.report.coverage import covered_share
 from diffproj.report.facts import Facts, tilts_of
@@ -183,6 +184,19 @@ def test_what_is_not_trusted_are_the_remarks(calibration: dp.Calibration, page: 
     told = Facts(calibration, (640, 480)).in_words(calibration.remarks[0]).replace("world units", "mm")
     assert told[1:] in words(page)
     assert "nothing speaks against" not in page
+
+
+def test_nothing_of_a_camera_that_was_not_found_is_trusted() -> None:
+    """The page said that the residuals, 36 px here, were those of noise, and that nothing spoke against the numbers."""
+    views = dp.example_views("left")
+    pixels = views.pixels.clone()
+    pixels[3] = pixels[3, torch.randperm(54, generator=torch.Generator().manual_seed(0))]
+    found = dp.calibrate(dp.Views(pixels, size=views.size), BOARD, throw=False)
+    for failed in (found, not_converged()):
+        assert failed.judgement.word == "Not usable"
+        text = words(verdict_part(Facts(failed, (640, 480))).html)
+        assert "nothing speaks against" not in text
+        assert "What not to trust Any of the numbers" in text
 
 
 def test_uses_are_what_measure_gives(calibration: dp.Calibration) -> None:
@@ -482,3 +496,31 @@ def test_with_photographs_the_report_measures_in_one(
     assert outline.texts["h2"][-1] == f"Measure in {usual}"
     ids = [a["id"] for _, a in outline.elements if "id" in a]
     assert len(set(ids)) == len(ids)
+
+
+def test_a_landmarks_plane_is_that_of_their_mean_height() -> None:
+    """The maps were of that plane and called the board's; the code to copy measured on z = 0, 30 units below."""
+    found = landmarks()
+    page = report(found, folds=None)
+    height = float(found.nominal[:, 2].mean())
+    code = html.unescape(re.search(r'<code class="python">(.*?)</code>', page, re.DOTALL)[1])  # type: ignore[index]
+    assert float(re.search(r"Plane\.z\((.*?)\)", code)[1]) == pytest.approx(height)  # type: ignore[index]
+    for part in (accuracy_part(Facts(found, (640, 480))), usage_part(Facts(found, (640, 480)), "camera.json")):
+        assert "board" not in words(part.html).replace("Board", "board")
+        assert re.search("the plane of the landmarks.{1,2} mean z", words(part.html))
+
+
+def test_names_at_axes_are_whole_and_stand_apart() -> None:
+    """Coordinates of a national grid ran out of the picture on the left, so that 8304040 read as 04e+06."""
+    x, y = (644970.0, 645090.0), (8303970.0, 8304070.0)
+    assert svg.tick_names(svg.ticks(*y)) == ["8303980", "8304000", "8304020", "8304040", "8304060"]
+    for x_range, y_range in ((x, y), ((-1e-4, 2.6e-4), (-1e-4, 2e-4)), ((-1e8, 2.6e8), (-1e8, 2e8))):
+        drawn = str(svg.Axes(x_range, y_range, left=svg.room_beside(y_range)).drawn("x, m", "y, m"))
+        texts = re.findall(r'<text class="tick" x="(.*?)" y="(.*?)" text-anchor="(.*?)">(.*?)</text>', drawn)
+        upright = [(float(u), name) for u, _, anchor, name in texts if anchor == "end"]
+        across = sorted((float(u), name) for u, _, anchor, name in texts if anchor == "middle")
+        assert len(upright) >= 4
+        assert len(across) >= 2
+        assert all(u - svg.DIGIT * len(name) >= 15 for u, name in upright)
+        for (u, name), (u2, name2) in itertools.pairwise(across):
+            assert u2 - u >= svg.DIGIT * (len(name) + len(name2)) / 2

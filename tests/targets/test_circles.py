@@ -1,6 +1,8 @@
 """Circle grids: their points are OpenCV's, and their images' middles are found, with some of them hidden."""
 
+import dataclasses
 import itertools
+import re
 
 import cv2
 import numpy as np
@@ -123,3 +125,32 @@ def test_words_and_numbers_that_cannot_be():
         dp.CircleGrid(7, 5, 20.0, 10.0, "both")
     with pytest.raises(dp.BoardNotFoundError, match=r"want a circle grid with 7 x 5 circles"):
         dp.detect(np.full((240, 320), 200, np.uint8), PLAIN)
+
+
+@pytest.mark.parametrize(("factor", "named"), [(0.5, True), (0.7, True), (0.9, False), (1.15, False), (1.35, True)])
+@pytest.mark.parametrize("board", [PLAIN, LYING], ids=["plain", "asymmetric"])
+def test_another_diameter_is_named(board, factor, named):
+    """The radius given for the diameter moved focal lengths by eight of their deviations, and nothing was said."""
+    image = photographed(camera_before(board, 5, 18, tilt_deg=25), board)
+    given = dataclasses.replace(board, diameter=min(factor * board.diameter, 0.94 * board.apart))
+    if not named:
+        assert bool(dp.detect(image, given).visible.all())
+        return
+    with pytest.raises(dp.BoardNotFoundError) as refused:
+        dp.detect(image, given)
+    told = re.search(
+        r"circles are about ([\d.]+) across where they should be ([\d.]+): give the diam", str(refused.value)
+    )
+    assert told is not None
+    assert float(told[1]) == pytest.approx(board.diameter, rel=0.05)
+    assert float(told[2]) == pytest.approx(given.diameter, rel=0.01)
+
+
+@pytest.mark.parametrize("change", ["blurred", "over-exposed", "dark"])
+def test_light_and_blur_make_no_other_diameter(change):
+    image = photographed(camera_before(PLAIN, 6, 14, tilt_deg=30), PLAIN).astype(np.float64)
+    if change == "blurred":
+        image = cv2.GaussianBlur(image, (0, 0), 2.0)
+    else:
+        image = (image * 1.6 - 10).clip(0, 255) if change == "over-exposed" else 255 * (image / 255) ** 2.2
+    assert len(dp.detect(image.astype(np.uint8), PLAIN)) == 1

@@ -10,6 +10,7 @@ import torch
 
 import diffproj as dp
 from diffproj.targets.codes import contradicted
+from diffproj.targets.finders import _spacing_of
 from tests.targets.boards_in_view import camera_before, errors, photographed
 
 CHARUCO = dp.CharucoBoard(8, 6, square=20.0, marker=15.0, dictionary="4X4_1000")
@@ -247,7 +248,7 @@ def test_markers_that_are_not_read_have_their_own_codes_where_corners_were_found
     assert contradicted(ordinary, LEGACY, 1, corners)
 
 
-@pytest.mark.parametrize(("given", "true"), [(0.2, 0.3), (0.5, 0.3), (0.3, 0.2), (0.25, 0.3)])
+@pytest.mark.parametrize(("given", "true"), [(0.2, 0.3), (0.5, 0.3), (0.3, 0.2), (0.25, 0.3), (0.27, 0.3), (0.33, 0.3)])
 def test_another_spacing_of_tags_is_told(given, true):
     board = dp.AprilGrid(4, 3, tag=20.0, spacing=true)
     photo = photographed(camera_before(board, 1, side_px=40, tilt_deg=20), board)
@@ -256,9 +257,35 @@ def test_another_spacing_of_tags_is_told(given, true):
         dp.detect(photo, dp.AprilGrid(4, 3, tag=20.0, spacing=given))
 
 
-def test_the_smallest_board_is_found():
-    board = dp.CharucoBoard(3, 3, square=20.0, marker=15.0, dictionary="4X4_50")
+def test_perspective_makes_no_other_spacing():
+    """Close to a tilted board sides and gaps shrink along it; their ratio, which was taken, says another spacing."""
+    board = dp.AprilGrid(3, 2, tag=20.0, spacing=0.3)
+    K = torch.tensor([[300.0, 0, 640], [0, 300, 480], [0, 0, 1]], dtype=torch.float64)
+    for turn in (0.0, 0.8, 2.0):
+        R = dp.rotation_from_euler(*torch.tensor([0.9, 0.3, turn], dtype=torch.float64))
+        t = torch.tensor([0.0, 0, 90], dtype=torch.float64) - R @ board.points.mean(0)
+        pixels, valid = dp.Camera(K, R, t).project(board.points)
+        assert bool(valid.all())
+        assert _spacing_of(pixels.reshape(4, 6, 2).numpy()) == pytest.approx(0.3, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "board",
+    [dp.CharucoBoard(3, 3, square=20.0, marker=15.0, dictionary="4X4_50"), dp.AprilGrid(1, 1, tag=20.0, spacing=0.3)],
+    ids=["charuco", "april"],
+)
+def test_the_smallest_board_is_found(board):
+    """An AprilGrid of one tag was accepted and printed, and never found."""
     camera = camera_before(board, 2, side_px=40, tilt_deg=20)
     found = dp.detect(photographed(camera, board), board)
     assert int(found.visible.sum()) == 4
     assert errors(found, camera, board)[0].max() < 0.1
+
+
+def test_what_is_not_found_has_its_article():
+    for board, words in (
+        (dp.AprilGrid(6, 6, 22.0, 0.3), "an AprilGrid"),
+        (dp.CircleGrid(4, 11, 20.0, 9.0, True), "an asym"),
+    ):
+        with pytest.raises(dp.BoardNotFoundError, match=f"photographs: want {words}"):
+            dp.detect(np.zeros((60, 80), np.uint8), board)

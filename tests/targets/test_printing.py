@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -69,6 +70,16 @@ def test_units(tmp_path):
     assert np.abs(mm.astype(int) - m).max() <= 1
 
 
+@pytest.mark.parametrize("kind", BOARDS)
+def test_a_board_finer_than_printers_print_is_told(tmp_path, kind):
+    """Sides in metres, taken to be in mm, gave a page with a dot, and nothing was said."""
+    sides = ("square", "marker", "tag", "diameter", *(["spacing"] if kind == "circles" else []))
+    small = replace(BOARDS[kind], **{k: getattr(BOARDS[kind], k) / 1000 for k in sides if hasattr(BOARDS[kind], k)})
+    with pytest.warns(UserWarning, match=r"finest parts are 0\.0[\d]+ mm wide, .* is it described in mm\?"):
+        dp.draw_target(small, tmp_path / "board.svg")
+    dp.draw_target(small, tmp_path / "board.svg", unit="m")
+
+
 def test_what_does_not_fit_is_refused_with_what_does(tmp_path):
     with pytest.raises(ValueError, match=r"277 x 176 mm on A4 .*, got 360 x 270 mm; the largest square .* 19\.5 mm"):
         dp.draw_target(dp.Chessboard(11, 8, 30.0), tmp_path / "board.pdf")
@@ -77,3 +88,13 @@ def test_what_does_not_fit_is_refused_with_what_does(tmp_path):
         dp.draw_target(dp.Chessboard(), tmp_path / "board.pdf", "B4")
     with pytest.raises(ValueError, match="path: want a file ending in .pdf, .svg, .png, got"):
         dp.draw_target(dp.Chessboard(), tmp_path / "board.jpg")
+
+
+def test_a_picture_that_no_memory_holds_is_refused(tmp_path):
+    """A0 at 5000 dpi ended in a MemoryError."""
+    with pytest.raises(
+        ValueError, match=r"dpi: want at most 622 for a \.png of 1189 x 841 mm, got 5000; a \.pdf or \.svg"
+    ):
+        dp.draw_target(dp.Chessboard(), tmp_path / "board.png", "A0", dpi=5000)
+    assert not list(tmp_path.iterdir())
+    dp.draw_target(dp.Chessboard(), tmp_path / "board.svg", "A0", dpi=5000)
