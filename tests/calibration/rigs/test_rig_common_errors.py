@@ -8,17 +8,27 @@ import torch
 
 import diffproj as dp
 from diffproj.calibration.rigs.common_errors import _not_negative
-from tests.calibration.rigs.rig_scenes import Scene, off_truth, scene
+from tests.calibration.rigs.rig_scenes import Scene, off_truth, rotation, scene
 
 D = torch.float64
 
 
-def late(true: Scene, shift: float, *names: str, seed: int = 0) -> dict[str, dp.Views]:
-    """The views, with all corners of each of some cameras' off by so many px (RMS), another way each time."""
+def late(true: Scene, shift: float, *names: str, turn: float = 0.0, seed: int = 0) -> dict[str, dp.Views]:
+    """The views, with all corners of each of some cameras' off by so many px (RMS), another way each time.
+
+    And with the board turned about its middle by so many radians (standard deviation, about each axis).
+    """
     draw, views = torch.Generator().manual_seed(10_000 + seed), dict(true.views)
+    middle = true.board.points.to(D).mean(0)
     for name in names:
-        one = true.views[name]
-        pixels = one.pixels + shift / math.sqrt(2) * torch.randn(len(one), 1, 2, generator=draw, dtype=D)
+        one, camera = true.views[name], true.cameras[name]
+        m = torch.tensor([int(moment.removeprefix("moment ")) for moment in one.names])
+        before = camera.R @ true.R[m]
+        place = (before @ middle) + (camera.R @ true.t[m].unsqueeze(-1)).squeeze(-1) + camera.t
+        after = rotation(turn * torch.randn(len(m), 3, generator=draw, dtype=D)) @ before
+        seen, moved = (camera.at(R, place - R @ middle).project(true.board.points)[0] for R in (before, after))
+        pixels = one.pixels + moved - seen
+        pixels = pixels + shift / math.sqrt(2) * torch.randn(len(one), 1, 2, generator=draw, dtype=D)
         views[name] = dp.Views(pixels, one.visible, one.names, size=(1280, 960))
     return views
 
@@ -33,7 +43,7 @@ def squares(rig: dp.RigCalibration, true: Scene) -> list[float]:
 
 
 def said(rig: dp.RigCalibration) -> list[str]:
-    return [remark for remark in rig.remarks if "all corners of a view alike" in remark]
+    return [remark for remark in rig.remarks if "all corners of a view together" in remark]
 
 
 def test_places_hold_that_a_camera_is_late() -> None:
@@ -43,10 +53,27 @@ def test_places_hold_that_a_camera_is_late() -> None:
         rig = dp.calibrate_rig(late(true, 0.2, "cam1", seed=seed), true.board)
         found += squares(rig, true)
         moved += [float("0.1" < remark.split(" px")[0][-4:] < "0.4") for remark in said(rig)]
-    # Measured over 200 rigs: 1.16, and 95 % of the baselines in their intervals; 3.4 and 80 % without.
+    # Measured over 200 rigs: 1.14, and 95 % of the baselines in their intervals; 3.4 and 80 % without.
     assert sum(found) / len(found) == pytest.approx(1, abs=0.5)
     assert len(moved) > 8
     assert all(moved)
+
+
+def test_places_hold_that_a_turning_board_is_seen_late() -> None:
+    found, focal, named = [], [], 0
+    for seed in range(16):
+        true = scene(2, 15, missing=0.1, seed=seed)
+        rig = dp.calibrate_rig(late(true, 0.0, "cam1", turn=0.0016, seed=seed), true.board)  # .2 px at the edge
+        found += squares(rig, true)
+        focal += [
+            float((rig.cameras[name].K[0, 0] - true.cameras[name].K[0, 0]) / rig[name].covariance.deviations["f_x"])
+            for name in rig.names
+        ]
+        named += len(said(rig))
+    # Measured over 40 rigs: 1.01 and 1.08; 2.3 and 1.34 without.
+    assert sum(found) / len(found) == pytest.approx(1, abs=0.5)
+    assert float(torch.tensor(focal).square().mean().sqrt()) == pytest.approx(1, abs=0.25)
+    assert named > 10
 
 
 @pytest.mark.slow
@@ -89,7 +116,7 @@ def test_the_late_one_of_four_is_named() -> None:
         ratio = rig.place_covariance(name).diagonal().sqrt() / before.place_covariance(name).diagonal().sqrt()
         assert least < float(ratio.square().mean().sqrt()) < most
     every = dp.calibrate_rig(late(true, 0.4, *true.views), true.board)
-    assert "cam0 by 0." in said(every)[0]
+    assert said(every)[0].count(" by 0.") >= 3
     # A moment's own pose is as uncertain as that makes it.
     widened = every.covariance.poses.diagonal(dim1=-2, dim2=-1) / before.covariance.poses.diagonal(dim1=-2, dim2=-1)
     assert float(widened.median()) > 2
@@ -101,7 +128,7 @@ def test_the_shift_itself_is_found() -> None:
     for seed in range(12):
         true = scene(2, 20, missing=0.0, seed=seed)
         rig = dp.calibrate_rig(late(true, 0.3, "cam0", seed=seed), true.board)
-        told.append(rig._covariance.common.variance)  # type: ignore[union-attr]
+        told.append(rig._covariance.common.variance[:, 0])  # type: ignore[union-attr]
     mean = torch.stack(told).mean(0)
     # The mean of 12 is known to 10 %.
     assert float(mean.sum()) == pytest.approx(0.3**2 / 2, rel=0.3)
