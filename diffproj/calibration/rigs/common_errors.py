@@ -13,7 +13,8 @@ view v, W their weights, and B_k the moves of its corners,
 
 tells the variance t_k(c)^2 of the moves in the views of each camera (the method of moments); the noise s_c^2 is that of
 the corners about what they have in common. Two cameras tell the sum of theirs alone, which is shared out evenly. It is
-believed as far as it stands out of chance, and joins the covariance of the scores:
+believed as far as it stands out of chance, counts more where few moments tell it, as dispersion does, and joins the
+covariance of the scores:
 
     M = sum over v of s_c^2 J_v^T W J_v + sum over k of t_k(c)^2 T_vk^T T_vk
 """
@@ -31,10 +32,11 @@ from diffproj.calibration.problem.shape import by_displacement
 from diffproj.calibration.results.covariance import Scores
 from diffproj.calibration.rigs.fit import RigFit
 from diffproj.calibration.rigs.problem import Group
+from diffproj.calibration.trust.dispersion import FEW_VIEWS
 
 STEPS = 200
 """Multiplications until variances that cannot be negative have settled."""
-CHANCE = 1.5
+CHANCE = 2.0
 """Deviations of chance that count as nothing; half of what is beyond counts at one more."""
 OF_KIND, KINDS = (0, 0, 1, 1, 1), 2
 """Of which kind each of the moves is: shifts along u and v; turns of the target about its middle."""
@@ -138,6 +140,7 @@ def common_errors(found: RigFit, variance: Tensor, freedom: Tensor, bend: Tensor
     squares = torch.einsum("mcadb,ak,bl->ckdl", G.square() - 2 * G * by_shared, kinds, kinds)
     across = inverse_S @ torch.einsum("mcai,mcaj,ak->ckij", left, left, kinds)
     squares = (squares + torch.einsum("ckij,dlji->ckdl", across, across)).clamp(min=0)
+    there = moves.weight.diagonal(dim1=-2, dim2=-1)[..., 0] > 0  # (M, C)
     noise = _noise_within(moves, own, variance, freedom)
     pull = torch.einsum("mca,ak->ck", moves.pull.square(), kinds)
     excess = pull - noise.unsqueeze(-1) * torch.einsum("mcaa,ak->ck", own, kinds)
@@ -149,6 +152,8 @@ def common_errors(found: RigFit, variance: Tensor, freedom: Tensor, bend: Tensor
     beyond = alone.sum(0) / chance.clamp(min=TINY).sqrt()
     over = (beyond - CHANCE).clamp(min=0).square()
     told = told * over / (1 + over)
+    moments = (there.sum(-1) > 1).sum()
+    told = told * (1 + FEW_VIEWS / (moments - 1).clamp(min=1))
     if not bool((told > 0).any()):
         return None
     deviation = (told @ kinds.mT).sqrt().unsqueeze(-1)  # (C, 5, 1)
