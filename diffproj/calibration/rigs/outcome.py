@@ -15,6 +15,7 @@ from diffproj.calibration.results.covariance import Covariance
 from diffproj.calibration.results.distinct import ALIKE_PX
 from diffproj.calibration.rigs.alone import Alone
 from diffproj.calibration.rigs.common_errors import CLEAR, CommonErrors, common_errors
+from diffproj.calibration.rigs.discounted import discounted
 from diffproj.calibration.rigs.fit import RigFit
 from diffproj.calibration.rigs.prior_contradiction import contradicted_priors
 from diffproj.calibration.rigs.result import RigCalibration
@@ -36,7 +37,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
     """The calibrated rig."""
     views, names = found.views, found.views.names
     noise = camera_noise(found)
-    joint = _Late(found, noise)
+    joint, wrong = _Late(found, noise), discounted(found, noise)
     R, t = found.problem.cameras(found.shared)
     cameras, calibrations = {}, {}
     fingerprint = hashlib.blake2b(found.shared.cpu().numpy().tobytes(), digest_size=12).hexdigest()
@@ -68,6 +69,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
             displacements=displacements(found),
             uncertain=data.uncertain,
             rig=fingerprint,
+            discounted=None if wrong is None else wrong[name],
             _covariance=partial(_of_camera, found, joint, c),
             _others=partial(_others, found, alone[name], name, posed.R, posed.t),
         )

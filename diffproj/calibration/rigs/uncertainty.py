@@ -171,7 +171,7 @@ def rig_covariance(found: RigFit, noise: CameraNoise, common: CommonErrors | Non
     scale = (noise.variance * noise.inflation).nan_to_num(0.0)
     _, M = problem.totals(*state, scale=scale, by_moment=True)
     phi, of_corners = _dispersion(found, M, None if common is None else common.scores)
-    noisy = _noisy_moments(found, noise)
+    noisy = noisy_moments(found, noise)
     if bool((noisy > 1).any()):
         _, M = problem.totals(*state, scale=scale.unsqueeze(-1) * noisy, by_moment=True)
     scores = Scores(M.U, M.E, M.W)
@@ -201,7 +201,7 @@ def rig_covariance(found: RigFit, noise: CameraNoise, common: CommonErrors | Non
     return replace(reshaped(found_one, ()), middle=middle, _arm=R @ middle)
 
 
-def _noisy_moments(found: RigFit, noise: CameraNoise) -> Tensor:
+def noisy_moments(found: RigFit, noise: CameraNoise) -> Tensor:
     """The factor on the variance of each camera's corners at each moment `(C, M)`: see `noisy_views.py`."""
     views, names = found.views, found.views.names
     count = torch.zeros(len(names), len(views.moments), dtype=torch.float64, device=found.shared.device)
