@@ -36,7 +36,8 @@ def metres_from_degrees(
     Raises:
         TypeError: no numbers, or a system that is no text.
         ValueError: degrees out of their range, as when the two are exchanged, a system that pyproj does not know, that
-            is not in metres, or whose metres are none where the points are, by more than a twentieth.
+            is not in metres, that counts to the west or south, or whose metres are none where the points are, by more
+            than a twentieth.
         ModuleNotFoundError: pyproj is not installed.
 
     Example:
@@ -71,7 +72,8 @@ def degrees_from_metres(points: Float[Tensor, "*batch n d"] | Array, crs: str) -
 
     Raises:
         TypeError: no numbers, or a system that is no text.
-        ValueError: a system that pyproj does not know, that is not in metres, or that does not reach the points.
+        ValueError: a system that pyproj does not know, that is not in metres, that counts to the west or south, or that
+            does not reach the points.
         ModuleNotFoundError: pyproj is not installed.
 
     Example:
@@ -138,6 +140,13 @@ def _map(pyproj: Any, name: str) -> Any:
         raise ValueError(f"crs: want a coordinate reference system such as 'EPSG:32630', got {name!r}") from error
     if not (system.is_projected and all(axis.unit_name == "metre" for axis in system.axis_info[:2])):
         raise ValueError(f"crs: want a map in metres, as UTM is, got {name!r} ({system.name})")
+    ways = [axis.direction for axis in system.axis_info[:2]]
+    if "west" in ways or ways.count("south") == 1:  # two souths, or two norths, are a pole's
+        raise ValueError(
+            f"crs: want a map that counts to the east and to the north, got {name!r} ({system.name}), which counts to "
+            f"the {ways[0]} and to the {ways[1]}; take one like it that does, as 'EPSG:5514' is for 'EPSG:5513', or a "
+            "UTM zone"
+        )
     return system
 
 

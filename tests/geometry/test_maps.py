@@ -80,6 +80,29 @@ def test_degrees_become_metres_and_back() -> None:
     assert float(fixed[0, 0]) > 900_000
 
 
+@pytest.mark.parametrize(
+    ("crs", "ways", "place"),
+    [("EPSG:5513", "south and to the west", [50.0, 15.0]), ("EPSG:2048", "west and to the south", [-33.9, 18.4])],
+)
+def test_maps_that_count_to_the_west_or_the_south_are_refused(crs: str, ways: str, place: list[float]) -> None:
+    """As east and north their numbers would be a mirrored or a turned world."""
+    pytest.importorskip("pyproj")
+    with pytest.raises(ValueError, match=f"crs: want a map that counts to the east and .* counts to the {ways}"):
+        dp.metres_from_degrees([place], crs)
+    with pytest.raises(ValueError, match="crs: want a map that counts to the east"):
+        dp.degrees_from_metres([[1.0, 2.0]], crs)
+
+
+def test_maps_that_name_north_first_or_lie_at_a_pole_are_taken() -> None:
+    pytest.importorskip("pyproj")
+    points, _ = dp.metres_from_degrees([[50.0, 9.0], [50.0, 9.001], [50.001, 9.0]], "EPSG:31467")  # north, east
+    assert 70 < float(points[1, 0] - points[0, 0]) < 73
+    assert 111 < float(points[2, 1] - points[0, 1]) < 112
+    pole, _ = dp.metres_from_degrees([[85.0, 10.0], [85.0, 10.01], [85.001, 10.0]], "EPSG:3413")  # south, south
+    east, north = pole[1] - pole[0], pole[2] - pole[0]
+    assert float(east[0] * north[1] - east[1] * north[0]) > 0  # right-handed
+
+
 def test_degrees_that_are_none_are_refused_by_name() -> None:
     pytest.importorskip("pyproj")
     with pytest.raises(

@@ -83,6 +83,13 @@ class RigFit:
         """How many shared unknowns are free."""
         return self.parameters.size if self.basis is None else self.basis.shape[-1]
 
+    def curvature(self, bend: Tensor) -> Equations:
+        """The normal equations with all that is minimised, and for each camera the mean slope of a loss `(C,)`."""
+        _, H = self.problem.totals(self.shared, self.local, None, scale=bend)
+        for more in (self.problem.precision(self.shared), None if self.prior is None else self.prior.whole):
+            H = H if more is None else H._replace(U=H.U + more)
+        return H
+
     @cached_property
     def by_camera(self) -> dict[str, Tensor]:
         """Projected minus seen corners `(V_c, N, 2)`, 0 where a corner was not used."""

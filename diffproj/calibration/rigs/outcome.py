@@ -3,7 +3,7 @@
 import hashlib
 import itertools
 from collections.abc import Mapping
-from functools import partial
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -14,6 +14,8 @@ from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.results.covariance import Covariance
 from diffproj.calibration.results.distinct import ALIKE_PX
 from diffproj.calibration.rigs.alone import Alone
+from diffproj.calibration.rigs.common_errors import CLEAR, CommonErrors, common_errors
+from diffproj.calibration.rigs.discounted import discounted
 from diffproj.calibration.rigs.fit import RigFit
 from diffproj.calibration.rigs.prior_contradiction import contradicted_priors
 from diffproj.calibration.rigs.result import RigCalibration
@@ -35,7 +37,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
     """The calibrated rig."""
     views, names = found.views, found.views.names
     noise = camera_noise(found)
-    joint = _Late(found, noise)
+    joint, wrong = _Late(found, noise), discounted(found, noise)
     R, t = found.problem.cameras(found.shared)
     cameras, calibrations = {}, {}
     fingerprint = hashlib.blake2b(found.shared.cpu().numpy().tobytes(), digest_size=12).hexdigest()
@@ -67,6 +69,7 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
             displacements=displacements(found),
             uncertain=data.uncertain,
             rig=fingerprint,
+            discounted=None if wrong is None else wrong[name],
             _covariance=partial(_of_camera, found, joint, c),
             _others=partial(_others, found, alone[name], name, posed.R, posed.t),
         )
@@ -108,15 +111,21 @@ def bow_of(found: RigFit) -> Tensor | None:
 
 
 class _Late:
-    """The joint covariance, computed once, when it is asked for."""
+    """The joint covariance, and what the corners of a view have in common, computed once, when it is asked for."""
 
     def __init__(self, found: RigFit, noise: CameraNoise) -> None:
         self.found, self.noise = found, noise
         self.known: Covariance | None = None
 
+    @cached_property
+    def common(self) -> CommonErrors | None:
+        """Errors that all corners of a view share."""
+        noise = self.noise
+        return common_errors(self.found, noise.variance, noise.freedom, noise.bend)
+
     def __call__(self) -> Covariance:
         if self.known is None:
-            self.known = rig_covariance(self.found, self.noise)
+            self.known = rig_covariance(self.found, self.noise, self.common)
             self.found.problem.forget()
         return self.known
 
@@ -207,6 +216,9 @@ def _remarks(
     if found.problem.known is not None:  # else the covariance is not asked for here
         said += contradicted_priors(found, noise, float(joint().dispersion))
     said += _unlike(found, noise)
+    if joint.common is not None and joint.common.beyond > CLEAR:
+        places = [i for one in found.parameters.poses[1:] for i in one]
+        said += filter(None, [joint.common.remark(names, places, joint().shared)])
     residuals = found.by_camera
     for name in names:
         used = found.used[name]

@@ -130,7 +130,8 @@ class RigCalibration(RigAccount, Copied, RigRecorded):
         """What is to be known of a rig that converged, and what to try; computed at the first call.
 
         Views that contradict the others and were left out, cameras that fit worse together than alone, moments that fit
-        badly, a prior that the views contradict, and the remarks on each camera on its own.
+        badly, cameras that see the target elsewhere than others do from moment to moment, a prior that the views
+        contradict, and the remarks on each camera on its own.
         """
         return self._remarks() if self._remarks is not None else ()
 
@@ -145,7 +146,8 @@ class RigCalibration(RigAccount, Copied, RigRecorded):
 
         Names of parameters are `left.f_x`, ..., `right.omega_x`, ..., `right.tau_z`: a camera's pose in the rig is
         perturbed by `R <- exp(omega) R`, `t <- t + tau`, in radians about the camera's axes and in world units. Its
-        "views" are the moments: poses of the target in the rig.
+        "views" are the moments: poses of the target in the rig. `dispersion` is that of the moments against independent
+        corners; what of it comes from errors that all corners of a view share is counted as such, and not by it.
 
         Raises:
             ValueError: it is not known.

@@ -7,7 +7,9 @@ each camera's share. With s_c the noise of camera c, and all views of a moment o
     H = sum_c sum w J^T J       M = sum_c s_c^2 sum w J^T J       covariance = phi H^-1 M H^-1
 
 where the corners of a camera clearly scatter more at a moment than at others, their own noise stands for s_c there
-(`noisy_views.py`); phi is the dispersion (`dispersion.py`): how much the moments contradict each other.
+(`noisy_views.py`); phi is the dispersion (`dispersion.py`): how much the moments contradict each other. Errors that all
+corners of a view share are a part of M of their own (`common_errors.py`), and phi multiplies the corners' part by what
+these leave of the dispersion.
 """
 
 from dataclasses import replace
@@ -21,10 +23,16 @@ from diffproj.calibration.least_squares.losses import slope_and_bend
 from diffproj.calibration.least_squares.normal_equations import Equations
 from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.results.covariance import Covariance, Scores, covariance, points_turned, reshaped
+from diffproj.calibration.rigs.common_errors import CommonErrors
 from diffproj.calibration.rigs.fit import RigFit
 from diffproj.calibration.trust.dispersion import FEW_VIEWS, FEW_VIEWS_OF_A_SHAPE, believed, contradiction
 from diffproj.calibration.trust.noisy_views import beyond_chance
 from diffproj.geometry.cayley import cross_matrix
+
+DISPERSION_STEPS = 10
+"""Towards the dispersion where views share errors: each comes closer to it severalfold."""
+LEAST = 1e-3
+"""Dispersion, anywhere below 1, that is as good as any."""
 
 
 class CameraNoise(NamedTuple):
@@ -156,22 +164,19 @@ def unseen(found: RigFit) -> Tensor | None:
     return torch.nn.functional.pad(found.restraint.unknown, (found.parameters.few, 0))
 
 
-def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
+def rig_covariance(found: RigFit, noise: CameraNoise, common: CommonErrors | None) -> Covariance:
     """The joint covariance, without batch axes; poses are the target's in the rig."""
     problem, state = found.problem, (found.shared, found.local, None)
-    _, H = problem.totals(*state, scale=noise.bend)
-    known = problem.precision(found.shared)
-    if known is not None:
-        H = H._replace(U=H.U + known)
-    if found.prior is not None:
-        H = H._replace(U=H.U + found.prior.whole)
+    H, known = found.curvature(noise.bend), problem.precision(found.shared)
     scale = (noise.variance * noise.inflation).nan_to_num(0.0)
     _, M = problem.totals(*state, scale=scale, by_moment=True)
-    phi = _dispersion(found, H, M)
-    noisy = _noisy_moments(found, noise)
+    phi, of_corners = _dispersion(found, M, None if common is None else common.scores)
+    noisy = noisy_moments(found, noise)
     if bool((noisy > 1).any()):
         _, M = problem.totals(*state, scale=scale.unsqueeze(-1) * noisy, by_moment=True)
     scores = Scores(M.U, M.E, M.W)
+    if common is not None:  # of all dispersion, the part that common errors do not explain is the corners'
+        scores = Scores(*((of_corners * a + b) / phi for a, b in zip(scores, common.scores, strict=True)))
     precision = (
         None if known is None else found.prior_variance * known
     )  # of its own scores, in the unit of the corners'
@@ -196,7 +201,7 @@ def rig_covariance(found: RigFit, noise: CameraNoise) -> Covariance:
     return replace(reshaped(found_one, ()), middle=middle, _arm=R @ middle)
 
 
-def _noisy_moments(found: RigFit, noise: CameraNoise) -> Tensor:
+def noisy_moments(found: RigFit, noise: CameraNoise) -> Tensor:
     """The factor on the variance of each camera's corners at each moment `(C, M)`: see `noisy_views.py`."""
     views, names = found.views, found.views.names
     count = torch.zeros(len(names), len(views.moments), dtype=torch.float64, device=found.shared.device)
@@ -222,30 +227,35 @@ def _noisy_moments(found: RigFit, noise: CameraNoise) -> Tensor:
     return 1 + excess * believed
 
 
-def _dispersion(found: RigFit, H: Equations, M: Equations) -> Tensor:
+def _dispersion(found: RigFit, M: Equations, common: Scores | None) -> tuple[Tensor, Tensor]:
     """How much more the moments contradict each other than independent corners would `(1,)`.
 
+    And by what the corners' part of the covariance of the scores is to be multiplied beside that of common errors.
     Free points follow what the moments want: what is compared is how these pull at the cameras with the points held.
     """
-    few = found.parameters.few + 2 * found.parameters.bow
+    few, none = found.parameters.few + 2 * found.parameters.bow, torch.ones_like(M.h[:, 0, 0])
     kept = slice(0, few)
     basis = found.basis
     if basis is not None:
         basis = basis[:, :few, basis[0, :few].abs().sum(0) > 0]
     if basis is not None and basis.shape[-1] == 0:
-        return torch.ones_like(H.g[:, 0])
+        return none, none
     seen = torch.stack([_seen(found, name) for name in found.views.names]).any(0)
     if found.free == 0 or int(seen.sum()) < 2:
-        return torch.ones_like(H.g[:, 0])
+        return none, none
     with torch.inference_mode():
         _, own = found.problem.totals(found.shared, found.local, found.loss, by_moment=True)
         inverse, _ = local_inverse(own.W)
         F = own.E @ inverse
         u = own.g - (F @ own.h.unsqueeze(-1)).squeeze(-1)
         S = own.U - F @ own.E.mT
-        leaning = F @ M.E.mT
-        K = M.U - leaning - leaning.mT + F @ M.W @ F.mT
-        u, S, K = u[..., kept], S[..., kept, kept], K[..., kept, kept]
+
+        def of_pulls(scores: Equations | Scores) -> Tensor:
+            leaning = F @ scores.E.mT
+            return (scores.U - leaning - leaning.mT + F @ scores.W @ F.mT)[..., kept, kept]
+
+        K, L = of_pulls(M), None if common is None else of_pulls(common)
+        u, S = u[..., kept], S[..., kept, kept]
         total, pull = S.sum(1), u.sum(1)
         if found.problem.known is not None:  # pulls along, and what it determines costs no degree of freedom
             off, rows = found.problem.known.rows(found.shared, *found.problem.places(found.shared))
@@ -253,12 +263,21 @@ def _dispersion(found: RigFit, H: Equations, M: Equations) -> Tensor:
             total, pull = total + rows.mT @ rows, pull + (rows.mT @ off.unsqueeze(-1)).squeeze(-1)
         if basis is not None:
             T = basis.mT.unsqueeze(1)
-            u, S, K = (T @ u.unsqueeze(-1)).squeeze(-1), T @ S @ T.mT, T @ K @ T.mT
+            u, S = (T @ u.unsqueeze(-1)).squeeze(-1), T @ S @ T.mT
+            K, L = T @ K @ T.mT, None if L is None else T @ L @ T.mT
             total, pull = basis.mT @ total @ basis, (basis.mT @ pull.unsqueeze(-1)).squeeze(-1)
         share = seen.to(u).unsqueeze(0)
-        told = contradiction(u, S, K, share, total, pull)
         shaped = found.restraint is not None and found.views.spread is None
-        return believed(told, FEW_VIEWS_OF_A_SHAPE if shaped else FEW_VIEWS).clone()
+        few_views = FEW_VIEWS_OF_A_SHAPE if shaped else FEW_VIEWS
+        told = contradiction(u, S, K, share, total, pull)
+        whole = believed(told, few_views).clone()
+        if L is None:
+            return whole, whole
+        phi = torch.ones_like(told.phi)
+        for _ in range(DISPERSION_STEPS):
+            told = contradiction(u, S, phi[:, None, None, None] * K + L, share, total, pull)
+            phi = (phi * told.phi).clamp(min=LEAST)
+        return whole, believed(told._replace(phi=phi), few_views).clone()
 
 
 def _seen(found: RigFit, name: str) -> Tensor:

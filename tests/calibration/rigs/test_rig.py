@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ import diffproj as dp
 from diffproj.calibration.problem.parametrisation import Parametrisation
 from diffproj.calibration.rigs.parameters import RigParameters
 from diffproj.calibration.rigs.problem import RigProblem
+from diffproj.calibration.rigs.uncertainty import rig_covariance
 from diffproj.calibration.rigs.views import rig_views
 from tests.calibration.rigs.rig_scenes import Scene, off_truth, scene
 
@@ -60,8 +62,13 @@ def test_the_bundled_pair_is_calibrated_as_by_opencv(pair: dict[str, dp.Views]) 
     assert rig.rms == pytest.approx(same.rms, rel=1e-5)  # of corners that are not rounded
     length, deviation = rig.baseline("left", "right")
     assert length == pytest.approx(float(np.linalg.norm(T)), abs=2e-3)
-    # The error bar holds that the views contradict each other more than independent corners would.
-    assert deviation / float(rig.covariance.dispersion.sqrt()) == pytest.approx(0.2032 * rms, rel=0.1)
+    # The error bar holds that the views contradict each other more than independent corners would, and on top of that
+    # what all corners of a view have in common.
+    joint = rig._covariance
+    apart = replace(rig, _covariance=lambda: rig_covariance(joint.found, joint.noise, None))  # type: ignore[union-attr]
+    without = apart.baseline("left", "right").deviation
+    assert without / float(rig.covariance.dispersion.sqrt()) == pytest.approx(0.2032 * rms, rel=0.1)
+    assert deviation / without == pytest.approx(1.35, abs=0.03)
 
 
 @pytest.mark.parametrize(("cameras", "moments", "chain"), [(2, 20, False), (4, 20, False), (4, 30, True)])
