@@ -30,6 +30,9 @@ SAVED, OF_EACH, OF_LINE = (0.3, 0.15), (0.5, 0.75), (0.9, 0.95)
 """What two groups save, from which on they are told: as a part of the sum of squares, of what a camera of its own for
 each view would save, and of what is saved where each view has its place on the line through both cameras. Two rules:
 where they save much, and where they save most of what there is to save."""
+BY_CHANCE = 1.85
+"""Over the root of the number of views: what two groups save of what a camera for each view would, where the errors of
+each view's corners go together, in one of 20 sets; what two cameras save is more."""
 DIRECTIONS, ROUNDS = 6, 12
 """Main directions in which the views' pulls differ, from both sides of which groups are begun; and rounds of each."""
 TINY = 1e-9
@@ -47,7 +50,9 @@ def two_groups(found: Fit, which: Tensor) -> dict[int, TwoGroups]:
     """Those of cameras `(n,)` whose views fall into two groups, by their number."""
     task = found.part(which).task if len(which) else found.task
     counted = task.used.any(-1).sum(-1) if task.shares is None else (task.shares * task.used.any(-1)).sum(-1)
-    which = which[counted >= FEWEST] if len(which) else which
+    if len(which):
+        enough = counted >= FEWEST
+        which, counted = which[enough], counted[enough]
     if len(which) == 0 or task.free:
         return {}
     with torch.no_grad():
@@ -59,8 +64,11 @@ def two_groups(found: Fit, which: Tensor) -> dict[int, TwoGroups]:
         labels, saved = _best(H, g, part.task.used.any(-1))
         total, each, line = seen.c.sum(-1), _of_each(H, g), saved + _along_the_line(H, g, labels)
         told = torch.zeros_like(total, dtype=torch.bool)
+        by_chance = BY_CHANCE / counted.to(each).sqrt()
         for of_total, of_each, of_line in zip(SAVED, OF_EACH, OF_LINE, strict=True):
-            told |= (saved > of_total * total) & (saved > of_each * each) & (saved > of_line * line)
+            told |= (
+                (saved > of_total * total) & (saved > by_chance.clamp(min=of_each) * each) & (saved > of_line * line)
+            )
         told &= total.isfinite()
     groups = {}
     for i in told.nonzero().flatten().tolist():
