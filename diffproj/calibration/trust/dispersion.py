@@ -11,10 +11,17 @@ independent corners the covariance of the pull is K_v. Over all views
     phi = sum u_v^T K_v^+ u_v / (sum rank K_v - free parameters)
 
 is 1 if corners err independently (the analysis of variance: between views over within views), and the factor by which
-the variances of the parameters are too small if not. What it exceeds 1 by is taken for what it is where it stands out
-of chance, and shrunk where it does not; and it counts more where few views tell it, for it is an average over all
-directions of the parameters, of which one may be far worse: on random subsets of real sets of views, errors then are
-what they are said to be.
+the variances of the parameters are too small if not. It is an average over all directions of the parameters, and views
+may contradict each other more on some than on others: errors that are smooth over a board look like another
+perspective, and pull at the focal lengths and the principal point more than at the lens. These are asked for
+themselves, too. Each view moves them by d_v = S^-1 u_v, S the sum of the views' normal matrices, and
+
+    psi = mean over these parameters of  sum d_v^2 / its expectation if corners err independently
+
+raises phi where that stands out of chance, by as much as psi / phi does so, too.
+
+What the result exceeds 1 by is taken for what it is where it stands out of chance, and shrunk where it does not; and it
+counts more where few views tell it: on random subsets of real sets of views, errors then are what they are said to be.
 
 Where the points of the target are free they follow what the views want, and these pull less. What is compared then is
 how far each view moves the focal lengths and the principal point, to first order, with how far it would if corners
@@ -46,8 +53,8 @@ BELIEF = 4.0
 """Degrees of freedom below which phi counts little: what one or two of them say is mostly chance."""
 FAR_VIEWS = 2.0
 """How many times larger the variance of such ratios is than for independent corners: a few views err most."""
-STANDS_OUT = 25.0
-"""Variances of phi, for independent corners, by which it must exceed 1 for half of what the intrinsics tell."""
+STANDS_OUT = 5.0
+"""Deviations of phi for independent corners, beyond 1, at which half of what psi tells counts."""
 SINGULAR = 1e-9
 """Eigenvalue of K_v, relative to the largest, below which the view says nothing in this direction."""
 
@@ -169,7 +176,7 @@ def _more(told: Contradiction, of_intrinsics: Contradiction) -> Contradiction:
     beyond = (told.phi - 1).clamp(min=0).square()
     excess = (of_intrinsics.phi / told.phi.clamp(min=1) - 1).clamp(min=0)
     by_chance = FAR_VIEWS * (2 / of_intrinsics.spare + 2 / told.spare)
-    more = excess.pow(3) / (excess.square() + by_chance) * beyond / (beyond + STANDS_OUT * 2 / told.spare)
+    more = excess.pow(3) / (excess.square() + by_chance) * beyond / (beyond + STANDS_OUT**2 * 2 / told.spare)
     return told._replace(phi=told.phi * (1 + more))
 
 

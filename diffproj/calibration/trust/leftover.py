@@ -39,7 +39,7 @@ BLOCK_VIEWS = 500
 """Views that are looked at side by side, for the memory's sake."""
 
 
-class Contradiction(NamedTuple):
+class Excess(NamedTuple):
     """By how much the variance is larger for views that contradict each other `(n,)`, and its degrees of freedom."""
 
     excess: Tensor
@@ -199,7 +199,12 @@ class _Scores:
     def _added(self, columns: Tensor, residual: Tensor, count: Tensor, sure: Tensor | None = None) -> Effect:
         """What added unknowns with derivatives `(n, V, q, 2, N)` would explain, all others free.
 
-        That they are none of chance, and views may contradict each other on them, is sure of some cameras `(n,)`.
+        Args:
+            columns: these derivatives.
+            residual: what is to be explained `(n, V, 2, N)`.
+            count: its degrees of freedom `(n,)`.
+            sure: cameras `(n,)` whose effect counts however much the views contradict each other; if left out, those
+                where it explains more than `MOST` of the sum of squares.
         """
         first = self.shared.shape[2]
         rows = torch.cat([self.shared, columns, self.poses, residual.unsqueeze(2)], dim=2).flatten(-2)
@@ -242,7 +247,7 @@ class _Scores:
             moved = (self.task.basis @ moved.unsqueeze(-1)).squeeze(-1)
         return replace(found, moved=moved)
 
-    def _contradiction(self, left: Tensor, unknowns: Tensor, rest: Tensor, count: Tensor) -> "Contradiction":
+    def _contradiction(self, left: Tensor, unknowns: Tensor, rest: Tensor, count: Tensor) -> Excess:
         """How much more the views contradict each other on added unknowns than independent corners would.
 
         Args:
@@ -255,7 +260,7 @@ class _Scores:
         spare = (unknowns * (views - 1)).clamp(min=1)
         variance = rest / (count - unknowns).clamp(min=1)
         excess = (left * views / spare / variance.clamp(min=1e-300) - 1).clamp(min=0)
-        return Contradiction(excess.pow(3) / (excess.square() + 2 / spare), spare)
+        return Excess(excess.pow(3) / (excess.square() + 2 / spare), spare)
 
     def _moved_points(self) -> tuple[Tensor, Tensor, Tensor]:
         """What points that move explain `(n,)`, how many unknowns that takes, and the moves `(n, N, 3)`.
@@ -308,7 +313,7 @@ def _chebyshev(x: Tensor, order: int) -> list[Tensor]:
 
 
 def effect(
-    explained: Tensor, unknowns: Tensor, total: Tensor, count: Tensor, contradiction: Contradiction | None = None
+    explained: Tensor, unknowns: Tensor, total: Tensor, count: Tensor, contradiction: Excess | None = None
 ) -> Effect:
     """The F test: `explained` of the sum of squares `total` by some unknowns, of `count` degrees of freedom.
 

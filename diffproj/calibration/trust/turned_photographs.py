@@ -47,8 +47,6 @@ TWO_HEAPS, BEYOND_CHOICE = 6.0, 5.5
 """Logarithm of how much more likely two heaps of views are than one, from which on they are told; and what is saved for
 each view, over the variance, from which on nothing else is asked. Where errors of .1 to .3 px went together in views of
 one camera, 381 of 3200 sets were accused without these (82 of 100 where the principal point was the middle), 21 are."""
-
-
 WIDTHS = (0.0, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5, 2.5, 4.0)
 """Of one heap: its standard deviations, in lengths of the line."""
 
@@ -87,8 +85,8 @@ def turned_photographs(found: Fit, which: Tensor, sizes: Sequence[tuple[int, int
         Q, pull = of_prior(held, shared)
         choice = _Choice(seen, T, Q[:, :few, :few], pull[:, :few], size, *_turn(task.names[:few], shared, size))
         turned = choice.best(task.used.any(-1))
-        saved, of_each, level, spare, two_heaps = choice.judged(turned, task.used.any(-1), part.degrees_of_freedom())
-        told = ((saved > _as_rare(CERTAIN, spare) * level) & two_heaps).unsqueeze(-1) & turned
+        saved, of_each, level, spare, clear = choice.judged(turned, task.used.any(-1), part.degrees_of_freedom())
+        told = ((saved > _as_rare(CERTAIN, spare) * level) & clear).unsqueeze(-1) & turned
         told &= of_each > (_as_rare(OF_A_VIEW, spare) * level).unsqueeze(-1)
         total = 2 * seen.c.sum(-1)
     groups = {}
@@ -107,6 +105,24 @@ def _turn(names: tuple[str, ...], shared: Tensor, size: Tensor) -> tuple[Tensor,
         elif name in ONE_SIDED:
             sign[place] = -1.0
     return sign, sign * shared[:, :few] + origin - shared[:, :few]
+
+
+class _Judged(NamedTuple):
+    """What it is worth to turn views back.
+
+    Attributes:
+        saved: of the sum of squares `(P,)`.
+        of_each: the same by each view `(P, V)`.
+        level: phi s^2 then `(P,)`.
+        spare: degrees of freedom that phi is from `(P,)`.
+        clear: whether it is more than what a choice of views saves anyhow `(P,)`.
+    """
+
+    saved: Tensor
+    of_each: Tensor
+    level: Tensor
+    spare: Tensor
+    clear: Tensor
 
 
 class _Choice(NamedTuple):
@@ -168,13 +184,8 @@ class _Choice(NamedTuple):
             starts.append(aside)
         return starts
 
-    def judged(self, turned: Tensor, used: Tensor, redundant: Tensor) -> tuple[Tensor, ...]:
-        """What it is worth to turn these views back `(P, V)`, of those used `(P, V)`.
-
-        Returns:
-            What is saved of the sum of squares `(P,)`, and by each of them `(P, V)`; phi s^2 then, and the degrees of
-            freedom that phi is from `(P,)`; and whether it is more than what a choice of views saves anyhow `(P,)`.
-        """
+    def judged(self, turned: Tensor, used: Tensor, redundant: Tensor) -> _Judged:
+        """What it is worth to turn these views back `(P, V)`, of those used `(P, V)`."""
         A, b, fixed = self._sum(turned)
         y = _lowest(A, b)
         saved = -2 * (fixed + (b * y).sum(-1) / 2)
@@ -189,7 +200,7 @@ class _Choice(NamedTuple):
         level = phi.clamp(min=1) * left
         clear = self._two_heaps(x, turned, used, level) > TWO_HEAPS
         clear |= saved > BEYOND_CHOICE * used.sum(-1) * level
-        return saved, 2 * (costs[0] - costs[1]), level, spare, clear
+        return _Judged(saved, 2 * (costs[0] - costs[1]), level, spare, clear)
 
     def _two_heaps(self, x: Tensor, turned: Tensor, used: Tensor, level: Tensor) -> Tensor:
         """By how much two heaps of views, at x and at its turned place, are likelier than one `(P,)`, as a logarithm.
@@ -210,7 +221,7 @@ class _Choice(NamedTuple):
         weight = torch.where(told, 1 / variance, 0.0)
         middle = (weight * place).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-300)
         one = _likelihood(place - middle, variance, told).amax(0)
-        ways = torch.lgamma(count + 1.0) - torch.lgamma(some + 1.0) - torch.lgamma(count - some + 1.0)
+        ways = (count.to(two) + 1).lgamma() - (some.to(two) + 1).lgamma() - ((count - some).to(two) + 1).lgamma()
         return two - one - ways
 
     def _costs(self, x: Tensor) -> Tensor:
