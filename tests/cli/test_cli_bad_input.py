@@ -144,7 +144,7 @@ CASES: list[tuple[tuple[str, ...], int, str]] = [
             "half.json": "want a camera file, got one that is no format known here",
             "list.json": "want a camera matrix under a known name, such as camera_matrix",
             "newer.json": r"want version \d or earlier, got 99; a newer diffproj reads it",
-            "number.yaml": "want .*camera",
+            "number.yaml": "camera_matrix: want 3 x 3 numbers, got 5",
             "other.yaml": "want a camera matrix under a known name, such as camera_matrix",
             "photo.png": "want a camera file, got a photograph",
             "no_camera.json": "the camera in this file is damaged",

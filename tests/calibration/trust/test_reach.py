@@ -224,4 +224,5 @@ def test_what_only_restrains_is_no_measurement(monkeypatch: pytest.MonkeyPatch) 
     found = dp.calibrate(seen(TRUTH, 8), BOARD, "brown8")
     spread, dispersion = found.covariance.shared, found.covariance.dispersion
     (restrained,) = fits
-    torch.testing.assert_close(spread, restrained.plain_covariance.shared[0] * dispersion, rtol=1e-6, atol=0)
+    # To rounding: the condition of the matrix is 1e10.
+    torch.testing.assert_close(spread, restrained.plain_covariance.shared[0] * dispersion, rtol=1e-5, atol=0)
