@@ -7,11 +7,13 @@ from typing import NamedTuple
 from diffproj.cli.spreadsheet import Spreadsheet
 
 TITLES = {
-    "u": ("u", "x", "column", "col", "pixel_u", "image_x"),
-    "v": ("v", "y", "row", "line", "pixel_v", "image_y"),
-    "name": ("name", "id", "point"),
+    "u": ("u", "x", "column", "col", "upx", "xpx"),
+    "v": ("v", "y", "row", "line", "vpx", "ypx"),
 }
-"""What the columns may be called, by their first word in small letters; a file's titles may be others as well."""
+"""What the columns are called, in small letters and among other words: `v`, `image v`, `y_px`. Others may be names."""
+
+COUNTERS = ("row", "line", "column", "col")
+"""Of these words, those that a running number in front of u and v has as well."""
 
 
 class Order(NamedTuple):
@@ -42,8 +44,8 @@ def read_points(path: Path) -> list[Pixel]:
     are passed over. Where semicolons or tabs separate, numbers may have a decimal comma.
 
     Raises:
-        ValueError: a line is none of these, titles say of one column alone that it is u or v, a name stands twice, or
-            there is no point; the line is named.
+        ValueError: a line is none of these, titles name only one of u and v, or one of them twice, a name stands
+            twice, or there is no point; the line is named.
         OSError: the file cannot be read.
     """
     table = Spreadsheet("--points-file", path, "lines of name,u,v")
@@ -91,15 +93,26 @@ def _order(cells: list[str], table: Spreadsheet) -> Order:
     Raises:
         ValueError: they name u or v alone, or one of them twice.
     """
-    words = [re.match(r"\w*", cell.lower())[0] for cell in cells]  # type: ignore[index]  # it always matches
+    words = [_word(cell) for cell in cells]
     known = {title: column for column, titles in TITLES.items() for title in titles}
     columns = [known.get(word) for word in words]
+    if len(cells) == 3 and words[0] in COUNTERS and {*columns[1:]} == {"u", "v"}:
+        columns[0] = None
     if "u" not in columns and "v" not in columns:
         return Order()
-    if columns.count("u") != 1 or columns.count("v") != 1:
-        raise ValueError(
-            f"--points-file: want the titles name, u and v, got {table.joined(cells)!r} in the first line of "
-            f"{table.path}, which tells only one of u and v"
-        )
+    for column in sorted(TITLES, key=columns.count, reverse=True):
+        if columns.count(column) != 1:
+            same = [repr(cell) for cell, other in zip(cells, columns, strict=True) if other == column]
+            why = f"{' and '.join(same[:2])} both mean {column}" if same else f"none means {column}"
+            raise ValueError(
+                f"--points-file: want the titles name, u and v, got {table.joined(cells)!r} in the first line of "
+                f"{table.path}, where {why}"
+            )
     turned = columns.index("v") < columns.index("u")
     return Order(({0, 1, 2} - {columns.index("u"), columns.index("v")}).pop() if len(cells) == 3 else 0, turned)
+
+
+def _word(title: str) -> str:
+    """The word of a title that says whether it is u or v; none where it is another."""
+    words = re.split(r"[\W_]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", title).lower())
+    return next((word for word in words if any(word in titles for titles in TITLES.values())), "")

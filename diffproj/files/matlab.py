@@ -134,7 +134,7 @@ def _bouguet_camera(fields: dict[str, Any], side: str, pose: Any) -> Camera:
     if len(kc) == 4 and any(kc):
         raise ValueError(
             f"kc{side}: want 5 coefficients, got 4, which may be those of the toolbox's fisheye model, or k1 k2 p1 p2 "
-            "of an early version; behind the latter put a 0, of the former build "
+            "of an early version: if they are k1 k2 p1 p2, append a 0; if the fisheye's, build "
             "dp.Camera(K, distortion=dp.KannalaBrandt(kc))"
         )
     return camera_of(focal_lengths(f_x, f_y, c_x, c_y, skew), brown(kc), size, pose)

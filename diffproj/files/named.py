@@ -267,14 +267,20 @@ def _plausible(size: tuple[int, int] | None, K: np.ndarray) -> tuple[int, int] |
     return size
 
 
-def posed(cameras: dict[str, Camera], mapping: dict[str, Any]) -> tuple[dict[str, Camera], set[str]]:
+def posed(
+    cameras: dict[str, Camera], mapping: dict[str, Any], apart: bool = False
+) -> tuple[dict[str, Camera], set[str]]:
     """The second of two cameras at its place beside the first, or the only one at its pose, and the keys of the pose.
+
+    Args:
+        cameras: by name.
+        mapping: where the pose may stand.
+        apart: whether the cameras stand in mappings of their own, as for `poses_beside.of_pair`.
 
     Raises:
         ValueError: the pose is none, or there in part.
     """
-    find = {1: poses_beside.of_one, 2: poses_beside.of_pair}.get(len(cameras))
-    pose, keys = (None, set[str]()) if find is None else find(mapping)
+    pose, keys = poses_beside.of(len(cameras), mapping, apart)
     if pose is None:
         return cameras, set()
     last = list(cameras)[-1]

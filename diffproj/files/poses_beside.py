@@ -24,8 +24,10 @@ def _words(text: str) -> frozenset[str]:
 
 TURNS = _words("r rot rotation rotationmatrix rotationvector rotmat rmat rmatrix rvec quaternion orientation")
 SHIFTS = _words("t trans translation translationvector translationmatrix tvec tvector")
+PLACES = _words("position pos location center centre origin")
 WHOLE = _words("rt extrinsic extrinsics cameraextrinsic cameraextrinsics pose camerapose transform transformation")
-"""Names in lower case, without what stands between words. Of 4 x 4 and 3 x 4 numbers with a rotation any will do."""
+"""Names in lower case, without what stands between words. A place is one of a pose only where a rotation is there too.
+Of 4 x 4 and 3 x 4 numbers with a rotation any name will do."""
 
 LARGEST = 16
 """Numbers of a pose, at most."""
@@ -34,19 +36,47 @@ MOST_NAMES = 4
 """Keys in a remark."""
 
 
-def of_pair(mapping: dict[str, Any]) -> tuple[Pose | None, set[str]]:
-    """The pose from the first of two cameras to the second, and the keys that it was read from.
+def of(count: int, mapping: dict[str, Any], apart: bool = False) -> tuple[Pose | None, set[str]]:
+    """The pose of the last of so many cameras, and the keys that it was read from.
+
+    Args:
+        count: of the cameras; of more than two no pose is read.
+        mapping: where it may stand.
+        apart: whether the cameras stand in mappings of their own, as for `of_pair`.
 
     Raises:
         ValueError: it is there in part, or is none.
     """
+    if count == 2:
+        return of_pair(mapping, apart)
+    return of_one(mapping) if count == 1 else (None, set())
+
+
+def of_pair(mapping: dict[str, Any], apart: bool = False) -> tuple[Pose | None, set[str]]:
+    """The pose from the first of two cameras to the second, and the keys that it was read from.
+
+    Args:
+        mapping: where it may stand.
+        apart: whether the cameras stand in mappings of their own. What is beside these may be anything, so that only
+            3 x 3 and 3 numbers count, and a rotation alone is no half of a pose.
+
+    Raises:
+        ValueError: a rotation is there alone, a name is there twice, or the pose is none.
+    """
     for names in PAIRS:
-        found = [key for name in names for key in mapping if _named(key, name)]
-        if not found:
+        keys = [[key for key in mapping if _named(key, name)] for name in names]
+        if apart:
+            shapes = (((3, 3), (9,)), ((3,), (3, 1), (1, 3)))
+            keys = [[k for k in some if _shape(k, mapping[k]) in fit] for some, fit in zip(keys, shapes, strict=True)]
+        for name, some in zip(names, keys, strict=True):
+            if len(some) > 1:
+                raise ValueError(f"want {name} once, got {', '.join(some)}")
+        turns, shifts = keys
+        if turns and not shifts and not apart:
+            raise ValueError(f"want {' and '.join(names)} from the first camera to the second, got {turns[0]}")
+        if not turns or not shifts:
             continue
-        if len(found) != 2:
-            raise ValueError(f"want {' and '.join(names)} from the first camera to the second, got {', '.join(found)}")
-        turn, shift = found
+        turn, shift = turns[0], shifts[0]
         R, t = square(turn, mapping[turn], 3, 3), matrix(shift, mapping[shift]).ravel()
         if t.size != 3:
             raise ValueError(f"{shift}: want 3 numbers, got {t.size}")
@@ -73,7 +103,7 @@ def unread(mapping: dict[str, Any], read: set[str]) -> list[str]:
         read: keys that were read, or that others look through.
     """
     found = [(key, kind) for key, value in mapping.items() if key not in read for kind in _kinds(key, value)]
-    return [key for key, _ in found] if any(kind != "turn" for _, kind in found) else []
+    return [key for key, _ in found] if _tell({kind for _, kind in found}) else []
 
 
 def remark(names: Sequence[str]) -> str:
@@ -85,25 +115,36 @@ def remark(names: Sequence[str]) -> str:
     )
 
 
+def _tell(kinds: set[str]) -> bool:
+    """Whether these are of a pose: a rotation or a place alone may be anything."""
+    return bool(kinds & {"shift", "pose"}) or kinds == {"turn", "place"}
+
+
 def _kinds(key: str, value: Any) -> Iterator[str]:
-    """Whether a key holds a `"turn"`, a `"shift"` or a whole `"pose"`."""
+    """Whether a key holds a `"turn"`, a `"shift"`, a `"place"` or a whole `"pose"`."""
     plain = _plain(key)
     if isinstance(value, dict) and "data" not in value:
         inside = {kind for inner, item in value.items() for kind in _kinds(inner, item)}
-        if plain in TURNS | SHIFTS:  # x, y, z by their names
-            yield "turn" if plain in TURNS else "shift"
-        elif inside - {"turn"}:
+        if plain in TURNS | SHIFTS | PLACES:  # x, y, z by their names
+            yield "turn" if plain in TURNS else "shift" if plain in SHIFTS else "place"
+        elif _tell(inside):
             yield "pose"
         return
     numbers = _numbers(key, value)
     if numbers is None:
         return
-    if _is_rigid(numbers) or (plain in WHOLE and numbers.size in (6, 7)):
+    if _is_rigid(numbers) or (plain in WHOLE and (numbers.size in (6, 7) or numbers.shape in ((12,), (16,)))):
         yield "pose"
     elif plain in TURNS and numbers.size in (3, 4, 9):
         yield "turn"
-    elif plain in SHIFTS and numbers.size == 3:
-        yield "shift"
+    elif plain in SHIFTS | PLACES and numbers.size == 3:
+        yield "shift" if plain in SHIFTS else "place"
+
+
+def _shape(key: str, value: Any) -> tuple[int, ...]:
+    """The shape of the numbers that a key holds; of none, where it holds something else."""
+    numbers = _numbers(key, value)
+    return () if numbers is None else numbers.shape
 
 
 def _numbers(key: str, value: Any) -> np.ndarray | None:
@@ -117,8 +158,8 @@ def _numbers(key: str, value: Any) -> np.ndarray | None:
 
 
 def _is_rigid(numbers: np.ndarray) -> bool:
-    """Whether these are 4 x 4 or 3 x 4 numbers, with a rotation."""
-    if numbers.shape not in ((4, 4), (3, 4), (16,)):
+    """Whether these are 4 x 4 or 3 x 4 numbers, or one list of them, with a rotation."""
+    if numbers.shape not in ((4, 4), (3, 4), (12,), (16,)):
         return False
     rows = numbers.reshape(-1, 4)
     last = len(rows) == 3 or rows[3].tolist() == [0, 0, 0, 1]
@@ -127,7 +168,7 @@ def _is_rigid(numbers: np.ndarray) -> bool:
 
 def _named(key: str, name: str) -> bool:
     """Whether a key is that name; of a long one in any case, and with anything between words."""
-    return key == name or (len(name) > 1 and re.sub("[^a-z]", "", key.lower()) == name.replace("_", ""))
+    return key == name or (len(name) > 1 and re.sub("[^a-z0-9]", "", key.lower()) == name.replace("_", ""))
 
 
 def _plain(key: str) -> str:

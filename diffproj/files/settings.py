@@ -4,8 +4,8 @@ ORB-SLAM writes them flat (`Camera.fx`, `Camera1.fx`; of some pairs `Camera.fx` 
 `Camera`, VINS in `projection_parameters` and `distortion_parameters`. Integer pixel centres. A fisheye only where the
 file says so: `KannalaBrandt8`, `fisheye`, VINS's `KANNALA_BRANDT` with k2 to k5. `Stereo.T_c1_c2` and `Tlr` take the
 second camera to the first, the world; so does `Stereo.b`, along x, where both are rectified. Poses in a body are not
-taken. Where a pair stands beside the camera as it is before rectification (`stereo_rectifier`), those are the cameras,
-and `"rectified"` is asked for by its name.
+taken. Where the file also has the two cameras before rectification (`stereo_rectifier`), these are read, and the
+rectified one by its name `"rectified"`.
 """
 
 import re
@@ -93,11 +93,12 @@ def _along_x(baseline: Any) -> np.ndarray:
 
 
 def _common(fields: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """What holds for every camera: of `Camera`, taken out where it is none, all but focal lengths and lens."""
+    """What holds for every camera: all of `Camera` where it is none, and is taken out; else all but its K and lens."""
     if len(fields) == 1 or "Camera" not in fields:
         return {}
-    common = fields["Camera"] if _is_whole(fields["Camera"]) else fields.pop("Camera")
-    return {key: value for key, value in common.items() if key not in (*FOCAL, *ORDER)}
+    if not _is_whole(fields["Camera"]):
+        return fields.pop("Camera")
+    return {key: value for key, value in fields["Camera"].items() if key not in (*FOCAL, *ORDER)}
 
 
 def _is_whole(fields: dict[str, Any]) -> bool:

@@ -36,8 +36,7 @@ def accuracy_part(facts: Facts) -> Part:
         )
         return Part("Accuracy", "accuracy", render("nothing.html", why=why), svg.STYLE)
     view, calibration = facts.usual_view, facts.calibration
-    nominal = calibration.nominal
-    plane = Plane.z(float(nominal[:, 2].mean()))
+    plane = Plane.z(facts.plane_z)
     with warnings.catch_warnings():  # what they say is in the verdict
         warnings.simplefilter("ignore")
         over_image = AccuracyMap.over_image(calibration, plane, view, max(facts.size) / PLACES)

@@ -76,7 +76,7 @@ def _measuring(facts: Facts, found: Pictures, orientation: Orientation) -> list[
     view = facts.usual_view
     if view not in found.sources or not (facts.converged and facts.planar and facts.seen_views):
         return []
-    plane = Plane.z(float(facts.calibration.nominal[:, 2].mean()))
+    plane = Plane.z(facts.plane_z)
     source, name = found.sources[view], facts.names[view]
     source = source.image if isinstance(source, Frame) else source
     return [measuring_part(source, facts.calibration, plane, view, orientation=orientation, name=name)]

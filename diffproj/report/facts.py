@@ -1,5 +1,6 @@
 """What every part of a report looks at, taken from a calibration once: corners, residuals and boards, as arrays."""
 
+import math
 import re
 from dataclasses import dataclass
 from functools import cached_property
@@ -112,6 +113,16 @@ class Facts:
     def planar(self) -> bool:
         """Whether the target is a board, whose tilt and outline mean something."""
         return self.calibration.landmarks is None
+
+    @cached_property
+    def plane_z(self) -> float:
+        """The height of the plane that the maps are of: the target's mean z, to a millionth of its extent or better.
+
+        Any plane so near would do; so a mean of 30.1 is printed as 30.1, also of points that were given in float32.
+        """
+        nominal = _array(self.calibration.nominal)
+        decimals = 6 - math.floor(math.log10(np.ptp(nominal, axis=0).max()))
+        return round(float(nominal[:, 2].mean()), decimals) + 0.0  # no -0.0
 
     @cached_property
     def outlines(self) -> list[Shaped[np.ndarray, "_ 2"]]:

@@ -21,7 +21,7 @@ def usage_part(facts: Facts, camera_file: str) -> Part:
         whole=Path(camera_file).suffix.lower() == ".json",
         name=facts.names[facts.usual_view],
         view=facts.usual_view,
-        z=float(calibration.nominal[:, 2].to(torch.float64).mean()),
+        z=facts.plane_z,
         board=facts.planar,
         K=_rows(camera.K.tolist()),
         coefficients="" if lens == "none" else _row(camera.distortion.coefficients.tolist()),  # type: ignore[union-attr]

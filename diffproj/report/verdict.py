@@ -51,6 +51,7 @@ def verdict_part(facts: Facts) -> Part:
         kind=kind,
         heading=heading,
         judgement=judgement,
+        failed=kind == "bad",
         reasons=[sentence(facts.in_words(reason)) for reason in judgement.reasons],
         remedies=[sentence(remedy) for remedy in judgement.remedies],
         note=facts.in_words(judgement.note),

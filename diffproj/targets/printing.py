@@ -3,7 +3,6 @@
 import io
 import math
 import os
-import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from diffproj._core.arguments import choice, file_path, number, numbers
 from diffproj._core.atomic import write_whole
+from diffproj._core.warn import warn_caller
 from diffproj.targets.artwork import Artwork
 from diffproj.targets.boards import Board, as_printed
 
@@ -102,9 +102,8 @@ def draw_target(
         _check_pixels(page, dpi)
     finest = _finest(target) * scale
     if finest < FINEST:
-        warnings.warn(
-            f"target: its finest parts are {finest:.2g} mm wide, finer than printers print; is it described in {unit}?",
-            stacklevel=2,
+        warn_caller(
+            f"target: its finest parts are {finest:.2g} mm wide, finer than printers print; is it described in {unit}?"
         )
     write_whole(file, _drawn(target, page, scale, unit, file.suffix.lower()[1:], dpi))
 

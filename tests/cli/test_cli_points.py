@@ -43,6 +43,21 @@ def test_points_without_names_have_numbers(tmp_path: Path) -> None:
         "v,u\n1,2,1\n2,4,3\n",
         "name,v,u\n2,1\n4,3\n",
         "Punkt,Spalte,Zeile\n1,1,2\n2,3,4\n",
+        "y_px,x_px\n2,1\n4,3\n",
+        "v_px,u_px\n2,1\n4,3\n",
+        "name,v_px,u_px\n1,2,1\n2,4,3\n",
+        "pixel v,pixel u\n2,1\n4,3\n",
+        "image v,image u\n2,1\n4,3\n",
+        "Y(px),X(px)\n2,1\n4,3\n",
+        "coordinate_y,coordinate_x\n2,1\n4,3\n",
+        "corner_y,corner_x\n2,1\n4,3\n",
+        "point y,point x\n2,1\n4,3\n",
+        "pixelY,pixelX\n2,1\n4,3\n",
+        "ypx,xpx\n2,1\n4,3\n",
+        "line,x,y\n1,1,2\n2,3,4\n",
+        "row,u,v\n1,1,2\n2,3,4\n",
+        "Row number;v;u\n1;2;1\n2;4;3\n",
+        "col,u,v\n1,1,2\n2,3,4\n",
     ],
 )
 def test_titles_tell_the_order(text: str, tmp_path: Path) -> None:
@@ -57,6 +72,27 @@ def test_titles_that_tell_half_are_refused(titles: str, tmp_path: Path) -> None:
     file = tmp_path / "points.csv"
     file.write_text(f"{titles}\n1,2\n")
     with pytest.raises(ValueError, match=r"--points-file: want the titles name, u and v, got .* in the first line"):
+        read_points(file)
+
+
+@pytest.mark.parametrize(
+    ("titles", "why"),
+    [
+        ("u,Zeile", "where none means v"),
+        ("name,x,height", "where none means v"),
+        ("name,height,y", "where none means u"),
+        ("name,u,u", "where 'u' and 'u' both mean u"),
+        ("v,y", "where 'v' and 'y' both mean v"),
+        ("x,y,column", "where 'x' and 'column' both mean u"),
+        ("x,u,y", "where 'x' and 'u' both mean u"),
+        ("row,u,col", "where 'u' and 'col' both mean u"),
+    ],
+)
+def test_what_is_wrong_with_titles_is_said(titles: str, why: str, tmp_path: Path) -> None:
+    """Each of them was said to tell only one of u and v."""
+    file = tmp_path / "points.csv"
+    file.write_text(f"{titles}\n1,2\n")
+    with pytest.raises(ValueError, match=rf"got '{titles}' in the first line of .*points\.csv, {why}$"):
         read_points(file)
 
 

@@ -35,6 +35,12 @@ PAIR = {"K1": K, "D1": D, "K2": K, "D2": D}
         ({"extrinsics": {"rotation": R, "translation": T}}, "extrinsics"),
         ({"extrinsics": [0.1, -0.2, 0.3, *T]}, "extrinsics"),
         ({"stereo": {"R": R, "T": T}}, "stereo"),
+        ({"extrinsic": np.ravel(RT).tolist()}, "extrinsic"),
+        ({"anything": np.ravel(RT).tolist()}, "anything"),
+        ({"extrinsic": [*np.transpose(R).ravel().tolist(), *T]}, "extrinsic"),
+        ({"rotation": R, "position": T}, "rotation, position"),
+        ({"orientation": {"x": 0, "y": 0, "z": 0, "w": 1}, "position": {"x": 1, "y": 2, "z": 3}}, "orientation, pos"),
+        ({"mounting": {"quaternion": [1, 0, 0, 0], "location": T}}, "mounting"),
     ],
 )
 def test_a_pose_of_unknown_meaning_is_not_dropped_in_silence(
@@ -54,6 +60,9 @@ def test_a_pose_of_unknown_meaning_is_not_dropped_in_silence(
         {"rvecs": [[0.1, 0.2, 0.3]] * 9, "tvecs": [T] * 9},
         {"extrinsic_parameters": [[0.1, 0.2, 0.3, *T]] * 9},
         {"R": R},  # of a rectification
+        {"position": [1, 2, 3], "location": {"x": 1, "y": 2}, "window": {"position": [1, 2, 3]}},  # without a rotation
+        {"position": "front", "origin": [0, 0, 0]},
+        {"twelve": [0.5] * 12, "bounds": [[1, 0, 0, 1]] * 3},
         {"R1": R, "P1": [[*row, 0.0] for row in K], "Q": np.diag([1.0, 1, 0, 0.1]).tolist(), "E": R, "F": R},
         {"newcameramtx": K, "roi": [0, 0, 640, 480], "T": 25.5, "pose": "front", "transform": None},
     ],
@@ -116,3 +125,50 @@ def test_a_pose_beside_numbers_one_by_one_is_not_dropped_in_silence(tmp_path: Pa
     tree = {"fx": 500.0, "fy": 501.0, "cx": 320.0, "cy": 240.0, "rvec": [0.1, -0.2, 0.3], "tvec": T}
     with pytest.warns(UserWarning, match="rvec, tvec: a pose that is not read"):
         load(tmp_path, "plain.json", json.dumps(tree))
+
+
+def test_a_pair_s_pose_does_not_replace_poses_of_their_own(tmp_path: Path) -> None:
+    """The second camera was moved to T without a word, while the first one stayed at its own pose."""
+    eye, pose = np.eye(3).tolist(), {"R": R, "T": T}
+    own = {"cam0": ONE | {"R": eye, "t": [5.0, 0, 0]}, "cam1": ONE | {"R": eye, "t": [9.0, 0, 0]}}
+    for tree in (own, own | {"cam1": ONE}, own | {"cam0": ONE}):
+        with pytest.warns(UserWarning, match="R, T: a pose that is not read"):
+            both = load(tmp_path, "plain.json", json.dumps(tree | pose))
+        wanted = [[tree[name].get("t", [0.0, 0, 0])[0], 0, 0] for name in ("cam0", "cam1")]
+        assert both.t.tolist() == wanted
+    with pytest.warns(UserWarning, match="R, t: a pose that is not read"):
+        one = load(tmp_path, "plain.json", json.dumps({"cam0": own["cam0"], "R": R, "t": T}))
+    assert one.t.tolist() == [5.0, 0, 0]
+    with pytest.warns(UserWarning, match="R, T: a pose that is not read"):
+        both = load(tmp_path, "plain.json", json.dumps({"stereo": PAIR | {"R": eye, "T": [9.0, 0, 0]}} | pose))
+    assert both.t.tolist() == [[0, 0, 0], [9, 0, 0]]
+
+
+def test_rotations_with_numbers_are_those_of_a_rectification(tmp_path: Path) -> None:
+    """Both were taken for the pair's rotation, or one of them for its translation."""
+    numbered = PAIR | {"rotation_matrix_1": R, "rotation_matrix_2": R}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not load(tmp_path, "plain.json", json.dumps(numbered)).t.any()
+        both = load(tmp_path, "plain.json", json.dumps(numbered | {"rotation_matrix": R, "translation_vector": T}))
+    np.testing.assert_allclose(poses(both[1])[:3], RT, atol=1e-15)
+    with pytest.warns(UserWarning, match=r"translation_vector.*a pose that is not read"):
+        assert not load(tmp_path, "plain.json", json.dumps(numbered | {"translation_vector": T})).t.any()
+    twice = PAIR | {"rotation_matrix": R, "RotationMatrix": R, "translation_vector": T}
+    with pytest.raises(ValueError, match="want rotation_matrix once, got rotation_matrix, RotationMatrix"):
+        load(tmp_path, "plain.json", json.dumps(twice))
+
+
+@pytest.mark.parametrize("beside", [{"T": 25.5}, {"R": R}, {"R": R, "T": 25.5}, {"R": 0.9}])
+def test_half_a_pose_beside_two_mappings_is_none(tmp_path: Path, beside: dict[str, object]) -> None:
+    """The files were refused, though T was a temperature, and R a rectification."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        both = load(tmp_path, "plain.json", json.dumps(dict.fromkeys(("left", "right"), ONE) | beside))
+    np.testing.assert_array_equal(poses(both[1]), np.eye(4))
+
+
+def test_a_lone_translation_is_not_dropped_in_silence(tmp_path: Path) -> None:
+    for tree in (PAIR, dict.fromkeys(("left", "right"), ONE)):
+        with pytest.warns(UserWarning, match="T: a pose that is not read"):
+            load(tmp_path, "plain.json", json.dumps(tree | {"T": T}))

@@ -79,7 +79,8 @@ def test_four_coefficients_of_bouguets_may_be_a_fisheyes(tmp_path: Path) -> None
     five, four = "0.1 ; -0.2 ; 0.001 ; 0.002 ; 0 ]", "0.1 ; -0.2 ; 0.001 ; 0.002 ]"
     text = f"fc = [ 500 ; 501 ];\ncc = [ 320 ; 240 ];\nkc = [ {five};\nnx = 640;\nny = 480;\n"
     assert numbers(load(tmp_path, "Calib_Results.m", text))[1] == [0.1, -0.2, 0.001, 0.002, 0.0]
-    with pytest.raises(ValueError, match="kc: want 5 coefficients, got 4, which may be those of the toolbox's fisheye"):
+    said = r"kc: want 5 .* got 4, which may be those of the toolbox's fisheye model, or .*: if they are k1 k2 p1 p2, append a"
+    with pytest.raises(ValueError, match=said + r" 0; if the fisheye's, build dp\.Camera\(K, dist"):
         load(tmp_path, "Calib_Results.m", text.replace(five, four))
     assert numbers(load(tmp_path, "Calib_Results.m", text.replace(five, "0 ; 0 ; 0 ; 0 ]")))[1] == [0.0] * 4
 
@@ -235,3 +236,21 @@ def test_a_rectification_beside_k_makes_no_camera_info(tmp_path: Path) -> None:
     del tree["dist"]
     with pytest.raises(ValueError, match="want distortion_coefficients and distortion_model in a camera_info"):
         load(tmp_path, "plain.json", json.dumps(tree))
+
+
+@pytest.mark.parametrize("kind", ["", 'Camera.type: "PinHole"\n'])
+def test_a_lens_that_holds_for_both_cameras_is_not_dropped(tmp_path: Path, kind: str) -> None:
+    """Both cameras were read without a lens, or, with a type beside it, refused for the lack of one."""
+    text = "".join(
+        line + "\n"
+        for line in ORB_PAIR.splitlines()
+        if not line.startswith(("Camera.f", "Camera.c", "Camera.type", "Camera2"))
+    )
+    text = text.replace("%YAML:1.0\n", f"%YAML:1.0\n{kind}")
+    for i in (1, 2):
+        text += "".join(f"Camera{i}.{key}: {250.5 + i}\n" for key in ("fx", "fy", "cx", "cy"))
+    for i in (1, 2):
+        camera = load(tmp_path, "pair.yaml", text, camera=i - 1)
+        assert numbers(camera) == ([250.5 + i] * 4, [0.1, 0.2, 0.01, 0.02, 0.3])
+    second = load(tmp_path, "pair.yaml", text + "Camera2.k1: -0.1\n", camera=1)
+    assert numbers(second)[1] == [-0.1, 0.2, 0.01, 0.02, 0.3]

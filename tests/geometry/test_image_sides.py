@@ -38,7 +38,7 @@ def test_parts_of_images_and_turned_ones_are_not() -> None:
 
 
 def test_parts_that_users_cut_themselves_are_seldom_warned_of() -> None:
-    """1500 parts of all places, shapes and sizes; 6 were measured."""
+    """1500 parts of all places, shapes and sizes: 4 were warned of, as measured."""
     generator = np.random.default_rng(1)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -47,4 +47,4 @@ def test_parts_that_users_cut_themselves_are_seldom_warned_of() -> None:
             part = (generator.uniform(0.1, 1, 2) * whole).astype(int) + 1
             c = whole / 2 * (1 + 0.04 * generator.standard_normal(2)) - generator.uniform(0, 1, 2) * (whole - part)
             dp.Camera(K(*c), size=(int(part[0]), int(part[1])))
-    assert len(caught) <= 10
+    assert len(caught) <= 4

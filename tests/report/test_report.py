@@ -79,16 +79,16 @@ def fisheye() -> dp.Calibration:
     return dp.calibrate(dp.Views(pixels + noise, size=(640, 480)), BOARD, "fisheye")
 
 
-def landmarks() -> dp.Calibration:
+def landmarks(dtype: torch.dtype = D, origin: tuple[float, ...] = (500.0, 4000.0, 30.0)) -> dp.Calibration:
     generator = torch.Generator().manual_seed(2)
-    points = 10 * torch.rand(14, 3, dtype=D, generator=generator) + torch.tensor([500.0, 4000, 30], dtype=D)
+    points = 10 * torch.rand(14, 3, dtype=D, generator=generator) + torch.tensor(origin, dtype=D)
     camera = dp.Camera(torch.tensor([[800.0, 0, 319.5], [0, 800.0, 239.5], [0, 0, 1]], dtype=D), size=(640, 480))
     R = dp.rotation_from_euler(*torch.tensor([0.2, 0.1, 0.3], dtype=D))
     t = -R @ points.mean(0) + torch.tensor([0.0, 0, 25], dtype=D)
     pixels, _ = camera.at(R, t).project(points)
     noise = 0.3 * torch.randn(pixels.shape, dtype=D, generator=generator)
-    views = dp.Views((pixels + noise)[None], size=(640, 480))
-    return dp.calibrate(views, dp.Landmarks(points), "none", fixed=["principal_point"])
+    views = dp.Views((pixels + noise)[None].to(dtype), size=(640, 480))
+    return dp.calibrate(views, dp.Landmarks(points.to(dtype)), "none", fixed=["principal_point"])
 
 
 def not_converged() -> dp.Calibration:
@@ -508,6 +508,17 @@ def test_a_landmarks_plane_is_that_of_their_mean_height() -> None:
     for part in (accuracy_part(Facts(found, (640, 480))), usage_part(Facts(found, (640, 480)), "camera.json")):
         assert "board" not in words(part.html).replace("Board", "board")
         assert re.search("the plane of the landmarks.{1,2} mean z", words(part.html))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_plane_s_height_is_printed_without_the_dust_of_its_sum(dtype: torch.dtype) -> None:
+    """It was one such as 30.100000000000005 in the code to copy."""
+    found = landmarks(dtype, (0.0, 0.0, 30.0))
+    facts = Facts(found, (640, 480))
+    printed = re.search(r"Plane\.z\((.*?)\)", usage_part(facts, "camera.json").html)[1]  # type: ignore[index]
+    assert re.fullmatch(r"35\.\d{1,6}", printed)
+    extent = float((found.nominal.amax(0) - found.nominal.amin(0)).max())
+    assert float(printed) == facts.plane_z == pytest.approx(float(found.nominal[:, 2].mean()), abs=1e-6 * extent)
 
 
 def test_names_at_axes_are_whole_and_stand_apart() -> None:

@@ -80,6 +80,15 @@ def test_a_board_finer_than_printers_print_is_told(tmp_path, kind):
     dp.draw_target(small, tmp_path / "board.svg", unit="m")
 
 
+@pytest.mark.plain  # the checks of types put frames of their own between
+def test_the_warning_points_at_the_caller_s_line_through_the_package(tmp_path):
+    small, inside = dp.Chessboard(9, 6, 0.025), {"__name__": "diffproj.room.part", "dp": dp}
+    exec("def draw(board, path):\n    dp.draw_target(board, path)", inside)  # noqa: S102
+    with pytest.warns(UserWarning, match="finest parts") as seen:
+        inside["draw"](small, tmp_path / "board.svg")
+    assert [warning.filename for warning in seen] == [__file__]
+
+
 def test_what_does_not_fit_is_refused_with_what_does(tmp_path):
     with pytest.raises(ValueError, match=r"277 x 176 mm on A4 .*, got 360 x 270 mm; the largest square .* 19\.5 mm"):
         dp.draw_target(dp.Chessboard(11, 8, 30.0), tmp_path / "board.pdf")
