@@ -118,7 +118,8 @@ def common_errors(found: RigFit, variance: Tensor, freedom: Tensor, bend: Tensor
 
     Args:
         found: the fit.
-        variance: of a residual component of weight 1, for each camera `(C,)`.
+        variance: of the score of a residual component of weight 1, over the bend, for each camera `(C,)`: of the
+            residual itself without a loss. In these units the mean of |q|^2 is s^2 tr G with a loss, too.
         freedom: the degrees of freedom that it is from `(C,)`.
         bend: the mean slope of a robust loss's score `(C,)`, 1 without a loss.
     """

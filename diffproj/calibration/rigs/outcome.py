@@ -121,7 +121,7 @@ class _Late:
     def common(self) -> CommonErrors | None:
         """Errors that all corners of a view share."""
         noise = self.noise
-        return common_errors(self.found, noise.variance, noise.freedom, noise.bend)
+        return common_errors(self.found, noise.variance / noise.bend, noise.freedom, noise.bend)
 
     def __call__(self) -> Covariance:
         if self.known is None:
