@@ -219,6 +219,7 @@ def _remarks(
     if joint.common is not None and joint.common.beyond > CLEAR:
         places = [i for one in found.parameters.poses[1:] for i in one]
         said += filter(None, [joint.common.remark(names, places, joint().shared)])
+    found.problem.forget()  # what common errors are found from
     residuals = found.by_camera
     for name in names:
         used = found.used[name]

@@ -146,6 +146,15 @@ def test_noise_alone_is_nothing_in_common_whatever_the_loss(loss: dp.Loss) -> No
     assert common is None or common.beyond < 3.5
 
 
+def test_remarks_keep_no_panel() -> None:
+    """Also where nothing is found in common, and no covariance asked for."""
+    true = scene(2, 12, missing=0.1, seed=0)
+    rig = dp.calibrate_rig(true.views, true.board)
+    assert not said(rig)
+    groups = rig._covariance.found.problem.groups  # type: ignore[union-attr]
+    assert all("_panel" not in vars(group.reprojection) for group in groups)
+
+
 @pytest.mark.parametrize(
     "options",
     [
