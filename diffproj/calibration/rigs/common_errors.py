@@ -69,18 +69,20 @@ class CommonErrors(NamedTuple):
     def remark(self, names: tuple[str, ...], places: Sequence[int], covariance: Tensor) -> str:
         """A remark on cameras whose views are off, where that makes up most of what is not known of a place; else ''.
 
+        Whether that is clear of chance it does not ask: `beyond` says so, without a covariance.
+
         Args:
             names: of the cameras.
             places: where their places stand among the shared unknowns.
             covariance: of all of these `(s, s)`, whatever it is from.
         """
         rows = list(places)
-        of_shifts, of_all = (part.diagonal()[rows] for part in (self.shared, covariance))
+        of_common, of_all = (part.diagonal()[rows] for part in (self.shared, covariance))
         known = of_all.isfinite() & (of_all > 0)
         variance = 2 * self.variance.sum(-1)  # of a distance
-        if self.beyond < CLEAR or float(variance.amax()) < NEGLIGIBLE_PX**2:
+        if float(variance.amax()) < NEGLIGIBLE_PX**2:
             return ""
-        if not bool((of_shifts[known] > MOST * of_all[known]).any()):
+        if not bool((of_common[known] > MOST * of_all[known]).any()):
             return ""
         ones = [i for i, one in enumerate(variance) if one > variance.amax() / 4]
         px = [f"{float(one.sqrt()):.2f} px" for one in variance]
@@ -118,7 +120,8 @@ def common_errors(found: RigFit, variance: Tensor, freedom: Tensor, bend: Tensor
 
     Args:
         found: the fit.
-        variance: of a residual component of weight 1, for each camera `(C,)`.
+        variance: of the score of a residual component of weight 1, over the bend, for each camera `(C,)`: of the
+            residual itself without a loss. In these units the mean of |q|^2 is s^2 tr G with a loss, too.
         freedom: the degrees of freedom that it is from `(C,)`.
         bend: the mean slope of a robust loss's score `(C,)`, 1 without a loss.
     """

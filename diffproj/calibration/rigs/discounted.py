@@ -6,7 +6,7 @@ from torch import Tensor
 from diffproj.calibration.least_squares.losses import slope_and_bend
 from diffproj.calibration.rigs.fit import RigFit
 from diffproj.calibration.rigs.uncertainty import CameraNoise, noisy_moments
-from diffproj.calibration.trust.discounted import FALLING, HALF, HARDLY, WRONG
+from diffproj.calibration.trust.discounted import WRONG, held_for_wrong
 
 
 @torch.no_grad()
@@ -22,7 +22,5 @@ def discounted(found: RigFit, noise: CameraNoise) -> dict[str, Tensor] | None:
         of_view = variance[c, views.where[name]].unsqueeze(-1)
         squares = squared if weights is None else weights[0] * squared
         far = torch.where(of_view > 0, squares > WRONG**2 * of_view, squares > 0)
-        hardly = ((slope < HARDLY) & used).sum(-1) > used.sum(-1) / 2
-        narrow = hardly & ((slope + 2 * bend * squared < FALLING) & used).any(-1)
-        wrong[name] = used & (slope < HALF) & (far | narrow.unsqueeze(-1))
+        wrong[name] = held_for_wrong(used, far, slope, slope + 2 * bend * squared)
     return wrong

@@ -121,7 +121,7 @@ class _Late:
     def common(self) -> CommonErrors | None:
         """Errors that all corners of a view share."""
         noise = self.noise
-        return common_errors(self.found, noise.variance, noise.freedom, noise.bend)
+        return common_errors(self.found, noise.variance / noise.bend, noise.freedom, noise.bend)
 
     def __call__(self) -> Covariance:
         if self.known is None:
@@ -219,6 +219,7 @@ def _remarks(
     if joint.common is not None and joint.common.beyond > CLEAR:
         places = [i for one in found.parameters.poses[1:] for i in one]
         said += filter(None, [joint.common.remark(names, places, joint().shared)])
+    found.problem.forget()  # what common errors are found from
     residuals = found.by_camera
     for name in names:
         used = found.used[name]

@@ -146,8 +146,13 @@ class RigCalibration(RigAccount, Copied, RigRecorded):
 
         Names of parameters are `left.f_x`, ..., `right.omega_x`, ..., `right.tau_z`: a camera's pose in the rig is
         perturbed by `R <- exp(omega) R`, `t <- t + tau`, in radians about the camera's axes and in world units. Its
-        "views" are the moments: poses of the target in the rig. `dispersion` is that of the moments against independent
-        corners; what of it comes from errors that all corners of a view share is counted as such, and not by it.
+        "views" are the moments: poses of the target in the rig.
+
+        `dispersion` says how much more the moments contradict each other than they would if all corners erred
+        independently. Where all corners of a view are found to be off together, at each moment otherwise, as those of
+        a camera that is late, these errors have a part of the covariance of their own. The deviations of the cameras'
+        poses then hold more than `dispersion` says (on the bundled pair up to 1.45 times its root), those of intrinsics
+        about as much: do not divide them by its root for a comparison.
 
         Raises:
             ValueError: it is not known.

@@ -21,18 +21,31 @@ FALLING = -1e-3
 def discounted(found: Fit) -> Tensor | None:
     """Those of the used corners `(P, V, N)`; `None` without a loss, or where it does not judge pixels.
 
-    They count less than half, and are further off than noise puts one. Where a redescending loss is too narrow for a
-    view, these are all that count less than half: such a fit has many minima, each at the corners that happen to agree.
+    Which these are `held_for_wrong` says.
     """
     if found.task.loss is None or found.task.objective != "image":
         return None
     with torch.no_grad():
         corners, used = CornerScores(found), found.task.used
-        wrong = beyond_noise(found, corners) > WRONG**2
-        along = corners.slope + 2 * corners.bend * corners.squared
-        hardly = ((corners.slope < HARDLY) & used).sum(-1) > used.sum(-1) / 2
-        narrow = hardly & ((along < FALLING) & used).any(-1)
-        return used & (corners.slope < HALF) & (wrong | narrow.unsqueeze(-1))
+        far = beyond_noise(found, corners) > WRONG**2
+        return held_for_wrong(used, far, corners.slope, corners.slope + 2 * corners.bend * corners.squared)
+
+
+def held_for_wrong(used: Tensor, far: Tensor, weight: Tensor, along: Tensor) -> Tensor:
+    """Which of the corners of each view a loss holds for wrong `(*B, V, N)`.
+
+    They count less than half, and are further off than noise puts one. Where a redescending loss is too narrow for a
+    view, these are all that count less than half: such a fit has many minima, each at the corners that happen to agree.
+
+    Args:
+        used: the corners that count `(*B, V, N)`.
+        far: those that are further off than noise puts one.
+        weight: what the loss lets each count for, 1 at most.
+        along: the slope of the score along the residual.
+    """
+    hardly = ((weight < HARDLY) & used).sum(-1) > used.sum(-1) / 2
+    narrow = hardly & ((along < FALLING) & used).any(-1)
+    return used & (weight < HALF) & (far | narrow.unsqueeze(-1))
 
 
 def beyond_noise(found: Fit, corners: CornerScores) -> Tensor:

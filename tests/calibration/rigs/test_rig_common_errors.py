@@ -8,6 +8,7 @@ import torch
 
 import diffproj as dp
 from diffproj.calibration.rigs.common_errors import _not_negative
+from diffproj.calibration.trust.dispersion import FEW_VIEWS
 from tests.calibration.rigs.rig_scenes import Scene, off_truth, rotation, scene
 
 D = torch.float64
@@ -52,11 +53,12 @@ def test_places_hold_that_a_camera_is_late() -> None:
         true = scene(2, 12, missing=0.1, seed=seed)
         rig = dp.calibrate_rig(late(true, 0.2, "cam1", seed=seed), true.board)
         found += squares(rig, true)
-        moved += [float("0.1" < remark.split(" px")[0][-4:] < "0.4") for remark in said(rig)]
-    # Measured over 200 rigs: 1.06, and 92 % of the baselines in their intervals; 3.4 and 80 % without.
-    assert sum(found) / len(found) == pytest.approx(1, abs=0.5)
-    assert len(moved) > 8
-    assert all(moved)
+        moved += [float(remark.split(" px")[0][-4:]) for remark in said(rig)]
+    # Measured over 200 rigs: 1.09, and 92 % of the baselines in their intervals; 3.4 and 80 % without. Of these 16: 0.91,
+    # and 13 remarks that say .15 to .32 px.
+    assert sum(found) / len(found) == pytest.approx(0.91, abs=0.05)
+    assert 12 <= len(moved) <= 14
+    assert all(0.14 < px < 0.34 for px in moved)
 
 
 def test_places_hold_that_a_turning_board_is_seen_late() -> None:
@@ -70,10 +72,10 @@ def test_places_hold_that_a_turning_board_is_seen_late() -> None:
             for name in rig.names
         ]
         named += len(said(rig))
-    # Measured over 40 rigs: 1.01 and 1.08; 2.3 and 1.34 without.
-    assert sum(found) / len(found) == pytest.approx(1, abs=0.5)
-    assert float(torch.tensor(focal).square().mean().sqrt()) == pytest.approx(1, abs=0.25)
-    assert named > 10
+    # Measured over 40 rigs: 0.94 and 1.09; 2.3 and 1.34 without. Of these 16: 1.09 and 1.06, and each has the remark.
+    assert sum(found) / len(found) == pytest.approx(1.09, abs=0.05)
+    assert float(torch.tensor(focal).square().mean().sqrt()) == pytest.approx(1.06, abs=0.05)
+    assert named >= 15
 
 
 @pytest.mark.slow
@@ -113,14 +115,14 @@ def test_the_late_one_of_four_is_named() -> None:
     assert remark.startswith("cam2 sees the target 0.")
     before = dp.calibrate_rig(true.views, true.board)
     assert not said(before)
-    for name, least, most in (("cam1", 0.9, 1.5), ("cam2", 1.5, 6.0), ("cam3", 0.9, 1.5)):
+    for name, measured in (("cam1", 1.31), ("cam2", 2.36), ("cam3", 1.27)):  # 1 without
         ratio = rig.place_covariance(name).diagonal().sqrt() / before.place_covariance(name).diagonal().sqrt()
-        assert least < float(ratio.square().mean().sqrt()) < most
+        assert float(ratio.square().mean().sqrt()) == pytest.approx(measured, rel=0.05)
     every = dp.calibrate_rig(late(true, 0.4, *true.views), true.board)
     assert said(every)[0].count(" by 0.") >= 3
-    # A moment's own pose is as uncertain as that makes it.
+    # A moment's own pose is as uncertain as that makes it: its variances, measured, by 19.
     widened = every.covariance.poses.diagonal(dim1=-2, dim2=-1) / before.covariance.poses.diagonal(dim1=-2, dim2=-1)
-    assert float(widened.median()) > 2
+    assert float(widened.median()) == pytest.approx(19.2, rel=0.1)
 
 
 def test_the_shift_itself_is_found() -> None:
@@ -131,9 +133,28 @@ def test_the_shift_itself_is_found() -> None:
         rig = dp.calibrate_rig(late(true, 0.3, "cam0", seed=seed), true.board)
         told.append(rig._covariance.common.variance[:, 0])  # type: ignore[union-attr]
     mean = torch.stack(told).mean(0)
-    # The mean of 12 is known to 10 %.
-    assert float(mean.sum()) == pytest.approx(0.3**2 / 2, rel=0.3)
-    assert float(mean[0]) == pytest.approx(float(mean[1]), rel=0.05)
+    # It counts more where few moments tell it. The mean of 12 is known to 10 %; measured is 1.056 times as much.
+    assert float(mean.sum()) == pytest.approx(0.3**2 / 2 * (1 + FEW_VIEWS / 19), rel=0.1)
+    assert float(mean[0]) == pytest.approx(float(mean[1]), rel=0.02)
+
+
+@pytest.mark.parametrize("loss", [dp.Huber(0.1), dp.Cauchy(0.2)], ids=["huber", "cauchy"])
+def test_noise_alone_is_nothing_in_common_whatever_the_loss(loss: dp.Loss) -> None:
+    """A loss lowers the curvature by its mean slope, and the variance of the scores by another factor."""
+    true = scene(2, 20, missing=0.0, seed=1)
+    rig = dp.calibrate_rig(true.views, true.board, loss=loss)
+    common = rig._covariance.common  # type: ignore[union-attr]
+    # Measured: 2.9 and 2.4 deviations of chance; with the scores' variance not over the bend, 15.8 and 17.0.
+    assert common is None or common.beyond < 3.5
+
+
+def test_remarks_keep_no_panel() -> None:
+    """Also where nothing is found in common, and no covariance asked for."""
+    true = scene(2, 12, missing=0.1, seed=0)
+    rig = dp.calibrate_rig(true.views, true.board)
+    assert not said(rig)
+    groups = rig._covariance.found.problem.groups  # type: ignore[union-attr]
+    assert all("_panel" not in vars(group.reprojection) for group in groups)
 
 
 @pytest.mark.parametrize(
