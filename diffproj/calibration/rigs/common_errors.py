@@ -156,7 +156,7 @@ def common_errors(found: RigFit, variance: Tensor, freedom: Tensor, bend: Tensor
     over = (beyond - CHANCE).clamp(min=0).square()
     told = told * over / (1 + over)
     moments = (there.sum(-1) > 1).sum()
-    told = told * (1 + FEW_VIEWS / (moments - 1).clamp(min=1))
+    told = told * (1 + FEW_VIEWS / (moments - 1).clamp(min=1).to(told))
     if not bool((told > 0).any()):
         return None
     deviation = (told @ kinds.mT).sqrt().unsqueeze(-1)  # (C, 5, 1)
