@@ -400,7 +400,7 @@ def fuzz(folder: Path, seed: int, count: int) -> int:
             assert all(bool(tensor.isfinite().all()) for tensor in (found.K, found.R, found.t)), (name, kind)
             if name == "own.json":
                 dp.load(folder / name)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, UserWarning) as error:  # a warning, where it is an error, tells too
             said, refused = str(error), refused + 1
             if str(folder / name) not in said or "\n" in said:
                 raise AssertionError(f"{name} after {kind}") from error
