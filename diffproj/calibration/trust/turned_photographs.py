@@ -85,7 +85,8 @@ def turned_photographs(found: Fit, which: Tensor, sizes: Sequence[tuple[int, int
         Q, pull = of_prior(held, shared)
         choice = _Choice(seen, T, Q[:, :few, :few], pull[:, :few], size, *_turn(task.names[:few], shared, size))
         turned = choice.best(task.used.any(-1))
-        saved, of_each, level, spare, clear = choice.judged(turned, task.used.any(-1), part.degrees_of_freedom())
+        share = task.used.any(-1).to(shared) * (1.0 if task.shares is None else task.shares)
+        saved, of_each, level, spare, clear = choice.judged(turned, share, part.degrees_of_freedom())
         told = ((saved > _as_rare(CERTAIN, spare) * level) & clear).unsqueeze(-1) & turned
         told &= of_each > (_as_rare(OF_A_VIEW, spare) * level).unsqueeze(-1)
         total = 2 * seen.c.sum(-1)
@@ -184,8 +185,12 @@ class _Choice(NamedTuple):
             starts.append(aside)
         return starts
 
-    def judged(self, turned: Tensor, used: Tensor, redundant: Tensor) -> _Judged:
-        """What it is worth to turn these views back `(P, V)`, of those used `(P, V)`."""
+    def judged(self, turned: Tensor, share: Tensor, redundant: Tensor) -> _Judged:
+        """What it is worth to turn these views back `(P, V)`, each of which counts by its share `(P, V)`.
+
+        The bowls have these shares in them: a copy tells nothing more.
+        """
+        whole = torch.where(share > 0, 1 / share, 0.0)
         A, b, fixed = self._sum(turned)
         y = _lowest(A, b)
         saved = -2 * (fixed + (b * y).sum(-1) / 2)
@@ -196,13 +201,14 @@ class _Choice(NamedTuple):
         H, g = self.T.mT.unsqueeze(1) @ H @ self.T.unsqueeze(1), (g.unsqueeze(-2) @ self.T.unsqueeze(1)).squeeze(-2)
         u = g + (H @ y[:, None, :, None]).squeeze(-1)
         pull = u.sum(1) + b - g.sum(1) + ((A - H.sum(1)) @ y.unsqueeze(-1)).squeeze(-1)
-        phi, spare, _ = contradiction(u, H, left[:, None, None, None] * H, torch.ones_like(u[..., 0]), A, pull)
+        u, H = u * whole.unsqueeze(-1), H * whole[..., None, None]
+        phi, spare, _ = contradiction(u, H, left[:, None, None, None] * H, share, A, pull)
         level = phi.clamp(min=1) * left
-        clear = self._two_heaps(x, turned, used, level) > TWO_HEAPS
-        clear |= saved > BEYOND_CHOICE * used.sum(-1) * level
-        return _Judged(saved, 2 * (costs[0] - costs[1]), level, spare, clear)
+        clear = self._two_heaps(x, turned, share, level) > TWO_HEAPS
+        clear |= saved > BEYOND_CHOICE * share.sum(-1) * level
+        return _Judged(saved, 2 * (costs[0] - costs[1]) * whole, level, spare, clear)
 
-    def _two_heaps(self, x: Tensor, turned: Tensor, used: Tensor, level: Tensor) -> Tensor:
+    def _two_heaps(self, x: Tensor, turned: Tensor, share: Tensor, level: Tensor) -> Tensor:
         """By how much two heaps of views, at x and at its turned place, are likelier than one `(P,)`, as a logarithm.
 
         A view's place on the line between both, from the middle and in lengths of the line, is what it costs more at x
@@ -210,18 +216,20 @@ class _Choice(NamedTuple):
         """
         jump = self.sign * x + self.d - x
         curvature = torch.einsum("pi,pvij,pj->pv", jump, self.seen.H, jump)
-        told = used & (curvature > 0)
-        curvature, count, some = torch.where(told, curvature, 1.0), told.sum(-1), (turned & told).sum(-1)
+        told = (share > 0) & (curvature > 0)
+        share, curvature = torch.where(told, share, 0.0), torch.where(told, curvature, 1.0)
+        count, some = share.sum(-1), (turned * share).sum(-1)
         costs = self._costs(x)
         place = torch.where(told, (costs[0] - costs[1]) / curvature, 0.0)
+        curvature = torch.where(told, curvature / torch.where(told, share, 1.0), 1.0)  # of the whole view
         off = torch.where(told, place - torch.where(turned, 0.5, -0.5), 0.0)
-        within = ((off.square() * curvature).sum(-1) / count.clamp(min=1)).maximum(level)
-        two = _likelihood(off, within.unsqueeze(-1) / curvature, told)
+        within = ((share * off.square() * curvature).sum(-1) / count.clamp(min=1)).maximum(level)
+        two = _likelihood(off, within.unsqueeze(-1) / curvature, share)
         variance = (level.unsqueeze(-1) / curvature) + place.new_tensor(WIDTHS).square()[:, None, None]
-        weight = torch.where(told, 1 / variance, 0.0)
+        weight = share / variance
         middle = (weight * place).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-300)
-        one = _likelihood(place - middle, variance, told).amax(0)
-        ways = (count.to(two) + 1).lgamma() - (some.to(two) + 1).lgamma() - ((count - some).to(two) + 1).lgamma()
+        one = _likelihood(place - middle, variance, share).amax(0)
+        ways = (count + 1).lgamma() - (some + 1).lgamma() - (count - some + 1).lgamma()
         return two - one - ways
 
     def _costs(self, x: Tensor) -> Tensor:
@@ -248,9 +256,9 @@ class _Choice(NamedTuple):
         return A, b, fixed.sum(-1)
 
 
-def _likelihood(off: Tensor, variance: Tensor, told: Tensor) -> Tensor:
-    """The logarithm of how likely normal variables `(*B, V)` with these variances are, up to a constant `(*B,)`."""
-    return -torch.where(told, off.square() / variance + variance.log(), 0.0).sum(-1) / 2
+def _likelihood(off: Tensor, variance: Tensor, share: Tensor) -> Tensor:
+    """The logarithm of how likely normal variables `(*B, V)` are that count by shares, up to a constant `(*B,)`."""
+    return -(share * (off.square() / variance + variance.log())).sum(-1) / 2
 
 
 def _as_rare(deviations: float, freedom: Tensor) -> Tensor:

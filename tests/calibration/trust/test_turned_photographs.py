@@ -134,6 +134,15 @@ def test_errors_that_go_together_within_a_view_turn_nothing() -> None:
     assert sum(TURNED in remark for remark in found.remarks) <= 2
 
 
+def test_copies_of_views_turn_nothing() -> None:
+    """With three of each of 8 views whose errors go together, 11 of 30 sets were accused, and none of the views once."""
+    middle = dp.Camera([[530.0, 0, 320], [0, 530, 240], [0, 0, 1]], distortion=CAMERA.distortion, size=SIZE)
+    once = with_smooth_errors(seen_at_random(middle, BOARD, 30, 8), BOARD.points, 0.2)
+    copied = dp.Views(once.pixels.repeat(1, 3, 1, 1), once.visible.repeat(1, 3, 1), size=SIZE)
+    for views in (once, copied):
+        assert not any(TURNED in remark for remark in dp.calibrate(views, BOARD, throw=False).remarks)
+
+
 WIDE = dp.BrownConrady(torch.tensor([-0.3, 0.09, 0.001, 0.001, -0.01, 0.02, 0.001, 0.001], dtype=torch.float64))
 FISHEYE = dp.KannalaBrandt(torch.tensor([0.02, -0.01, 0.003, -0.001], dtype=torch.float64))
 
