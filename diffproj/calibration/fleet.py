@@ -19,10 +19,9 @@ from diffproj.calibration.fitting.fit import Fit
 from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.one_lens import fitted
-from diffproj.calibration.outcome import outcome
+from diffproj.calibration.outcome import outcome, remarks_on
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
 from diffproj.calibration.trust.entangled import Entangled
-from diffproj.calibration.trust.remarks import remarks
 from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.target import Target, points_of
 from diffproj.targets.views import Views, as_views
@@ -145,16 +144,14 @@ def _side_by_side(
             results.append(outcome("calibrate", own, found.alone(row, len(views)), views.size, chosen.throw))
         except CalibrationError as error:
             results.append(error)
-    return _with_remarks(results, found, cameras) if told else results
+    return _with_remarks(results, found, data[0], cameras) if told else results
 
 
-def _with_remarks(results: Sequence[Outcome], found: Fit, cameras: Sequence[Views]) -> list[Outcome]:
+def _with_remarks(results: Sequence[Outcome], found: Fit, data: Data, cameras: Sequence[Views]) -> list[Outcome]:
     """The same with the remarks on each, from the fit of all."""
     ends = [int(one.status) if isinstance(one, Calibration) else int(Status.DIVERGED) for one in results]
     status = torch.tensor(ends, device=found.solution.status.device)
-    texts = remarks(
-        found, status, Entangled(found, status), [views.names for views in cameras], [views.size for views in cameras]
-    )
+    texts = remarks_on(found, status, Entangled(found, status), data, cameras)
     return [
         replace(one, _remarks=partial(_same, (text,))) if isinstance(one, Calibration) else one
         for one, text in zip(results, texts, strict=True)

@@ -1,6 +1,6 @@
 """What `calibrate`, `refine` and `locate` share: from a start to the minimum, and from there to a `Calibration`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -35,6 +35,7 @@ from diffproj.calibration.trust.uncertainty import covariance_of
 from diffproj.calibration.trust.verdict import verdicts
 from diffproj.geometry.camera import Camera
 from diffproj.targets.landmarks import Landmarks
+from diffproj.targets.views import Views
 
 BELOW = (
     "in {} the camera is below the landmarks' plane, where z is smaller, and not upright if z is up: heights over the "
@@ -165,7 +166,7 @@ def outcome(
         rig=None if known is None else known.rig,
         _covariance=partial(_covariance, found, data, before, known, doubt),
         _others=partial(_others, found, data, before),
-        _remarks=partial(_remarks, found, status, doubt, data),
+        _remarks=partial(remarks_on, found, status, doubt, data, [data.views] * len(status)),
         landmarks=landmarks,
         uncertain=data.uncertain,
         discounted=None if wrong is None else shaped(wrong),
@@ -176,18 +177,16 @@ def outcome(
     return calibration
 
 
-def _remarks(found: Fit, status: Tensor, doubt: Entangled, data: Data) -> tuple[Remarks, ...]:
-    """The remarks on each camera, and on how it stands to the landmarks, where the target is that."""
-    names, of_landmarks = data.views.names, isinstance(data.target, Landmarks)
-    P = len(status)
-    said = remarks(found, status, doubt, [names] * P, [data.views.size] * P, of_landmarks)
-    if not of_landmarks or found.task.solid:
+def remarks_on(found: Fit, status: Tensor, doubt: Entangled, data: Data, views: Sequence[Views]) -> tuple[Remarks, ...]:
+    """The remarks on each of P cameras, of its own views, and on how it stands to landmarks, if the target is that."""
+    said = remarks(found, status, doubt, [own.names for own in views], [own.size for own in views], data.target)
+    if not isinstance(data.target, Landmarks) or found.task.solid:
         return said
     below = upside_down(data.frame, *_state(found)[1]) & found.task.used.any(-1)
     below &= (status == Status.CONVERGED).unsqueeze(-1)
     return tuple(
-        (*one, Remark(BELOW.format(", ".join(names[v] for v in where)), Kind.BELOW)) if where else one
-        for one, where in zip(said, (row.nonzero().flatten().tolist() for row in below), strict=True)
+        (*one, Remark(BELOW.format(", ".join(own.names[v] for v in where)), Kind.BELOW)) if where else one
+        for one, where, own in zip(said, (row.nonzero().flatten().tolist() for row in below), views, strict=True)
     )
 
 

@@ -90,6 +90,13 @@ class AprilGrid:
         return torch.from_numpy(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1))
 
     @property
+    def by_spacing(self) -> Float[Tensor, "n 3"]:
+        """How its points move as the tags move apart: their derivatives by `spacing`."""
+        x, y = (self.tag * (np.arange(2 * count) // 2) for count in (self.columns, self.rows))
+        y, x = np.meshgrid(y, x, indexing="ij")
+        return torch.from_numpy(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1))
+
+    @property
     def dictionary(self) -> str:
         """The name of the tags' family among OpenCV's dictionaries."""
         return FAMILY

@@ -149,6 +149,8 @@ def judged(seen: Evidence) -> Judgement:
         remedies.insert(0, "no other photograph yet, but those that the remark names turned as the others are")
     if Kind.UNEVEN_PRINT in seen.kinds:
         remedies.insert(0, "no other photograph yet, but shape='free', or a board whose sides were measured both ways")
+    if Kind.SPACING in seen.kinds:
+        remedies.insert(0, "no other photograph yet, but the side and the distance of the tags measured")
     if Kind.WRONG_PRIOR in seen.kinds:
         remedies.insert(0, "first another look at the prior that the remark names")
     if Kind.BENT in seen.kinds:
@@ -213,7 +215,9 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
         )
     return [
         *faults,
-        *_reasons(seen.remarks, Kind.TURNED, Kind.TWO_CAMERAS, Kind.UNEVEN_PRINT, Kind.BENT, *OF_THE_CAMERA),
+        *_reasons(
+            seen.remarks, Kind.TURNED, Kind.TWO_CAMERAS, Kind.UNEVEN_PRINT, Kind.SPACING, Kind.BENT, *OF_THE_CAMERA
+        ),
     ]
 
 

@@ -21,6 +21,8 @@ class Kind(StrEnum):
     """Photographs of some views are turned by 180 degrees against the others'."""
     UNEVEN_PRINT = "uneven print"
     """The board was printed wider than high, or slanted."""
+    SPACING = "spacing"
+    """The tags of an AprilGrid do not stand as far apart as it says."""
     BENT = "bent board"
     """The board is bent."""
     CONTRADICTION = "contradiction"

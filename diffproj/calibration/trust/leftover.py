@@ -56,18 +56,20 @@ class Effect:
         deviations: how improbable that is if the residuals are noise, as standard deviations of a normal variable.
         moved: by how much the shared parameters would move if these unknowns were free, to first order `(n, s)`;
             `None` where that is not known.
+        strengths: what these unknowns themselves would be `(n, q)`; `None` likewise.
     """
 
     share: Tensor
     least_share: Tensor
     deviations: Tensor
     moved: Tensor | None = None
+    strengths: Tensor | None = None
 
     def besides(self, apart: "Effect", where: Tensor) -> "Effect":
         """The lesser of this effect and of what is left of it when another is taken out, where there is one."""
         share = torch.where(where, self.least_share.minimum(apart.least_share), self.least_share)
         deviations = torch.where(where, self.deviations.minimum(apart.deviations), self.deviations)
-        return Effect(self.share, share, deviations, self.moved)
+        return replace(self, least_share=share, deviations=deviations)
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,8 @@ class Leftover:
         shape: points of the board moved, alike in all views.
         bow: the same by a paraboloid alone.
         print: the same by a stretch along x and a shear, as printers and wrong sides of squares make them.
+        proportion: the same as a proportion of the board changes them, such as the distance of its tags; `None` for
+            boards without one.
         moved: how far the points lie off the board within its plane, `(n,)`, RMS in world units, without the noise.
     """
 
@@ -90,20 +94,22 @@ class Leftover:
     shape: Effect
     bow: Effect
     print: Effect
+    proportion: Effect | None
     moved: Tensor
 
 
-def leftover(found: Fit, which: Tensor, shape_deviations: float) -> Leftover:
+def leftover(found: Fit, which: Tensor, shape_deviations: float, by_proportion: Tensor | None = None) -> Leftover:
     """Test the residuals of some cameras of a fit.
 
     Args:
         found: the fit.
         which: the cameras, `(n,)`, at least one.
         shape_deviations: from which on the board's shape counts as significant, and is taken out first.
+        by_proportion: how the board's points move with its proportion `(N, 3)`, if it has one.
     """
     with torch.no_grad():
         length = max(1, BLOCK_VIEWS // found.task.used.shape[1])
-        parts = [_Scores(found, rows).leftover(shape_deviations) for rows in which.split(length)]
+        parts = [_Scores(found, rows).leftover(shape_deviations, by_proportion) for rows in which.split(length)]
         return parts[0] if len(parts) == 1 else _joined(parts)
 
 
@@ -140,7 +146,7 @@ class _Scores:
         self.projected = torch.where(valid.unsqueeze(-1), seen, task.pixels)
         self.middle = shared[:, 2:4]
 
-    def leftover(self, shape_deviations: float) -> Leftover:
+    def leftover(self, shape_deviations: float, by_proportion: Tensor | None) -> Leftover:
         explained, points, moves = self._moved_points()
         if self.task.free:  # they are where the residuals want them
             explained, points, moves = explained * 0, points * 0, moves * 0
@@ -158,7 +164,10 @@ class _Scores:
         skew = besides_shape(self._skew())
         bow = self._added(self._bow(), self.residual, self.count)
         uneven = self._added(self._uneven_print(), self.residual, self.count)
-        return Leftover(radial, smooth, skew, shape, bow, uneven, self._spread(moves))
+        proportion = None
+        if by_proportion is not None and not self.task.free:
+            proportion = self._added(self._moving(by_proportion), self.residual, self.count)
+        return Leftover(radial, smooth, skew, shape, bow, uneven, proportion, self._spread(moves))
 
     def _radial(self) -> Tensor:
         off = self.projected - self.middle[:, None, None]
@@ -191,6 +200,10 @@ class _Scores:
         along = self.by_point[:, :, :1]
         x, y = self.task.points[:, :2].unbind(-1)
         return torch.cat([along * x, along * y], dim=2)
+
+    def _moving(self, points: Tensor) -> Tensor:
+        """As the board's points move all together by `(N, 3)`."""
+        return torch.einsum("pvikn,ni->pvkn", self.by_point, points.to(self.by_point)).unsqueeze(2)
 
     def _columns(self, fields: list[Tensor]) -> Tensor:
         """Weighted derivatives `(n, V, q, 2, N)` by the strengths of fields `(n, V, N, 2)`."""
@@ -245,7 +258,7 @@ class _Scores:
         moved = (moved * scale[:, :first]).squeeze(-1)
         if self.task.basis is not None:
             moved = (self.task.basis @ moved.unsqueeze(-1)).squeeze(-1)
-        return replace(found, moved=moved)
+        return replace(found, moved=moved, strengths=-(step * scale[:, first:]).squeeze(-1))
 
     def _contradiction(self, left: Tensor, unknowns: Tensor, rest: Tensor, count: Tensor) -> Excess:
         """How much more the views contradict each other on added unknowns than independent corners would.

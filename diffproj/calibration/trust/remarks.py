@@ -33,8 +33,10 @@ from diffproj.calibration.trust.leftover import Leftover, leftover
 from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
 from diffproj.calibration.trust.prior_weight import Elsewhere, weighed_anew
 from diffproj.calibration.trust.small_effects import SmallEffects
+from diffproj.calibration.trust.tag_spacing import by_spacing, of_free_points, of_the_spacing
 from diffproj.calibration.trust.turned_photographs import Turned, turned_photographs
 from diffproj.calibration.trust.two_groups import TwoGroups, two_groups
+from diffproj.targets.landmarks import Landmarks
 
 UNSURE = 0.1
 """Deviation of a focal length, relative to it, from which on it is known roughly."""
@@ -56,7 +58,7 @@ def remarks(
     doubt: Entangled,
     names: Sequence[Sequence[str]],
     sizes: Sequence[tuple[int, int] | None],
-    of_landmarks: bool = False,
+    target: object,
 ) -> tuple[Remarks, ...]:
     """The remarks on each of P cameras; none on one that did not converge.
 
@@ -66,9 +68,10 @@ def remarks(
         doubt: what the views hardly tell apart.
         names: of the views of each camera.
         sizes: of the photographs of each camera.
-        of_landmarks: whether the corners are landmarks, which people click and survey.
+        target: what they saw.
     """
     task = found.task
+    of_landmarks = isinstance(target, Landmarks)  # which people click and survey
     converged = status == Status.CONVERGED
     held = found.is_restrained()
     said: list[list[Remark]] = [[] for _ in status]
@@ -111,7 +114,7 @@ def remarks(
     sigma = found.pixel_sigma().detach()
     which = (converged & (sigma > EXACT_PX) & (not poses_only(task))).nonzero().flatten()
     if len(which):
-        left, groups = leftover(found, which, SIGNIFICANT), two_groups(found, which)
+        left, groups = leftover(found, which, SIGNIFICANT, by_spacing(target)), two_groups(found, which)
         wrong = prior_contradictions(found, which)
         # What is known beforehand and does not fit holds the camera where turned photographs would fit better.
         turned = turned_photographs(found, which[~found.has_prior()[which]], sizes)
@@ -127,6 +130,10 @@ def remarks(
                 said[p].append(_of_the_prior(wrong[p]))
                 if wrong[p].saved > BETTER * max(saved, float(left.smooth.share[i])):
                     continue
+            spacing = of_the_spacing(target, left, i, float(sigma[p])) or of_free_points(target, found, p)
+            if spacing is not None:
+                said[p].append(spacing)
+                continue
             if not of_landmarks and _uneven_print(task, left, i, p, saved):
                 said[p].append(_of_the_print(left, i))
                 continue
