@@ -149,6 +149,8 @@ def judged(seen: Evidence) -> Judgement:
         remedies.insert(0, "no other photograph yet, but those that the remark names turned as the others are")
     if Kind.UNEVEN_PRINT in seen.kinds:
         remedies.insert(0, "no other photograph yet, but shape='free', or a board whose sides were measured both ways")
+    if Kind.FOCUS in seen.kinds:
+        remedies.insert(0, "the photographs once more with focus and zoom held")
     if Kind.SPACING in seen.kinds:
         remedies.insert(0, "no other photograph yet, but the side and the distance of the tags measured")
     if Kind.WRONG_PRIOR in seen.kinds:
@@ -216,7 +218,14 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
     return [
         *faults,
         *_reasons(
-            seen.remarks, Kind.TURNED, Kind.TWO_CAMERAS, Kind.UNEVEN_PRINT, Kind.SPACING, Kind.BENT, *OF_THE_CAMERA
+            seen.remarks,
+            Kind.TURNED,
+            Kind.TWO_CAMERAS,
+            Kind.UNEVEN_PRINT,
+            Kind.SPACING,
+            Kind.FOCUS,
+            Kind.BENT,
+            *OF_THE_CAMERA,
         ),
     ]
 

@@ -53,8 +53,9 @@ class Covariance(Copied, Shown):
         undetermined_views: which poses they do not determine `(*B, V)`.
         dispersion: how many times larger the variances are than they would be if all corners erred independently of
             each other `(*B,)`, at least 1: how much more the views contradict each other than such corners would. The
-            square root divides a deviation for a comparison with tools that do not look for it; not that of a rig
-            whose cameras see all corners of a view off together (`RigCalibration.covariance`).
+            square root divides a deviation for a comparison with tools that do not look for it; not where focal lengths
+            differ from view to view, nor that of a rig whose cameras see all corners of a view off together
+            (`RigCalibration.covariance`).
         middle: the middle of the target `(3,)` in the world; `None` stands for the world's origin.
     """
 

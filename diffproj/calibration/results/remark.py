@@ -23,6 +23,8 @@ class Kind(StrEnum):
     """The board was printed wider than high, or slanted."""
     SPACING = "spacing"
     """The tags of an AprilGrid do not stand as far apart as it says."""
+    FOCUS = "focus"
+    """The focal length differs from view to view."""
     BENT = "bent board"
     """The board is bent."""
     CONTRADICTION = "contradiction"

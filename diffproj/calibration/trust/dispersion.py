@@ -74,7 +74,7 @@ def dispersion(found: Fit) -> Tensor:
         if task.free:
             factor = believed(_moved_intrinsics(found, shared, local), few_views)
         else:
-            pulls = _pulls(task, shared, local, found.degrees_of_freedom())
+            pulls = pulls_of(found)
             told = contradiction(*pulls)
             if task.basis is None or bool((task.basis[:, : len(INTRINSICS)] != 0).any()):
                 told = _more(told, _of_intrinsics(pulls, task.basis))
@@ -119,9 +119,11 @@ class Pulls(NamedTuple):
     pull: Tensor
 
 
-def _pulls(task: Task, shared: Tensor, local: tuple[Tensor, ...], redundant: Tensor) -> Pulls:
-    """Those of all views; `redundant (P,)` are the degrees of freedom of the fit."""
-    rows, residual, pull_weight, variance = _weighted(task, shared, local, redundant)
+def pulls_of(found: Fit) -> Pulls:
+    """Those of all views of a fit whose target's points are not free."""
+    task, solution = found.task, found.solution
+    shared, local = solution.shared.detach(), tuple(z.detach() for z in solution.local)
+    rows, residual, pull_weight, variance = _weighted(task, shared, local, found.degrees_of_freedom())
     s = shared.shape[-1]
     if task.basis is not None:
         rows = torch.cat([torch.einsum("psq,pvskn->pvqkn", task.basis, rows[:, :, :s]), rows[:, :, s:]], dim=2)
@@ -182,18 +184,10 @@ def _more(told: Contradiction, of_intrinsics: Contradiction) -> Contradiction:
 
 def _of_intrinsics(pulls: Pulls, basis: Tensor | None) -> Contradiction:
     """How much views contradict each other on the focal lengths and the principal point, whatever a prior says."""
-    u, S, K, share = pulls[:4]
+    u, S, _, share = pulls[:4]
     total, pull = (share[..., None, None] * S).sum(1), (share.unsqueeze(-1) * u).sum(1)
-    scale = total.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
-    values, vectors = torch.linalg.eigh((total * scale.unsqueeze(-1) * scale.unsqueeze(-2)).nan_to_num(0.0, 0.0, 0.0))
-    known = values > SINGULAR * values[:, -1:].clamp(min=1e-300)
-    roots = torch.where(known, torch.where(known, values, 1.0).rsqrt(), 0.0)
-    W = scale.unsqueeze(-1) * vectors * roots.unsqueeze(-2)  # in whose units the normal matrix is 1
-    across = W.mT.unsqueeze(1)
-    S, K = across @ S @ W.unsqueeze(1), across @ K @ W.unsqueeze(1)
-    u = (across @ u.unsqueeze(-1)).squeeze(-1) - (S @ (W.mT @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
-    of_all = (share[..., None, None] * K).sum(1, keepdim=True)
-    K = K - K @ S - S @ K + S @ of_all @ S  # what the fit leaves of it
+    own, W = in_own_units(pulls._replace(total=total, pull=pull))
+    u, K = own.u, left_of_noise(own)
     moves = (W if basis is None else basis @ W)[:, : len(INTRINSICS)].unsqueeze(1)
     moved = (share.unsqueeze(-1) * (moves @ u.unsqueeze(-1)).squeeze(-1).square()).sum(1)
     of_view = share.unsqueeze(-1) * ((moves @ K) * moves).sum(-1).clamp(min=0)
@@ -204,6 +198,37 @@ def _of_intrinsics(pulls: Pulls, basis: Tensor | None) -> Contradiction:
     equal = torch.where(free, expected.square() / (alike * of_view.square()).sum(1).clamp(min=1e-300), torch.inf)
     spare = _directions(basis) * (equal.amin(-1) - 1)
     return Contradiction(phi, torch.where(free.any(-1), spare, 0.0).clamp(min=1e-9), equal.amin(-1))
+
+
+def in_own_units(pulls: Pulls) -> tuple[Pulls, Tensor]:
+    """The pulls about their common minimum, in units in which the normal matrix is 1.
+
+    With them those units `W (P, q, q)`, `W^T total W = 1`; directions that nothing tells are 0.
+    """
+    u, S, K, share, total, pull = pulls
+    scale = total.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+    values, vectors = torch.linalg.eigh((total * scale.unsqueeze(-1) * scale.unsqueeze(-2)).nan_to_num(0.0, 0.0, 0.0))
+    known = values > SINGULAR * values[:, -1:].clamp(min=1e-300)
+    roots = torch.where(known, torch.where(known, values, 1.0).rsqrt(), 0.0)
+    W = scale.unsqueeze(-1) * vectors * roots.unsqueeze(-2)
+    across = W.mT.unsqueeze(1)
+    S, K = across @ S @ W.unsqueeze(1), across @ K @ W.unsqueeze(1)
+    u = (across @ u.unsqueeze(-1)).squeeze(-1) - (S @ (W.mT @ pull.unsqueeze(-1)).unsqueeze(1)).squeeze(-1)
+    return Pulls(u, S, K, share, W.mT @ total @ W, torch.zeros_like(pull)), W
+
+
+def left_of_noise(own: Pulls, copied: Tensor | None = None) -> Tensor:
+    """The covariance `(P, V, q, q)` that pulls in their own units have after the fit if corners err independently.
+
+    Args:
+        own: the pulls.
+        copied: how much of a view's noise all views that are alike have `(P, V)`, from 1, where they are copies, to its
+            share, where each has a noise of its own; 1 if left out.
+    """
+    S, K = own.S, own.K
+    copied = torch.ones_like(own.share) if copied is None else copied
+    of_all = ((own.share * copied)[..., None, None] * K).sum(1, keepdim=True)
+    return K - copied[..., None, None] * (K @ S + S @ K) + S @ of_all @ S
 
 
 def _moved_intrinsics(found: Fit, shared: Tensor, local: tuple[Tensor, ...]) -> Contradiction:

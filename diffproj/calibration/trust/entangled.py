@@ -33,7 +33,7 @@ from diffproj.calibration.results.covariance import Covariance
 from diffproj.calibration.trust.adequacy import EXACT_PX, SIGNIFICANT
 from diffproj.calibration.trust.dispersion import dispersion
 from diffproj.calibration.trust.leftover import effect
-from diffproj.calibration.trust.uncertainty import covariance_of
+from diffproj.calibration.trust.uncertainty import pooled_covariance_of
 from diffproj.lens.models import MODELS
 
 ONE_SIDED = (("tau_x", "tau_y"), ("s1", "s2", "s3", "s4"), (SKEW,))
@@ -154,7 +154,7 @@ def _simpler(found: Fit, numbers: list[int], choices: list[tuple[str, ...]], eve
     With `every`, the first of all choices with which it is another one, or known far less well.
     """
     told: dict[int, Simpler] = {}
-    covariance = covariance_of(found).shared
+    covariance = pooled_covariance_of(found).shared
     deviations = _deviations(covariance)
     left = torch.arange(len(numbers), device=deviations.device)
     for held in choices:
@@ -169,7 +169,7 @@ def _simpler(found: Fit, numbers: list[int], choices: list[tuple[str, ...]], eve
         off = torch.where(deviations[left] > 0, off, 0.0)
         doubt, poorer = step.unsqueeze(-1) * step.unsqueeze(-2), deviations[left]
         if every:
-            known = covariance_of(without).shared
+            known = pooled_covariance_of(without).shared
             doubt, poorer = doubt + _excess(known, covariance[left] + doubt), _deviations(known)
         pinned = torch.where((deviations[left] > 0) & poorer.isfinite(), poorer / deviations[left], 0.0)
         growth = (without.solution.cost / whole.solution.cost).sqrt() - 1

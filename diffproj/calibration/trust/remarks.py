@@ -28,8 +28,10 @@ from diffproj.calibration.trust.adequacy import (
     wants_skew,
 )
 from diffproj.calibration.trust.discounted import discounted
+from diffproj.calibration.trust.dispersion import dispersion
 from diffproj.calibration.trust.entangled import DENOMINATOR, Entangled, Simpler
 from diffproj.calibration.trust.leftover import Leftover, leftover
+from diffproj.calibration.trust.own_focal import OwnFocal, own_focal
 from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
 from diffproj.calibration.trust.prior_weight import Elsewhere, weighed_anew
 from diffproj.calibration.trust.small_effects import SmallEffects
@@ -119,6 +121,7 @@ def remarks(
         # What is known beforehand and does not fit holds the camera where turned photographs would fit better.
         turned = turned_photographs(found, which[~found.has_prior()[which]], sizes)
         small = SmallEffects(found, which, left, of_landmarks)
+        own = own_focal(found, dispersion(found))
         for i, p in enumerate(map(int, which.tolist())):
             saved = groups[p].saved if p in groups else 0.0
             if p in turned and turned[p].saved > max(
@@ -142,7 +145,7 @@ def remarks(
                 said[p].append(_two_cameras(names[p], groups[p]))
                 remark = None if remark is not None and remark.kind in OF_THE_CAMERA else remark
             elif remark is None and p not in wrong:
-                remark = small.of(i)
+                remark = _of_the_focus(own, p) or small.of(i)
             said[p] += [] if remark is None else [remark]
     return tuple(map(tuple, said))
 
@@ -264,6 +267,18 @@ def _of_the_print(left: Leftover, i: int) -> Remark:
         "take shape='free', which finds that, or print it at 100 % both ways and measure both sides of the whole board",
         Kind.UNEVEN_PRINT,
         "the board is not as wide and as high as it says",
+    )
+
+
+def _of_the_focus(own: OwnFocal | None, p: int) -> Remark | None:
+    if own is None or not bool(own.told[p]):
+        return None
+    return Remark(
+        f"the focal length differs by about {100 * float(own.spread[p]):.1g} % from view to view, as of a "
+        "camera that focuses for each photograph: hold focus and zoom, where a photograph is measured in, too; the "
+        "deviations are those of the mean",
+        Kind.FOCUS,
+        "its focal length differs from view to view",
     )
 
 

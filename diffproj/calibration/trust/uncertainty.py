@@ -28,6 +28,7 @@ from diffproj.calibration.trust.corner_scores import CornerScores, state_of
 from diffproj.calibration.trust.dispersion import dispersion
 from diffproj.calibration.trust.noise import Noise, with_known
 from diffproj.calibration.trust.noisy_views import widened_poses
+from diffproj.calibration.trust.own_focal import with_own_focal
 from diffproj.calibration.trust.robust_loss import with_own_scores
 
 
@@ -39,8 +40,15 @@ def covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = N
         known: the noise that a calibration before had, where the shared parameters are held.
         phi: and its dispersion `(P,)`; that of the fit if left out.
     """
+    whole = pooled_covariance_of(found, known, phi)
+    # A noise that was given is the whole error.
+    return whole if phi is not None or found.knows_noise else with_own_focal(whole, found)
+
+
+def pooled_covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = None) -> Covariance:
+    """The same with what views contradict each other about spread over all directions of the parameters."""
     task = found.task
-    if phi is None:  # a noise that was given is the whole error
+    if phi is None:
         phi = torch.ones_like(found.solution.cost) if found.knows_noise else dispersion(found)
     precision = found.measured_precision()
     common = {
