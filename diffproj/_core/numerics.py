@@ -20,7 +20,13 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import Kind, tensor_of
-from diffproj._core.torch_private import has_no_values, in_forward_mode, in_functional_transform, traced_beside
+from diffproj._core.torch_private import (
+    has_no_values,
+    in_forward_mode,
+    in_functional_transform,
+    in_recording,
+    traced_beside,
+)
 
 BLOCK_POINTS = 2**16
 """Points handled at once on a CPU when no derivative is asked: large enough to hide the cost of dispatch, small enough
@@ -113,8 +119,8 @@ def broadcast_batches(**shapes: Sequence[int]) -> torch.Size:
 
 
 def has_values(*tensors: Tensor) -> bool:
-    """Whether the values of these tensors can be read here: not while compiling, under `vmap`, or of a fake tensor."""
-    tracing = torch.compiler.is_compiling() or in_functional_transform()
+    """Whether the values of these tensors can be read here: not of a graph, under `vmap`, or of a fake tensor."""
+    tracing = torch.compiler.is_compiling() or in_functional_transform() or in_recording()
     return not (tracing or any(has_no_values(tensor) for tensor in tensors))
 
 
@@ -273,6 +279,7 @@ def wants_derivative(*tensors: Tensor) -> bool:
         torch.compiler.is_compiling()
         or in_functional_transform()
         or in_forward_mode()
+        or in_recording()
         or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors))
     )
 
