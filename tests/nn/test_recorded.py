@@ -1,6 +1,7 @@
 """What is recorded while it runs with an example (`torch.jit.trace`, `make_fx`) holds for other pixels and cameras too."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -25,7 +26,7 @@ pytestmark = [
 ]
 
 
-def traced(function: Callable[[Tensor], Tensor], example: Tensor) -> Callable[[Tensor], Tensor]:
+def traced(function: Callable[[Tensor], Tensor], example: Tensor) -> Any:
     return torch.jit.trace(function, (example,), check_trace=False)
 
 
@@ -77,7 +78,7 @@ def test_a_recording_is_for_other_cameras(record: Callable) -> None:
 
 def test_a_traced_projector_takes_other_numbers_of_pixels() -> None:
     projector = dp.PlaneProjector(dp.Camera(K, t=T, distortion=LENSES["brown"]), dp.Plane.z(0.0))
-    recorded = torch.jit.trace(projector, (SOME,), check_trace=False)
+    recorded: Any = torch.jit.trace(projector, (SOME,), check_trace=False)
     for pixels in (SOME[:1], SOME.repeat(2000, 1)):
         points, valid = recorded(pixels)
         torch.testing.assert_close(points, projector(pixels)[0])
