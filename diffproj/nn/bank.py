@@ -158,7 +158,7 @@ class ProjectorBank(nn.Module):
             if not has_values(chosen, pixels):  # in a graph each kind takes all samples, and gives its own
                 of_kind = torch.where(own, places, 0)
                 new = work(projector, pixels, warp=warp, plane=plane, camera=of_kind)
-                found = [torch.where(_beside(own, a), a, b.to(a)) for a, b in zip(new, found or new, strict=True)]
+                found = [_either(_beside(own, a), a, b.to(a)) for a, b in zip(new, found or new, strict=True)]
                 continue
             (samples,) = own.nonzero(as_tuple=True)
             if not len(samples) and (found or len(chosen)):
@@ -180,6 +180,11 @@ class ProjectorBank(nn.Module):
 def _beside(of_samples: Tensor, values: Tensor) -> Tensor:
     """A tensor `(S,)` that broadcasts against one of more axes `(S, ...)`."""
     return of_samples.reshape(-1, *(1,) * (values.ndim - 1))
+
+
+def _either(which: Tensor, yes: Tensor, no: Tensor) -> Tensor:
+    """`torch.where`, which ONNX runtimes do not have for booleans."""
+    return (which & yes) | (~which & no) if yes.dtype == torch.bool else torch.where(which, yes, no)
 
 
 def _check_of_samples(name: str, pixels: Tensor, batch: torch.Size) -> None:
