@@ -83,3 +83,22 @@ def test_a_traced_projector_takes_other_numbers_of_pixels() -> None:
         points, valid = recorded(pixels)
         torch.testing.assert_close(points, projector(pixels)[0])
         assert bool(valid.all())
+
+
+@pytest.mark.plain  # lengths are tensors in a recording
+def test_a_recorded_top_view_is_of_other_places_too() -> None:
+    """Which part of it shows something, and how many samples a pixel takes, would be those of the example."""
+    image, extent, resolution = torch.rand(1, 48, 64, dtype=D), (-8.0, -8.0, 8.0, 8.0), 0.5
+    small = dp.Camera(K / torch.tensor([[10.0], [10], [1]], dtype=D), size=(64, 48))
+
+    def top(t: Tensor) -> Tensor:
+        return dp.rectify(image, small.at(small.R, t), dp.Plane.z(0.0), extent, resolution)[0]
+
+    def of_one(t: Tensor) -> Tensor:
+        return dp.rectify(image, small.at(small.R, t), dp.Plane.z(0.0), extent, resolution, samples=1)[0]
+
+    example, other = (torch.tensor([x, 0.0, 8], dtype=D) for x in (-4.0, 4.0))
+    for record in (traced, followed):
+        with pytest.raises(ValueError, match="samples: want how many a pixel takes"):
+            record(top, example)
+        assert (record(of_one, example)(other) - of_one(other)).abs().max() < 1e-5  # sides are float32 in a trace
