@@ -26,6 +26,9 @@ class ProjectorBank(nn.Module):
     are kinds of cameras in it; in a compiled or exported graph, which is made for any samples, each kind takes all.
     Cameras that are all of one kind need no bank: `PlaneProjector(dp.stack(cameras), ...)`.
 
+    In `DistributedDataParallel` a bank that learns wants `find_unused_parameters=True`, for kinds that a batch has no
+    sample of take no part.
+
     Args:
         cameras: at least one, each a single camera at its pose, all of one dtype on one device.
         plane: the plane that all look at.
