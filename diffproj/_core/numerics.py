@@ -7,7 +7,8 @@ Three rules live here because they are easy to break one call at a time:
   off by a pixel or more. `linear` multiplies and adds elementwise instead, which no such switch reaches, and which is
   faster for matrices this small.
 * **Values are read only where somebody can read them.** Inside `torch.compile`, `vmap` or on the meta device a tensor
-  has a shape but no values; `has_values` tells, and checks on values are skipped there.
+  has a shape but no values, and in a recording (`torch.jit.trace`) those of an example; `has_values` tells, and checks
+  on values are skipped there.
 * **Work in blocks changes no result.** `in_blocks` cuts long inputs only when no derivative of any kind is asked.
 """
 
