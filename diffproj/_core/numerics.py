@@ -7,7 +7,8 @@ Three rules live here because they are easy to break one call at a time:
   off by a pixel or more. `linear` multiplies and adds elementwise instead, which no such switch reaches, and which is
   faster for matrices this small.
 * **Values are read only where somebody can read them.** Inside `torch.compile`, `vmap` or on the meta device a tensor
-  has a shape but no values; `has_values` tells, and checks on values are skipped there.
+  has a shape but no values, and in a recording (`torch.jit.trace`) those of an example; `has_values` tells, and checks
+  on values are skipped there.
 * **Work in blocks changes no result.** `in_blocks` cuts long inputs only when no derivative of any kind is asked.
 """
 
@@ -20,7 +21,13 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import Kind, tensor_of
-from diffproj._core.torch_private import has_no_values, in_forward_mode, in_functional_transform, traced_beside
+from diffproj._core.torch_private import (
+    has_no_values,
+    in_forward_mode,
+    in_functional_transform,
+    in_recording,
+    traced_beside,
+)
 
 BLOCK_POINTS = 2**16
 """Points handled at once on a CPU when no derivative is asked: large enough to hide the cost of dispatch, small enough
@@ -113,8 +120,8 @@ def broadcast_batches(**shapes: Sequence[int]) -> torch.Size:
 
 
 def has_values(*tensors: Tensor) -> bool:
-    """Whether the values of these tensors can be read here: not while compiling, under `vmap`, or of a fake tensor."""
-    tracing = torch.compiler.is_compiling() or in_functional_transform()
+    """Whether the values of these tensors can be read here: not of a graph, under `vmap`, or of a fake tensor."""
+    tracing = torch.compiler.is_compiling() or in_functional_transform() or in_recording()
     return not (tracing or any(has_no_values(tensor) for tensor in tensors))
 
 
@@ -273,6 +280,7 @@ def wants_derivative(*tensors: Tensor) -> bool:
         torch.compiler.is_compiling()
         or in_functional_transform()
         or in_forward_mode()
+        or in_recording()
         or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors))
     )
 

@@ -12,10 +12,21 @@ from torch.utils._python_dispatch import _disable_current_modes
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
 
+_PROXY = torch._C._TorchDispatchModeKey.PROXY  # type: ignore[attr-defined]
+
 
 def in_functional_transform() -> bool:
     """Whether the code runs under a transform of `torch.func`: `vmap`, `grad`, `jvp`, ..."""
     return torch._C._functorch.peek_interpreter_stack() is not None  # type: ignore[attr-defined]
+
+
+def in_recording() -> bool:
+    """Whether the code runs in order to be recorded, as by `torch.jit.trace`, ONNX's older exporter or `make_fx`.
+
+    Values are there, but they are those of an example: what is read of them, or worked out in NumPy, would be a
+    constant of the recording.
+    """
+    return torch._C._is_tracing() or torch._C._get_dispatch_mode(_PROXY) is not None  # type: ignore[attr-defined]
 
 
 def in_forward_mode() -> bool:

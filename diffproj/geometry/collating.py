@@ -1,6 +1,7 @@
 """Joining cameras, planes, lenses and views to batches, by hand and in a `DataLoader`."""
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, MutableMapping, Sequence
 from typing import Any, TypeVar
 
 from torch.utils.data import default_collate
@@ -70,7 +71,7 @@ def _joined(samples: list[Any]) -> Any:
     first = samples[0]
     kind = type(first)
     alike = all(isinstance(sample, kind) for sample in samples)
-    if alike and isinstance(first, dict):
+    if alike and isinstance(first, Mapping):
         alike = all(sample.keys() == first.keys() for sample in samples)
     if not alike:
         raise TypeError(f"samples: want ones that are built alike, got {', '.join(map(called, samples[:3]))}")
@@ -79,8 +80,13 @@ def _joined(samples: list[Any]) -> Any:
             return stack(samples)
         except (TypeError, ValueError) as error:
             raise type(error)(str(error).replace("items:", "samples:")) from None
-    if kind is dict:
-        return {key: _joined([sample[key] for sample in samples]) for key in first}
+    if isinstance(first, Mapping):
+        joined = {key: _joined([sample[key] for sample in samples]) for key in first}
+        if kind is dict or not isinstance(first, MutableMapping):
+            return joined
+        batch = copy.copy(first)  # of its own kind, as default_collate does it
+        batch.update(joined)
+        return batch
     if isinstance(first, tuple | list):
         if any(len(sample) != len(first) for sample in samples):
             raise TypeError(f"samples: want ones that are built alike, got {kind.__name__}s of different lengths")

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from diffproj._core.numerics import block_points
-from diffproj._core.torch_private import has_no_values
+from diffproj._core.torch_private import has_no_values, in_recording
 from diffproj.geometry.grid import pixel_grid
 
 LookUp = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
@@ -55,7 +55,8 @@ def resampled(
     if samples is not None:
         total, share = _mean(source, look_up_of(None), corners, samples)
         return (total, share > 0) if samples == (1, 1) else _finished(total, share)
-    if has_no_values(like) or has_no_values(source):
+    recording = not torch.compiler.is_compiling() and in_recording()  # whose numbers would be those of its example
+    if recording or has_no_values(like) or has_no_values(source):
         raise ValueError("samples: want how many a pixel takes, got None where no values say it; samples=1 is fastest")
     with torch.no_grad():
         u, v, valid = look_up_of(None)(*_apart(corners + 0.5))

@@ -1,7 +1,8 @@
 """The plan of a lens: what is worked out once for its coefficients, so that single points cost little.
 
-In a compiled graph the plan is one opaque operation. Its hundreds of small steps would take minutes to compile, and
-the same coefficients would be worked out anew in each call.
+In a compiled or recorded graph the plan is one opaque operation. Its hundreds of small steps would take minutes to
+compile, the same coefficients would be worked out anew in each call, and a recording would take the number of steps
+from its example.
 """
 
 import threading
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from diffproj._core.numerics import in_float64
+from diffproj._core.torch_private import in_recording
 from diffproj.lens.compiling import with_batch_in_front
 from diffproj.lens.table import NODES
 
@@ -79,14 +81,18 @@ def register_recipe(kind: type, recipe: Recipe) -> str:
 def domain_of(key: str, coefficients: Tensor) -> Tensor:
     """The domain for coefficients `(*B, k)`, in their type and rounded inward; 0 for those of no use."""
     coefficients = coefficients.detach()
-    return _domain(coefficients, key) if torch.compiler.is_compiling() else _rounded(key, coefficients)
+    return _domain(coefficients, key) if _in_graph() else _rounded(key, coefficients)
 
 
 def plan_of(key: str, coefficients: Tensor, domain: Tensor) -> Plan:
     """The whole plan for coefficients `(*B, k)` and their domain, in their type."""
     coefficients = coefficients.detach()
-    rest = _rest if torch.compiler.is_compiling() else _worked_out
+    rest = _rest if _in_graph() else _worked_out
     return Plan(domain, *rest(coefficients, domain, key))
+
+
+def _in_graph() -> bool:
+    return torch.compiler.is_compiling() or in_recording()
 
 
 def _rounded(key: str, coefficients: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from diffproj.lens.models import model_of
 from diffproj.nn.partial import Learn, asked_parts
 from diffproj.nn.plane import check_one_plane
 from diffproj.nn.projector import PlaneProjector, camera_numbers
+from diffproj.nn.whole_numbers import digits_of, numbers_of
 
 
 class ProjectorBank(nn.Module):
@@ -24,6 +25,9 @@ class ProjectorBank(nn.Module):
     Cameras of one lens model and size are one `PlaneProjector`, so that a batch of samples takes as many calls as there
     are kinds of cameras in it; in a compiled or exported graph, which is made for any samples, each kind takes all.
     Cameras that are all of one kind need no bank: `PlaneProjector(dp.stack(cameras), ...)`.
+
+    In `DistributedDataParallel` a bank that learns wants `find_unused_parameters=True`, for kinds that a batch has no
+    sample of take no part.
 
     Args:
         cameras: at least one, each a single camera at its pose, all of one dtype on one device.
@@ -65,9 +69,7 @@ class ProjectorBank(nn.Module):
         kinds: dict[object, list[int]] = {}
         for number, camera in enumerate(given):
             kinds.setdefault((model_of(camera.distortion).name, camera.size), []).append(number)
-        first = given[0].K
-        with torch.inference_mode(False):  # so that a state can be loaded wherever the bank was built
-            kind_of, place_of = (torch.zeros(len(given), dtype=torch.long, device=first.device) for _ in range(2))
+        kind_of, place_of = [0] * len(given), [0] * len(given)
         projectors = []
         for kind, numbers in enumerate(kinds.values()):
             for place, number in enumerate(numbers):
@@ -77,8 +79,10 @@ class ProjectorBank(nn.Module):
                 own.pop("distortion", None)
             projectors.append(PlaneProjector(stack([given[number] for number in numbers]), plane, own, False))
         self.projectors = nn.ModuleList(projectors)
-        self.register_buffer("kind_of", kind_of)
-        self.register_buffer("place_of", place_of)
+        device, bits = given[0].device, max(1, (len(given) - 1).bit_length())
+        with torch.inference_mode(False):  # so that a state can be loaded wherever the bank was built
+            self.register_buffer("kind_of", digits_of(kind_of, device, bits))
+            self.register_buffer("place_of", digits_of(place_of, device, bits))
 
     def __len__(self) -> int:
         """The number of cameras."""
@@ -151,12 +155,13 @@ class ProjectorBank(nn.Module):
             _check_of_samples("plane", pixels, plane.batch_shape)
             plane = plane.expand(*pixels.shape[:1])
         found: list[Tensor] = []
+        kinds, places = numbers_of(self.kind_of)[chosen], numbers_of(self.place_of)[chosen]
         for kind, projector in enumerate(self.projectors):
-            own = self.kind_of[chosen] == kind
+            own = kinds == kind
             if not has_values(chosen, pixels):  # in a graph each kind takes all samples, and gives its own
-                of_kind = torch.where(own, self.place_of[chosen], 0)
+                of_kind = torch.where(own, places, 0)
                 new = work(projector, pixels, warp=warp, plane=plane, camera=of_kind)
-                found = [torch.where(_beside(own, a), a, b.to(a)) for a, b in zip(new, found or new, strict=True)]
+                found = [_either(_beside(own, a), a, b.to(a)) for a, b in zip(new, found or new, strict=True)]
                 continue
             (samples,) = own.nonzero(as_tuple=True)
             if not len(samples) and (found or len(chosen)):
@@ -164,7 +169,7 @@ class ProjectorBank(nn.Module):
             options = {
                 "warp": None if warp is None else warp[samples],
                 "plane": None if plane is None else plane[samples],
-                "camera": self.place_of[chosen[samples]],
+                "camera": places[samples],
             }
             new = work(projector, pixels[samples], **options)
             found = found or [part.new_zeros(len(chosen), *part.shape[1:]) for part in new]
@@ -178,6 +183,11 @@ class ProjectorBank(nn.Module):
 def _beside(of_samples: Tensor, values: Tensor) -> Tensor:
     """A tensor `(S,)` that broadcasts against one of more axes `(S, ...)`."""
     return of_samples.reshape(-1, *(1,) * (values.ndim - 1))
+
+
+def _either(which: Tensor, yes: Tensor, no: Tensor) -> Tensor:
+    """`torch.where`, which ONNX runtimes do not have for booleans."""
+    return (which & yes) | (~which & no) if yes.dtype == torch.bool else torch.where(which, yes, no)
 
 
 def _check_of_samples(name: str, pixels: Tensor, batch: torch.Size) -> None:

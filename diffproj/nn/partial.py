@@ -14,6 +14,7 @@ from diffproj._core.numerics import has_values
 from diffproj._core.torch_private import has_no_values
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import MODELS, model_of
+from diffproj.nn.whole_numbers import digits_of, numbers_of
 
 PARTS = ("focal", "principal_point", "distortion", "pose")
 """The parts of a camera that can be learned."""
@@ -72,7 +73,10 @@ class GeometryModule(nn.Module):
             return moved
 
         with torch.inference_mode(False):  # a module that is moved in inference mode can still be trained afterwards
-            return super()._apply(convert, recurse)
+            super()._apply(convert, recurse)
+        if "own_kind" in self.__dict__:
+            self.own_kind = self.own_kind[0], self.kind
+        return self
 
 
 def without_autocast(device: torch.device) -> AbstractContextManager[Any]:
@@ -87,7 +91,7 @@ def add_kind(module: GeometryModule, camera: Camera) -> None:
     The coefficients of a fisheye and of another lens may be as many, and one would be taken for the other.
     """
     own = (list(MODELS).index(model_of(camera.distortion).name), *(camera.size or NO_SIZE))
-    module.register_buffer("kind", torch.tensor(own, dtype=torch.int64, device=camera.device))
+    module.register_buffer("kind", digits_of(own, camera.device))
     module.own_kind = own, module.kind
     module.register_load_state_dict_pre_hook(partial(_check_kind, own))
 
@@ -112,13 +116,15 @@ def check_swapped_kind(module: GeometryModule) -> None:
 def _check_kind(own: tuple[int, ...], _: nn.Module, state: dict[str, Any], prefix: str, *rest: Any) -> None:
     """Called before `load_state_dict`, which adds the message to its own."""
     saved = state.get(f"{prefix}kind")
-    if saved is not None and has_values(saved) and (wrong := _other_kind(own, saved)):
+    if saved is None or saved.ndim != 2 or not has_values(saved):
+        return
+    if wrong := _other_kind(own, saved):
         rest[-1].append(f"{prefix}kind: {wrong}")
 
 
 def _other_kind(own: tuple[int, ...], saved: Tensor) -> str:
     """What is wrong with a state of this kind; nothing where it fits."""
-    theirs = tuple(saved.tolist())
+    theirs = tuple(numbers_of(saved).tolist())
     if theirs[0] != own[0]:
         names = dict(enumerate(MODELS))
         want, got = f"lens {names[own[0]]!r}", f"lens {names.get(theirs[0], 'of another release')!r}"

@@ -26,6 +26,7 @@ from diffproj.geometry.cayley import turned
 from diffproj.geometry.rotations import check_pose
 from diffproj.nn.camera import LearnableCamera
 from diffproj.nn.partial import OF_POSE, PARTS, GeometryModule, Learn, add_parameter, asked_parts, learned
+from diffproj.nn.whole_numbers import digits_of, numbers_of
 
 MOMENTS = "moments"
 """Among the parts to learn: the poses of the rig itself."""
@@ -84,7 +85,7 @@ class LearnableRig(GeometryModule):
         self.members = nn.ModuleList(LearnableCamera(camera, parts[name]) for name, camera in cameras.items())
         self.moments = None if moments is None else RigPoses(*_poses(moments, first), of_moments)
         text = list(json.dumps(self.names).encode())
-        self.register_buffer("spelled", torch.tensor(text, dtype=torch.uint8, device=first.device))
+        self.register_buffer("spelled", digits_of(text, first.device, bits=8))
         self.register_load_state_dict_pre_hook(partial(_check_names, self.names))
 
     def __getitem__(self, name: str) -> LearnableCamera:
@@ -222,9 +223,9 @@ def _chosen(learn: Learn | None, cameras: Mapping[str, Camera], moving: bool) ->
 def _check_names(own: tuple[str, ...], _: nn.Module, state: dict[str, Any], prefix: str, *rest: Any) -> None:
     """Called before `load_state_dict`, which adds the message to its own: a state of others."""
     saved = state.get(f"{prefix}spelled")
-    if saved is None or not has_values(saved):
+    if saved is None or saved.ndim != 2 or not has_values(saved):
         return
-    theirs = tuple(json.loads(bytes(saved.tolist())))
+    theirs = tuple(json.loads(bytes(numbers_of(saved).tolist())))
     if theirs != own:
         errors: list[str] = rest[-1]
         errors.append(

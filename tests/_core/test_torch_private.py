@@ -2,10 +2,18 @@
 
 from typing import Any
 
+import pytest
 import torch
 from torch.autograd import forward_ad
+from torch.fx.experimental.proxy_tensor import make_fx
 
-from diffproj._core.torch_private import constant_in_graphs, has_storage, in_forward_mode, in_functional_transform
+from diffproj._core.torch_private import (
+    constant_in_graphs,
+    has_storage,
+    in_forward_mode,
+    in_functional_transform,
+    in_recording,
+)
 
 
 def test_functional_transforms_are_seen() -> None:
@@ -52,6 +60,21 @@ def test_forward_mode_is_seen() -> None:
         with torch.no_grad():
             assert in_forward_mode()
     assert not in_forward_mode()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_recordings_are_seen() -> None:
+    seen = []
+
+    def function(x: torch.Tensor) -> torch.Tensor:
+        seen.append(in_recording())
+        return x + 1
+
+    function(torch.ones(2))
+    torch.jit.trace(function, (torch.ones(2),), check_trace=False)
+    make_fx(function)(torch.ones(2))
+    function(torch.ones(2))
+    assert seen == [False, True, True, False]
 
 
 def test_a_constant_is_marked_as_pytorch_marks_it() -> None:

@@ -45,6 +45,9 @@ def case(what: str, lens: str) -> tuple[torch.nn.Module, torch.Tensor]:
         return dp.PlaneProjector(camera, plane), PIXELS
     if what == "project":
         return Called(camera.project), POINTS
+    if what == "bank":
+        bank = dp.ProjectorBank([camera, dp.Camera(K, R, T + 50, LENSES[lens], (800, 480))], plane)
+        return Called(lambda pixels: bank(pixels, torch.arange(pixels.shape[0]) % 2)), PIXELS
     return Called(lambda pixels: dp.back_project(pixels, camera, plane)), PIXELS
 
 
@@ -120,6 +123,7 @@ def test_next_to_a_fold_an_exported_lens_is_right_or_not_valid() -> None:
 
 IN_ONNX = [  # each takes half a minute
     ("projector", "none"),
+    ("bank", "none"),
     ("projector", "brown14"),
     ("projector", "fisheye"),
     ("project", "brown14"),

@@ -1,5 +1,9 @@
 """Many cameras in one projector, chosen by index; parts of a pose; and batches of cameras from a `DataLoader`."""
 
+from collections import OrderedDict, UserDict, defaultdict
+from functools import partial
+from types import MappingProxyType
+
 import pytest
 import torch
 
@@ -169,3 +173,14 @@ def test_a_loader_joins_cameras(cameras: dp.Camera) -> None:
         ValueError, match=r"samples: want .* got Tensor of shape \(2, 2\), Tensor of shape \(3, 2\): stack"
     ):
         dp.collate([(torch.zeros(2, 2), 1), (torch.zeros(3, 2), 2)])
+
+
+def test_cameras_are_joined_in_dictionaries_of_any_kind(cameras: dp.Camera) -> None:
+    for kind in (OrderedDict, partial(defaultdict, list), UserDict, MappingProxyType):
+        samples = [kind({"camera": camera, "number": n}) for n, camera in enumerate(cameras)]
+        batch = dp.collate(samples)
+        assert list(batch) == ["camera", "number"]
+        assert torch.equal(batch["camera"].t, cameras.t)
+        assert batch["number"].tolist() == [0, 1, 2]
+        assert isinstance(batch, type(samples[0])) or kind is MappingProxyType
+        assert not samples[0]["camera"].batch_shape

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
-from torch.optim.swa_utils import AveragedModel
+from torch.optim.swa_utils import AveragedModel, get_ema_avg_fn, get_ema_multi_avg_fn, get_swa_multi_avg_fn
 from torch.utils.checkpoint import checkpoint
 
 import diffproj as dp
@@ -64,6 +64,31 @@ def test_an_average_of_one_network_is_that(learn: tuple[str, ...], lens_camera: 
     for found, want in zip(average(pixels), projector(pixels), strict=True):
         assert torch.equal(found, want)
     assert average.module.camera.distortion.domain == torch.inf
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"multi_avg_fn": get_ema_multi_avg_fn(0.9)},
+        {"avg_fn": get_ema_avg_fn(0.9)},
+        {"multi_avg_fn": get_swa_multi_avg_fn()},
+    ],
+)
+def test_averages_know_which_cameras_they_are_of(options: dict, lens_camera: dp.Camera, pixels: Tensor) -> None:
+    """Of whole numbers a moving average cuts off what is behind the point: 0.9 * 6 + 0.1 * 6 is 5."""
+    fisheye = dp.KannalaBrandt(torch.tensor([0.01, -0.002, 0, 0], dtype=lens_camera.dtype))
+    seen = dp.Camera(lens_camera.K, lens_camera.R, lens_camera.t, fisheye, (641, 479))
+    many = [seen.shifted([5.0 * k, 0, 0]) for k in range(8)]
+    for learn in ((), ("focal",)):
+        bank = dp.ProjectorBank([lens_camera, *many], dp.Plane.z(0.0), learn)
+        rig = dp.LearnableRig({"left": seen, "right": many[1]}, learn)
+        averages = [AveragedModel(module, use_buffers=True, **options) for module in (bank, rig)]
+        for average, module in zip(averages, (bank, rig), strict=True):
+            for _ in range(20):
+                average.update_parameters(module)
+            module.load_state_dict(average.module.state_dict())  # which is refused as another camera's
+        each, samples = list(range(9)), pixels.expand(9, *pixels.shape)
+        torch.testing.assert_close(averages[0](samples, each)[0], bank(samples, each)[0])
 
 
 @pytest.mark.parametrize("reentrant", [True, False])
