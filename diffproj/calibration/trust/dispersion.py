@@ -59,22 +59,25 @@ SINGULAR = 1e-9
 """Eigenvalue of K_v, relative to the largest, below which the view says nothing in this direction."""
 
 
-def dispersion(found: Fit) -> Tensor:
+def dispersion(found: Fit, pulls: "Pulls | None" = None) -> Tensor:
     """The factor `(P,)`, at least 1, on the covariance that independent corners would give.
 
     1 where it is not known: with one view, or where no shared parameter is free.
+
+    Args:
+        found: the fit.
+        pulls: those of its views, where they are known already.
     """
     task, solution = found.task, found.solution
     shared, local = solution.shared.detach(), tuple(z.detach() for z in solution.local)
-    free = shared.shape[-1] if task.basis is None else task.basis.shape[-1]
-    if free == 0 or task.used.shape[1] < 2:
+    if not _views_tell(task):
         return torch.ones_like(shared[:, 0])
     few_views = FEW_VIEWS_OF_A_SHAPE if task.free and not task.surveyed else FEW_VIEWS
     with torch.inference_mode():
-        if task.free:
+        pulls = pulls_of(found) if pulls is None else pulls
+        if pulls is None:
             factor = believed(_moved_intrinsics(found, shared, local), few_views)
         else:
-            pulls = pulls_of(found)
             told = contradiction(*pulls)
             if task.basis is None or bool((task.basis[:, : len(INTRINSICS)] != 0).any()):
                 told = _more(told, _of_intrinsics(pulls, task.basis))
@@ -119,9 +122,17 @@ class Pulls(NamedTuple):
     pull: Tensor
 
 
-def pulls_of(found: Fit) -> Pulls:
-    """Those of all views of a fit whose target's points are not free."""
+def _views_tell(task: Task) -> bool:
+    """Whether some views could contradict each other."""
+    return (task.basis is None or task.basis.shape[-1] > 0) and task.used.shape[1] > 1
+
+
+@torch.inference_mode()
+def pulls_of(found: Fit) -> Pulls | None:
+    """Those of all views; `None` where they tell nothing, or the target's points are free."""
     task, solution = found.task, found.solution
+    if task.free or not _views_tell(task):
+        return None
     shared, local = solution.shared.detach(), tuple(z.detach() for z in solution.local)
     rows, residual, pull_weight, variance = _weighted(task, shared, local, found.degrees_of_freedom())
     s = shared.shape[-1]

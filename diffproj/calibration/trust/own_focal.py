@@ -37,10 +37,11 @@ from diffproj.calibration.trust.dispersion import (
     contradiction,
     in_own_units,
     left_of_noise,
-    pulls_of,
 )
 from diffproj.calibration.trust.leftover import f_deviations
 
+FEWEST = 3
+"""Views from which on they are compared."""
 LEAST_SPARE = 0.5
 """Degrees of freedom that two views or fewer which tell it count as."""
 CLEAR = 4.0
@@ -73,14 +74,15 @@ class OwnFocal(NamedTuple):
         return (self.ratio > ALONE) & (self.deviations > CLEAR)
 
 
-def with_own_focal(whole: Covariance, found: Fit) -> Covariance:
+def with_own_focal(whole: Covariance, found: Fit, pulls: Pulls | None) -> Covariance:
     """The covariance with the variance that focal lengths get where they differ from view to view.
 
     Args:
         whole: without it.
         found: the fit, of which nobody said how large its noise is.
+        pulls: those of its views, if they tell anything.
     """
-    own = own_focal(found, whole.dispersion.detach())
+    own = own_focal(found, whole.dispersion.detach(), pulls)
     if own is None or not bool((own.variance > 0).any()):
         return whole
     more, basis = own.more, found.task.basis
@@ -89,20 +91,21 @@ def with_own_focal(whole: Covariance, found: Fit) -> Covariance:
     return replace(whole, shared=whole.shared + torch.where(known, more, 0.0))
 
 
-def own_focal(found: Fit, phi: Tensor) -> OwnFocal | None:
+def own_focal(found: Fit, phi: Tensor, pulls: Pulls | None) -> OwnFocal | None:
     """By how much focal lengths differ; `None` where they are held, or the target's points are free.
 
     Args:
         found: the fit.
         phi: its dispersion `(P,)`.
+        pulls: those of its views, if they tell anything.
     """
-    if found.task.free or found.task.used.shape[1] < 3:
+    if pulls is None or found.task.used.shape[1] < FEWEST:
         return None
     with torch.inference_mode():
         along = _along(found)
         if not bool((along != 0).any()):
             return None
-        pulls, task = pulls_of(found), found.task
+        task = found.task
         same = None if task.shares is None else alike(task.points, task.pixels, task.used).to(along)
         told = _told(pulls, along, same, contradiction(*pulls), phi)
     return OwnFocal(*(part.clone() for part in told))

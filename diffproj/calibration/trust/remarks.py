@@ -28,7 +28,7 @@ from diffproj.calibration.trust.adequacy import (
     wants_skew,
 )
 from diffproj.calibration.trust.discounted import discounted
-from diffproj.calibration.trust.dispersion import dispersion
+from diffproj.calibration.trust.dispersion import dispersion, pulls_of
 from diffproj.calibration.trust.entangled import DENOMINATOR, Entangled, Simpler
 from diffproj.calibration.trust.leftover import Leftover, leftover
 from diffproj.calibration.trust.own_focal import OwnFocal, own_focal
@@ -121,7 +121,8 @@ def remarks(
         # What is known beforehand and does not fit holds the camera where turned photographs would fit better.
         turned = turned_photographs(found, which[~found.has_prior()[which]], sizes)
         small = SmallEffects(found, which, left, of_landmarks)
-        own = own_focal(found, dispersion(found))
+        pulls = pulls_of(found)
+        own = own_focal(found, dispersion(found, pulls), pulls)
         for i, p in enumerate(map(int, which.tolist())):
             saved = groups[p].saved if p in groups else 0.0
             if p in turned and turned[p].saved > max(

@@ -25,7 +25,7 @@ from diffproj.calibration.least_squares.normal_equations import Equations
 from diffproj.calibration.results import covariance as covariances
 from diffproj.calibration.results.covariance import Covariance, Scores
 from diffproj.calibration.trust.corner_scores import CornerScores, state_of
-from diffproj.calibration.trust.dispersion import dispersion
+from diffproj.calibration.trust.dispersion import dispersion, pulls_of
 from diffproj.calibration.trust.noise import Noise, with_known
 from diffproj.calibration.trust.noisy_views import widened_poses
 from diffproj.calibration.trust.own_focal import with_own_focal
@@ -40,9 +40,10 @@ def covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = N
         known: the noise that a calibration before had, where the shared parameters are held.
         phi: and its dispersion `(P,)`; that of the fit if left out.
     """
-    whole = pooled_covariance_of(found, known, phi)
-    # A noise that was given is the whole error.
-    return whole if phi is not None or found.knows_noise else with_own_focal(whole, found)
+    if phi is not None or found.knows_noise:  # a noise that was given is the whole error
+        return pooled_covariance_of(found, known, phi)
+    pulls = pulls_of(found)
+    return with_own_focal(pooled_covariance_of(found, known, dispersion(found, pulls)), found, pulls)
 
 
 def pooled_covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = None) -> Covariance:

@@ -8,7 +8,7 @@ import diffproj as dp
 from diffproj import synthetic
 from diffproj.calibration.fitting.options import calibration_options
 from diffproj.calibration.one_lens import fitted
-from diffproj.calibration.trust.dispersion import dispersion
+from diffproj.calibration.trust.dispersion import dispersion, pulls_of
 from diffproj.calibration.trust.own_focal import own_focal
 
 from .smooth_errors import seen_at_random, with_smooth_errors
@@ -110,7 +110,7 @@ def test_what_is_added_is_what_views_move_that_focus_anew(options: dict) -> None
     """Against cameras that are calibrated from what they see, with one view's focal length a little longer."""
     chosen = calibration_options("calibrate", {**options, "tolerance": 1e-16})
     _, found = fitted(refocused(1, 6, 0.02, noise=0.02), BOARD, "brown5", chosen)
-    own = own_focal(found, dispersion(found))
+    own = own_focal(found, dispersion(found), pulls_of(found))
     assert own is not None
     assert float(own.variance) > 0
     basis = found.task.basis
