@@ -28,13 +28,14 @@ from diffproj.calibration.trust.adequacy import (
     wants_skew,
 )
 from diffproj.calibration.trust.discounted import discounted
-from diffproj.calibration.trust.entangled import DENOMINATOR, Entangled, Simpler
+from diffproj.calibration.trust.entangled import Entangled, Simpler
 from diffproj.calibration.trust.leftover import Leftover, leftover
 from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
 from diffproj.calibration.trust.prior_weight import Elsewhere, weighed_anew
 from diffproj.calibration.trust.small_effects import SmallEffects
 from diffproj.calibration.trust.turned_photographs import Turned, turned_photographs
 from diffproj.calibration.trust.two_groups import TwoGroups, two_groups
+from diffproj.lens.models import DENOMINATOR
 
 UNSURE = 0.1
 """Deviation of a focal length, relative to it, from which on it is known roughly."""
