@@ -17,6 +17,11 @@ from diffproj.targets.residuals import nearest_minus_known, projected_minus_seen
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
+LEAST_CORNERS = 4
+"""That tell a pose; views of fewer take no part."""
+THIN = 1e-2
+"""Width of points, relative to their length, below which they lie on a line."""
+
 
 class Errors(NamedTuple):
     """Errors of k refits in each of V views `(k, V)`: sums of squares in pixels and in world units, and numbers.
@@ -58,6 +63,51 @@ def folds_of(views: Views, folds: int) -> Tensor:
     return torch.arange(len(views), device=views.device) % folds == torch.arange(folds, device=views.device)[:, None]
 
 
+class Half(NamedTuple):
+    """Half of the corners of each view, from which its pose is told, and the other one, on which it is evaluated.
+
+    Attributes:
+        hidden: corners that tell no pose `(V, N)`; all of a view whose half lies on a line.
+        evaluated: the other half `(V, N)`.
+    """
+
+    hidden: Tensor
+    evaluated: Tensor
+
+
+def halves(views: Views, points: Tensor) -> tuple[Half, Half]:
+    """Every second corner of each view, and the others, each to be evaluated with the pose that the other half tells.
+
+    Of a board seen in part, every second corner may lie on a line, which tells no pose: of two columns, where rows have
+    an even number of corners. Then the visible corners are taken in another order: the first, not the next two, the
+    next two, and so on. Where even that does not help, no pose is told from that half.
+
+    Args:
+        views: `(V, N)`, without batch axes.
+        points: of the target `(N, 3)`.
+    """
+    visible, points = views.visible, points.to(views.device, torch.float64)
+    every_second = (torch.arange(len(points), device=views.device) % 2 == 1).expand(visible.shape)
+    order = visible.long().cumsum(-1) % 4
+    in_pairs = (order == 2) | (order == 3)
+
+    def telling(half: Tensor) -> Tensor:
+        return (half.sum(-1) < LEAST_CORNERS) | ~_on_a_line(points, half)
+
+    usual = telling(visible & every_second) & telling(visible & ~every_second)
+    second = torch.where(usual.unsqueeze(-1), every_second, in_pairs)
+    return tuple(Half(out | ~telling(visible & ~out).unsqueeze(-1), out) for out in (second, ~second))  # type: ignore[return-value]
+
+
+def _on_a_line(points: Tensor, some: Tensor) -> Tensor:
+    """Where some of the points `(V, N)` lie on a line `(V,)`."""
+    weight = some.to(points).unsqueeze(-1)
+    count = weight.sum(-2, keepdim=True).clamp(min=1)
+    off = weight * (points - (weight * points).sum(-2, keepdim=True) / count)
+    spread = torch.linalg.eigvalsh(off.mT @ off)
+    return spread[..., 1] < THIN**2 * spread[..., 2]
+
+
 def without_views(
     views: Views,
     target: Target,
@@ -75,15 +125,15 @@ def without_views(
     every = repeated(views, len(out))
     fits = calibrated(every.hiding(_corners(out, every)), target, distortion, chosen, who)
     held_out = every.hiding(_corners(~out, every))
-    second = _second(views)
     errors = []
     posing: dict[str, Any] = {"loss": chosen.loss if chosen.objective == "image" else None, "throw": False}
-    for hidden in (second, ~second):
+    for half in halves(views, target.points):
+        hidden = half.hidden.expand(every.visible.shape)
         located = located_without_warning(held_out.hiding(hidden), target, fits.camera, fits, **posing)
         if bool((located.covariance.undetermined_views & located.used.any(-1)).any()):
             raise CalibrationError(f"{who}: a view that was held out has no pose: {located.message}", located)
         posed = located.used.any(-1, keepdim=True)
-        errors.append(errors_of(located, every.pixels, held_out.hiding(~hidden).visible & posed, measure))
+        errors.append(errors_of(located, every.pixels, held_out.visible & half.evaluated & posed, measure))
     return fits, errors[0].plus(errors[1])
 
 
@@ -92,10 +142,9 @@ def without_corners(
 ) -> tuple[Calibration, Errors]:
     """Two refits, each to every second corner of the views, and their errors on the others; see `without_views`."""
     every = repeated(views, 2)
-    second = _second(views)
-    out = torch.stack([second, ~second])[:, None].expand(every.visible.shape)
-    fits = calibrated(every.hiding(out), target, distortion, chosen)
-    return fits, errors_of(fits, every.pixels, every.visible & out & fits.used.any(-1, keepdim=True), measure)
+    hidden, evaluated = (torch.stack(masks) for masks in zip(*halves(views, target.points), strict=True))
+    fits = calibrated(every.hiding(hidden), target, distortion, chosen)
+    return fits, errors_of(fits, every.pixels, every.visible & evaluated & fits.used.any(-1, keepdim=True), measure)
 
 
 def errors_of(calibration: Calibration, pixels: Tensor, evaluated: Tensor, measure: Loss | None = None) -> Errors:
@@ -115,10 +164,6 @@ def errors_of(calibration: Calibration, pixels: Tensor, evaluated: Tensor, measu
     in_px = torch.where(evaluated & ~seen, torch.inf, squared if measure is None else measure.value(squared)).sum(-1)
     in_world = torch.where(evaluated & ~landed, torch.inf, world.square().sum(-1)).sum(-1)
     return Errors(in_px, in_world, evaluated.sum(-1), (evaluated & ~(seen & landed)).sum(-1))
-
-
-def _second(views: Views) -> Tensor:
-    return torch.arange(views.pixels.shape[-2], device=views.device) % 2 == 1
 
 
 def _corners(which: Tensor, views: Views) -> Tensor:

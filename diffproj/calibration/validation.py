@@ -86,8 +86,9 @@ def cross_validate(
 
     The pose of a held-out view is estimated from every second corner and evaluated on the others, then with the roles
     exchanged, so that no corner is evaluated with a pose that it contributed to. (A view with fewer than 4 such corners
-    is not evaluated.) A target's shape is that of the views of the fit alone. With `reject_outliers`, what the fit to
-    all views rejects is left out first: such a corner is wrong, and tells nothing of the camera.
+    is not evaluated, nor one where they lie on a line.) A target's shape is that of the views of the fit alone. With
+    `reject_outliers`, what the fit to all views rejects is left out first: such a corner is wrong, and tells nothing of
+    the camera.
 
     Args:
         views: corners `(V, N, 2)` of one camera; view i is left out of fit i mod k.

@@ -20,6 +20,8 @@ from diffproj.lens.names import LensModel
 from diffproj.lens.protocol import Lens
 
 T = TypeVar("T")
+DENOMINATOR = ("k4", "k5", "k6")
+"""The terms below the line of a rational lens."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,11 @@ class Model:
     def count(self) -> int:
         """The number of coefficients."""
         return len(self.coefficient_names)
+
+    @property
+    def below(self) -> tuple[str, ...]:
+        """The terms below the line of a rational lens, by name; of another lens none (a fisheye's k4 is another)."""
+        return tuple(name for name in DENOMINATOR if name in self.coefficient_names) if self.perspective else ()
 
     def lens(self, coefficients: Tensor) -> CoefficientLens | None:
         """The lens with coefficients `(*B, count)`, without a look at their values."""

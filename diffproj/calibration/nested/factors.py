@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.fitting.task import Task
-from diffproj.calibration.trust.entangled import DENOMINATOR
+from diffproj.lens.models import DENOMINATOR
 
 FACTORS = ((30.0, 225.0), (3.0, 2.25))
 """Terms in r^2 and r^4, with r in half diagonals of the image, of factors above and below the line: squares of positive

@@ -31,9 +31,9 @@ from diffproj.calibration.least_squares.solver import Prior
 from diffproj.calibration.nested.compared import costs, put, unrestrained_cost
 from diffproj.calibration.nested.factors import FACTORS, with_factor
 from diffproj.calibration.problem.parametrisation import INTRINSICS, Pose
-from diffproj.calibration.trust.entangled import DENOMINATOR
 from diffproj.calibration.trust.reach import folds_at_corners, reach_of
 from diffproj.lens.brown_domain import RADIUS_POWERS
+from diffproj.lens.models import DENOMINATOR, MODELS
 
 FIRST = 1.0
 """Deviation to which the terms below the line are held at first: what each adds to the denominator half an image's
@@ -85,7 +85,7 @@ def restrained(
         tolerance: of the solver.
     """
     task, names = found.task, found.task.names
-    below = [names.index(name) for name in DENOMINATOR if name in names]
+    below = [names.index(name) for name in MODELS[task.lens].below]
     if task.basis is not None:
         below = [i for i in below if bool(task.basis[:, i].any())]
     spare = found.degrees_of_freedom().to(found.solution.cost)
@@ -217,7 +217,7 @@ def unfolded(
     They are drawn to their terms of the fit to the flat target, which did not fold. Other cameras stay to the bit.
     """
     shared, task = flat.solution.shared, freed.task
-    if not any(name in task.names for name in DENOMINATOR):
+    if not MODELS[task.lens].below:
         return freed
     rows = folds_at_corners(task, freed.solution.shared, freed.solution.local).nonzero().flatten()
     if len(rows) == 0:

@@ -35,9 +35,8 @@ from diffproj.calibration.nested.side_by_side import Lane, side_by_side
 from diffproj.calibration.nested.tilt_twin import lower_valley
 from diffproj.calibration.outcome import Begun, begun
 from diffproj.calibration.problem.parametrisation import SKEW, Parametrisation, Pose
-from diffproj.calibration.trust.entangled import DENOMINATOR
 from diffproj.calibration.trust.reach import folds_at_corners, reach_of
-from diffproj.lens.models import MODELS
+from diffproj.lens.models import DENOMINATOR, MODELS
 
 SHORT = 5
 """Coefficients up to which a lens is fitted at once."""

@@ -22,7 +22,7 @@ from diffproj.calibration.rigs.problem import RigProblem
 from diffproj.calibration.rigs.start import RigStart
 from diffproj.calibration.rigs.together import Refinement, Wanted
 from diffproj.calibration.rigs.views import RigViews
-from diffproj.calibration.trust.entangled import DENOMINATOR
+from diffproj.lens.models import MODELS
 
 READMITTED = 10.0
 """RMS residuals of all views up to which a view that was set apart fits after all."""
@@ -140,7 +140,7 @@ def _below(parameters: RigParameters) -> dict[str, list[int]]:
     found = {}
     for c, (name, kind) in enumerate(zip(parameters.cameras, parameters.kinds, strict=True)):
         start = parameters.intrinsics(c).start
-        found[name] = [start + kind.names.index(term) for term in DENOMINATOR if term in kind.names]
+        found[name] = [start + kind.names.index(term) for term in MODELS[kind.lens].below]
     return found
 
 

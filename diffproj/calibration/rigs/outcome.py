@@ -37,7 +37,8 @@ def rig_outcome(found: RigFit, alone: Mapping[str, Alone]) -> RigCalibration:
     """The calibrated rig."""
     views, names = found.views, found.views.names
     noise = camera_noise(found)
-    joint, wrong = _Late(found, noise), discounted(found, noise)
+    wrong = discounted(found, noise)
+    joint = _Late(found, noise, wrong)
     R, t = found.problem.cameras(found.shared)
     cameras, calibrations = {}, {}
     fingerprint = hashlib.blake2b(found.shared.cpu().numpy().tobytes(), digest_size=12).hexdigest()
@@ -113,8 +114,8 @@ def bow_of(found: RigFit) -> Tensor | None:
 class _Late:
     """The joint covariance, and what the corners of a view have in common, computed once, when it is asked for."""
 
-    def __init__(self, found: RigFit, noise: CameraNoise) -> None:
-        self.found, self.noise = found, noise
+    def __init__(self, found: RigFit, noise: CameraNoise, wrong: Mapping[str, Tensor] | None) -> None:
+        self.found, self.noise, self.wrong = found, noise, wrong
         self.known: Covariance | None = None
 
     @cached_property
@@ -125,7 +126,7 @@ class _Late:
 
     def __call__(self) -> Covariance:
         if self.known is None:
-            self.known = rig_covariance(self.found, self.noise, self.common)
+            self.known = rig_covariance(self.found, self.noise, self.common, self.wrong)
             self.found.problem.forget()
         return self.known
 

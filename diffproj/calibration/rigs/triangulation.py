@@ -31,6 +31,7 @@ from diffproj._core.shown import Shown
 from diffproj._core.shown import number as shown
 from diffproj._core.warn import warn_caller
 from diffproj.calibration.results.mismatch import CameraDisagreementWarning
+from diffproj.calibration.rigs.curved import curved
 from diffproj.calibration.rigs.extrapolation import Rig, beyond_corners, stretch
 from diffproj.geometry.cayley import cross_matrix
 from diffproj.geometry.grid import warn_if_off_image
@@ -52,13 +53,16 @@ class Triangulation(Shown, Copied):
     Attributes:
         points: `(N, 3)` in world units; 0 where not valid.
         valid: where at least two cameras see the point, in front of them, from different directions `(N,)`.
-        covariance: of each point `(N, 3, 3)`, in squared world units: of its pixels and the rig; NaN if not valid, and
-            infinite where an extrapolated lens may end before the pixel.
+        covariance: of each point `(N, 3, 3)`, in squared world units, to first order: of its pixels and the rig; NaN if
+            not valid, and infinite where an extrapolated lens may end before the pixel.
         residuals: projected minus seen pixels, by camera, `(N, 2)`; 0 where a camera does not see the point.
         disagrees: where the residuals are larger than noise and rig explain, as where a camera's pixel is that of
             another point `(N,)`. The covariance there is as much larger as it takes to explain them.
         extrapolated: seen by a camera outside of the region that its corners covered `(N,)`, where the lens model is
             extrapolated. The covariance holds what the calibration leaves open there, as long as lens and camera agree.
+        nonlinear: where deviations mislead `(N,)`, for the rays are nearly parallel: the point may lie much further off
+            than `deviations` say, up to infinity, while the direction to it is as sure as they say. Cameras further
+            apart, or less noise, tell it.
     """
 
     points: Float[Tensor, "n 3"]
@@ -67,6 +71,7 @@ class Triangulation(Shown, Copied):
     residuals: dict[str, Float[Tensor, "n 2"]]
     disagrees: Bool[Tensor, " n"]
     extrapolated: Bool[Tensor, " n"]
+    nonlinear: Bool[Tensor, " n"]
     _by_rig: Tensor  # derivative of the points by a root of the rig's covariance (N, 3, s)
     _of_pixels: Tensor  # covariance of the pixels' noise alone (N, 3, 3)
 
@@ -110,6 +115,7 @@ class Triangulation(Shown, Copied):
         columns = {name: points[:, i].tolist() for i, name in enumerate("xyz")}
         columns |= {f"{name}_deviation": self.deviations[:, i].tolist() for i, name in enumerate("xyz")}
         flags = {"valid": self.valid, "disagrees": self.disagrees, "extrapolated": self.extrapolated}
+        flags["nonlinear"] = self.nonlinear
         return columns | {name: flag.tolist() for name, flag in flags.items()}
 
     def _facts(self) -> list[str]:
@@ -120,6 +126,7 @@ class Triangulation(Shown, Copied):
             f"deviation {shown(size, '.3g')}",
             f"{int(self.disagrees.sum())} doubtful" if bool(self.disagrees.any()) else "",
             f"{int(self.extrapolated.sum())} extrapolated" if bool(self.extrapolated.any()) else "",
+            f"{int(self.nonlinear.sum())} nonlinear" if bool(self.nonlinear.any()) else "",
         ]
 
     def _columns(self) -> dict[str, list[Any]]:
@@ -163,9 +170,10 @@ def triangulated(rig: Rig, pixels_by_camera: Any, pixel_sigma: Any) -> Triangula
     inverse = torch.where(unknown[:, None, None], torch.diag_embed(torch.full_like(X, torch.inf)), inverse)
     inverse = torch.where(valid[:, None, None], scale[:, None, None] * inverse, torch.nan)
     covariance = inverse + by_rig @ by_rig.mT
+    nonlinear = curved(rig.cameras, X, whole, slopes, covariance)
     points = torch.where(valid.unsqueeze(-1), X, 0.0)
     left = {name: torch.where(valid.unsqueeze(-1), residuals[name], 0.0) for name in pixels}
-    return Triangulation(points, valid, covariance, left, disagrees, extrapolated, by_rig, inverse)
+    return Triangulation(points, valid, covariance, left, disagrees, extrapolated, nonlinear, by_rig, inverse)
 
 
 def _disagreement(

@@ -7,11 +7,13 @@ each camera's share. With s_c the noise of camera c, and all views of a moment o
     H = sum_c sum w J^T J       M = sum_c s_c^2 sum w J^T J       covariance = phi H^-1 M H^-1
 
 where the corners of a camera clearly scatter more at a moment than at others, their own noise stands for s_c there
-(`noisy_views.py`); phi is the dispersion (`dispersion.py`): how much the moments contradict each other. Errors that all
-corners of a view share are a part of M of their own (`common_errors.py`), and phi multiplies the corners' part by what
-these leave of the dispersion.
+(`noisy_views.py`). A corner that a robust loss holds for wrong counts as if it had not been seen, but for what the loss
+lets through of its pull, so that a moment of few corners has the covariance of the right ones. phi is the dispersion
+(`dispersion.py`): how much the moments contradict each other. Errors that all corners of a view share are a part of M
+of their own (`common_errors.py`), and phi multiplies the corners' part by what these leave of the dispersion.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -25,6 +27,7 @@ from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.results.covariance import Covariance, Scores, covariance, points_turned, reshaped
 from diffproj.calibration.rigs.common_errors import CommonErrors
 from diffproj.calibration.rigs.fit import RigFit
+from diffproj.calibration.rigs.problem import RigProblem
 from diffproj.calibration.trust.dispersion import FEW_VIEWS, FEW_VIEWS_OF_A_SHAPE, believed, contradiction
 from diffproj.calibration.trust.noisy_views import beyond_chance
 from diffproj.geometry.cayley import cross_matrix
@@ -164,17 +167,34 @@ def unseen(found: RigFit) -> Tensor | None:
     return torch.nn.functional.pad(found.restraint.unknown, (found.parameters.few, 0))
 
 
-def rig_covariance(found: RigFit, noise: CameraNoise, common: CommonErrors | None) -> Covariance:
-    """The joint covariance, without batch axes; poses are the target's in the rig."""
-    problem, state = found.problem, (found.shared, found.local, None)
-    H, known = found.curvature(noise.bend), problem.precision(found.shared)
+def rig_covariance(
+    found: RigFit, noise: CameraNoise, common: CommonErrors | None, wrong: Mapping[str, Tensor] | None = None
+) -> Covariance:
+    """The joint covariance, without batch axes; poses are the target's in the rig.
+
+    Args:
+        found: the fit.
+        noise: of its cameras.
+        common: errors that all corners of a view share.
+        wrong: corners that a robust loss holds for wrong `(V_c, N)`, by camera.
+    """
+    state = found.shared, found.local, None
+    known = found.problem.precision(found.shared)
     scale = (noise.variance * noise.inflation).nan_to_num(0.0)
-    _, M = problem.totals(*state, scale=scale, by_moment=True)
+    _, M = found.problem.totals(*state, scale=scale, by_moment=True)
     phi, of_corners = _dispersion(found, M, None if common is None else common.scores)
-    noisy = noisy_moments(found, noise)
-    if bool((noisy > 1).any()):
-        _, M = problem.totals(*state, scale=scale.unsqueeze(-1) * noisy, by_moment=True)
+    pulls = None
+    if wrong is not None and any(bool(part.any()) for part in wrong.values()):
+        pulls = wrong_pulls(found, wrong)
+        found = without(found, wrong)
+        noise = camera_noise(found)
+        scale = (noise.variance * noise.inflation).nan_to_num(0.0)
+    H, noisy = found.curvature(noise.bend), noisy_moments(found, noise)
+    if pulls is not None or bool((noisy > 1).any()):
+        _, M = found.problem.totals(*state, scale=scale.unsqueeze(-1) * noisy, by_moment=True)
     scores = Scores(M.U, M.E, M.W)
+    if pulls is not None:
+        scores = Scores(*(a + b for a, b in zip(scores, pulls, strict=True)))
     if common is not None:  # of all dispersion, the part that common errors do not explain is the corners'
         scores = Scores(*((of_corners * a + b) / phi for a, b in zip(scores, common.scores, strict=True)))
     precision = (
@@ -199,6 +219,32 @@ def rig_covariance(found: RigFit, noise: CameraNoise, common: CommonErrors | Non
         found_one = points_turned(found_one, axes.mT, found.parameters.few + 2 * found.parameters.bow)
     R, _ = found.views.frame.world_pose(found.local[0][0], found.local[1][0])
     return replace(reshaped(found_one, ()), middle=middle, _arm=R @ middle)
+
+
+def without(found: RigFit, wrong: Mapping[str, Tensor]) -> RigFit:
+    """The fit as if some corners `(V_c, N)` had not been seen, at the minimum with them."""
+    used = {name: part & ~wrong[name] for name, part in found.used.items()}
+    problem = RigProblem(found.views, found.parameters, found.problem.base[0], used, found.problem.known)
+    return replace(found, problem=problem, used=used)
+
+
+def wrong_pulls(found: RigFit, wrong: Mapping[str, Tensor]) -> Scores:
+    """What a robust loss lets through of the pulls of wrong corners `(V_c, N)`, as a part of the scores' covariance.
+
+    They count by their own size, taken to be of any direction.
+    """
+    views, loss = found.views, found.loss
+    strength = found.shared.new_zeros(len(views.names), len(views.moments))
+    for c, (name, residual) in enumerate(found.by_camera.items()):
+        if loss is None:
+            continue
+        squared, weights = residual.square().sum(-1), views.data[name].weights
+        pull = squared * slope_and_bend(loss, squared)[0].square() / 2
+        pull = (pull if weights is None else pull * weights[0]) * wrong[name]
+        strength[c, views.where[name]] = pull.sum(-1) / wrong[name].sum(-1).clamp(min=1)
+    problem = RigProblem(views, found.parameters, found.problem.base[0], wrong)
+    _, M = problem.totals(found.shared, found.local, None, scale=strength, by_moment=True)
+    return Scores(M.U, M.E, M.W)
 
 
 def noisy_moments(found: RigFit, noise: CameraNoise) -> Tensor:

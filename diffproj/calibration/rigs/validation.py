@@ -10,7 +10,8 @@ from torch import Tensor
 
 from diffproj._core.arguments import whole_number
 from diffproj._core.shown import Shown
-from diffproj.calibration.held_out import table_of_folds
+from diffproj.calibration.held_out import LEAST_CORNERS, halves, table_of_folds
+from diffproj.calibration.least_squares.losses import Loss
 from diffproj.calibration.locate import located
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.rigs.one import rig_calibrated, rig_task
@@ -37,8 +38,9 @@ class _Errors(NamedTuple):
 
     @property
     def rms(self) -> tuple[float, float]:
-        count = max(1, self.number)
-        return (self.px / count) ** 0.5, (self.world / count) ** 0.5
+        if self.number == 0:  # no corner to say so of, which is not an error of 0
+            return torch.nan, torch.nan
+        return (self.px / self.number) ** 0.5, (self.world / self.number) ** 0.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,9 +48,9 @@ class RigCrossValidation(Shown):
     """Errors of k refits of a rig at the moments that they were fitted to, and at those held out, over all cameras.
 
     Attributes:
-        fits: the k refits.
+        fits: the k refits. Of those that did not converge, with `throw=False`, all errors are infinite.
         in_sample_px: RMS reprojection error of the fitted corners in pixels `(k,)`.
-        held_out_px: the same at the held-out moments `(k,)`.
+        held_out_px: the same at the held-out moments `(k,)`; NaN where no view there had corners enough to say so.
         in_sample_world: RMS error of the fitted corners, back-projected onto the target, in world units `(k,)`.
         held_out_world: the same at the held-out moments `(k,)`.
     """
@@ -91,7 +93,9 @@ def cross_validate_rig(
 
     At a held-out moment the target is located with the rig from every second corner of all cameras together, and
     evaluated on the others, then with the roles exchanged, so that no corner is evaluated with a pose that it
-    contributed to. With `reject_outliers`, what the fit to all moments rejects is left out first.
+    contributed to. (Of a view, these have to be 4 that do not lie on a line.) A view that contradicts the others at its
+    moment counts no more than `calibrate_rig` counts it. With `reject_outliers`, what the fit to all moments rejects is
+    left out first.
 
     Args:
         views_by_camera: corners by the camera's name, as for `calibrate_rig`; moment i is left out of fit i mod k.
@@ -131,12 +135,16 @@ def cross_validate_rig(
         kept = {name: views.hiding(_every_corner(views, out[name])) for name, views in views_by_camera.items()}
         fit = rig_calibrated(rig_task(kept, target, distortion, labels, cameras, chosen, who))
         fits.append(fit)
+        if not fit.converged:  # with throw=False
+            inside.append((torch.inf, torch.inf))
+            outside.append((torch.inf, torch.inf))
+            continue
         errors = _Errors()
         for one in fit.calibrations.values():
             errors = errors.plus(_errors(one, one.used))
         inside.append(errors.rms)
         held = {name: views.hiding(_every_corner(views, ~out[name])) for name, views in views_by_camera.items()}
-        outside.append(_held_out(fit, held, target, labels, who).rms)
+        outside.append(_held_out(fit, held, target, labels, chosen.loss, who).rms)
     like = whole.points
     columns = [like.new_tensor([row[i] for row in rows]) for i in (0, 1) for rows in (inside, outside)]
     return RigCrossValidation(tuple(fits), *columns)
@@ -148,28 +156,33 @@ def _every_corner(views: Views, which: Tensor) -> Tensor:
 
 
 def _held_out(
-    fit: RigCalibration, held: Mapping[str, Views], target: Target, labels: Mapping[str, list[str]], who: str
+    fit: RigCalibration,
+    held: Mapping[str, Views],
+    target: Target,
+    labels: Mapping[str, list[str]],
+    loss: Loss | None,
+    who: str,
 ) -> _Errors:
-    """Errors at moments that were held out, by two halves of the corners in turn."""
+    """Errors at moments that were held out, by two halves of the corners in turn, with poses by the loss of the fit."""
+    posing: dict[str, Any] = {"loss": loss, "throw": False}
     total = _Errors()
-    odd = torch.arange(next(iter(held.values())).visible.shape[-1], device=fit.t_target.device) % 2 == 1
-    for hidden in (odd, ~odd):
-        halves = {name: views.hiding(hidden) for name, views in held.items()}
-        seen = {name: views for name, views in halves.items() if bool((views.visible.sum(-1) >= 4).any())}
+    both = {name: halves(views, target.points) for name, views in held.items()}
+    for i in (0, 1):
+        half = {name: views.hiding(both[name][i].hidden) for name, views in held.items()}
+        seen = {name: views for name, views in half.items() if bool((views.visible.sum(-1) >= LEAST_CORNERS).any())}
         found: dict[str, Calibration] = {}
         if len(seen) == 1:
             name = next(iter(seen))
-            found[name] = located(
-                seen[name], target, fit.cameras[name].without_pose(), fit.calibrations[name], throw=False
-            )
+            camera = fit.cameras[name].without_pose()
+            found[name] = located(seen[name], target, camera, fit.calibrations[name], **posing)
         elif seen:
-            chosen = rig_options(who, {"fixed": ("rig", "intrinsics"), "throw": False})
+            chosen = rig_options(who, {"fixed": ("rig", "intrinsics"), **posing})
             known = {name: fit.cameras[name] for name in seen}
             theirs = {name: labels[name] for name in seen}
             moved = None if fit.shape == "flat" else fit.points - next(iter(fit.calibrations.values())).nominal
             found = rig_calibrated(rig_task(seen, target, "none", theirs, known, chosen, who, moved)).calibrations
         for name, one in found.items():
-            counts = held[name].visible & hidden & one.used.any(-1, keepdim=True)
+            counts = held[name].visible & both[name][i].evaluated & one.used.any(-1, keepdim=True)
             total = total.plus(_errors(one, counts, held[name]))
     return total
 

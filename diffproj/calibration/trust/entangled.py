@@ -38,8 +38,6 @@ from diffproj.lens.models import MODELS
 
 ONE_SIDED = (("tau_x", "tau_y"), ("s1", "s2", "s3", "s4"), (SKEW,))
 """Groups of parameters that bend the image to one side, as a shift of the principal point does."""
-DENOMINATOR = ("k4", "k5", "k6")
-"""The terms below the line of a rational lens."""
 LATE = ("k2", "k3", "k4")
 """The terms of a fisheye that little of the image tells of, so that seen through a long lens they stand for noise."""
 ADRIFT = 0.05
@@ -124,8 +122,8 @@ class Entangled:
 
         Such terms stand for noise, and of many places where they could, the fit ended in one.
         """
-        names = tuple(name for name in DENOMINATOR if name in _free(self.found))
-        if not names or not MODELS[self.found.task.lens].perspective:  # a fisheye has another k4
+        names = tuple(name for name in MODELS[self.found.task.lens].below if name in _free(self.found))
+        if not names:
             return {}
         with torch.no_grad():
             sound = (self.status == Status.CONVERGED) & (self.found.pixel_sigma() > EXACT_PX)

@@ -29,7 +29,7 @@ from diffproj.calibration.trust.adequacy import (
 )
 from diffproj.calibration.trust.discounted import discounted
 from diffproj.calibration.trust.dispersion import dispersion, pulls_of
-from diffproj.calibration.trust.entangled import DENOMINATOR, Entangled, Simpler
+from diffproj.calibration.trust.entangled import Entangled, Simpler
 from diffproj.calibration.trust.leftover import Leftover, leftover
 from diffproj.calibration.trust.own_focal import OwnFocal, own_focal
 from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
@@ -38,6 +38,7 @@ from diffproj.calibration.trust.small_effects import SmallEffects
 from diffproj.calibration.trust.tag_spacing import by_spacing, of_free_points, of_the_spacing
 from diffproj.calibration.trust.turned_photographs import Turned, turned_photographs
 from diffproj.calibration.trust.two_groups import TwoGroups, two_groups
+from diffproj.lens.models import DENOMINATOR
 from diffproj.targets.landmarks import Landmarks
 
 UNSURE = 0.1

@@ -1,5 +1,7 @@
 """Corners that a robust loss holds for wrong, in a rig: told by camera, kept in files, and doubted where they are most."""
 
+import math
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -49,3 +51,49 @@ def test_a_view_whose_corners_are_mostly_wrong_is_doubted() -> None:
     assert rig["cam0"].doubts == ""
     measured = dp.measure(one.pixels[2, :2], rig["cam1"], dp.Plane.z(0.0), one.names[2], 0.3)
     assert one.names[2] in measured.doubts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("alone", [True, False])
+def test_what_few_corners_tell_heeds_the_wrong_one(alone: bool) -> None:
+    """Of 8 corners at a moment one is 15 px off, and another camera sees the board there or not: deviations hold it."""
+    off = _off_with_a_wrong_corner(range(30), alone)
+    # Measured, alone and not: RMS 0.87 and 0.94, 99 and 95 % in their intervals; 1.18 and 1.01, 93 % each, before wrong
+    # corners counted by their own pulls. With nearer boards 1.07 and 95 %, and 1.67 and 79 % before.
+    assert 0.75 < off.square().mean().sqrt() < 1.05
+    assert (off.abs() < 1.96).double().mean() > 0.94
+
+
+def test_the_pose_of_few_corners_lacks_the_wrong_one() -> None:
+    """Measured: 0.88, and all in their 95 % intervals; 1.16 and 90 % with the wrong corner counted as one of many."""
+    off = _off_with_a_wrong_corner(range(8), alone=True)
+    assert off.square().mean().sqrt() < 1.0
+    assert (off.abs() < 1.96).double().mean() > 0.95
+
+
+def _off_with_a_wrong_corner(seeds: Iterable[int], alone: bool) -> torch.Tensor:
+    """Errors of exact pixels of three corners, measured by the pose at that moment, in deviations."""
+    found, ends = [], [0, 8, 53]
+    for seed in seeds:
+        true = scene(2, 12, missing=0.0, seed=seed)
+        draw, views, moment = torch.Generator().manual_seed(seed), dict(true.views), "moment 3"
+        number = int(moment.removeprefix("moment "))
+        if any(moment not in one.names for one in views.values()):
+            continue
+        for name, one in true.views.items():
+            row, pixels, visible = one.names.index(moment), one.pixels.clone(), one.visible.clone()
+            if name == "cam0":
+                some = visible[row].nonzero().flatten()
+                some = some[torch.randperm(len(some), generator=draw)[:8]]
+                visible[row] = torch.isin(torch.arange(54), some)
+                turn = torch.rand((), generator=draw, dtype=torch.float64) * 2 * math.pi
+                pixels[row, some[0]] += 15 * torch.stack([turn.cos(), turn.sin()])
+            elif alone:
+                visible[row] = False
+            views[name] = dp.Views(pixels, visible, one.names, size=one.size)
+        rig = dp.calibrate_rig(views, true.board, loss=dp.Huber(0.5))
+        camera, board = true.cameras["cam0"], true.board.points.to(torch.float64)[ends]
+        exact, _ = camera.at(true.R[number], true.t[number]).project(board)
+        measured = dp.measure(exact, rig["cam0"], dp.Plane.z(0.0), moment, 1e-3)
+        found.append(((measured.points - board) / measured.deviations)[:, :2].flatten())
+    return torch.cat(found)
