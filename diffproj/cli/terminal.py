@@ -40,7 +40,7 @@ WORDS = (
     (r"; or say how well the target was printed, such as priors=\{[^}]*\}", ""),
     (r": fixed=\([^)]*\) fits as well", ""),
     (r"; fix (it|them), or take a simpler lens", "; take a simpler lens"),
-    (r"\b(distortion|shape)=(['\"]?)(\w*)\2", r"--\1 \3"),
+    (r"\b(distortion|shape|orientation)=(['\"]?)(\w*)\2", r"--\1 \3"),
     (r"'(none|brown\d+|fisheye|auto)'", r"\1"),
     (r"\bformat='", "--to '"),
     (r"\bpixel_sigma=", "--pixel-sigma "),

@@ -564,9 +564,12 @@ def test_a_hand_picks_as_the_library_says() -> None:
         (3, "(639 - x, 479 - y)", (602, 378)),
         (6, "(y, 479 - x)", (101, 442)),
         (8, "(639 - y, x)", (538, 37)),
-        (2, "", None),
+        (2, "(639 - x, y)", (602, 101)),
+        (4, "(x, 479 - y)", (37, 378)),
+        (5, "(y, x)", (101, 37)),
+        (7, "(639 - y, 479 - x)", (538, 442)),
     ],
-    ids=["as it is", "upside down", "right", "left", "mirrored"],
+    ids=["as it is", "upside down", "right", "left", "mirrored", "upside down in water", "about x = y", "about x = -y"],
 )
 def test_a_photograph_that_programs_show_turned_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], orientation: int, told: str, place: tuple[int, int] | None
@@ -578,9 +581,11 @@ def test_a_photograph_that_programs_show_turned_is_told(
     path.write_bytes(with_orientation(jpeg, orientation))
     code, _, err = run(capsys, path, "--camera", "camera.json", *BOARD, "--points", CORNERS[0])
     assert code == 0
-    assert ("ask programs to show it turned, and --points count as the sensor" in " ".join(err.split())) == (
+    how = "mirrored" if orientation in (2, 4, 5, 7) else "turned"
+    assert (f"ask programs to show it {how}, and --points count as the sensor" in " ".join(err.split())) == (
         orientation != 1
     )
+    assert ("x and y are those of a mirrored world: give --orientation upright" in err) == (how == "mirrored")
     assert ("one that they show at (x, y) is" in " ".join(err.split())) == bool(told)
     assert told in " ".join(err.split())
     if place is not None:  # of (37, 101)
@@ -589,9 +594,9 @@ def test_a_photograph_that_programs_show_turned_is_told(
     code, _, err = run(
         capsys, path, "--camera", "camera.json", *BOARD, "--points", CORNERS[0], "--orientation", "upright"
     )
-    assert "ask programs to show it turned" not in err
+    assert f"ask programs to show it {how}" not in err
     refused = "leave out --orientation upright, with which EXIF data turn this one" in " ".join(err.split())
-    assert refused == (code == 1) == (orientation in (6, 8))  # the camera's photographs are 640 x 480 px
+    assert refused == (code == 1) == (orientation in (5, 6, 7, 8))  # the camera's photographs are 640 x 480 px
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])

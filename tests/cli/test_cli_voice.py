@@ -277,6 +277,14 @@ def test_files_are_read_once(
     assert read == expected
 
 
+def test_of_a_damaged_video_one_line_tells(tmp_path: Path) -> None:
+    (tmp_path / "film.mp4").write_bytes(b"something")
+    command = [sys.executable, "-m", "diffproj", "calibrate", str(tmp_path / "film.mp4"), *BOARD]
+    done = subprocess.run(command, capture_output=True, text=True)
+    told = f"diffproj: {tmp_path / 'film.mp4'}: want a video, got a file of which OpenCV reads no frame\n"
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", told)
+
+
 def test_frames_of_videos_are_decoded_once(read: Counter[str], capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ("film.avi", *BOARD, "--frames", "1", "--distortion", "none", "-o", "new.json")
     assert run(capsys, "calibrate", *arguments)[0] == 0
