@@ -136,6 +136,12 @@ def in_options(text: str) -> str:
     return text
 
 
+def in_words(text: str, unit: str | None) -> str:
+    """What the library says of results, with the command's options, and with the world's unit by its name."""
+    text = in_options(text)
+    return text if unit is None else text.replace("world units", unit)
+
+
 def sentence(text: str) -> str:
     """A remark with a capital letter, unless it begins with the name of a parameter, such as k1 or f_x."""
     return text if re.match(r"[a-z]+\d|[a-z]+_[xy]\b", text) else text[:1].upper() + text[1:]

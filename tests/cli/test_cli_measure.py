@@ -358,6 +358,10 @@ def test_lists_of_numbers_are_no_options() -> None:
         "5,-3",
     ]
     assert shielded(["--csv=-a,b.csv"]) == ["--csv=-a,b.csv"]
+    lengths = ["-3mm", "-.5 cm", "-2.5IN", "-3 µm", "-1e-3", "-1E2m"]
+    assert shielded(lengths) == [f" {length}" for length in lengths]
+    others = ["-3", "-.5", "-1.jpg", "-v", "-mm", "3mm", "-"]
+    assert shielded(others) == others
 
 
 def test_equations_and_quantities_for_people() -> None:
@@ -392,6 +396,7 @@ def test_heights_are_above_the_face_in_every_frame(
     options = ("--camera", file, "--view", seen.names[3], "--points", "300,200", "420,300")
     above = parsed(capsys, *options, "--height", "12")
     below = parsed(capsys, *options, "--height", "-3")
+    assert parsed(capsys, "--height", "-3e0", *options) == below
     assert (above["plane"], above["height"]) == ([0, 0, 1, 12 * towards], 12)
     assert (below["plane"], below["height"]) == ([0, 0, 1, -3 * towards], -3)
     assert above["lengths"][0]["value"] < below["lengths"][0]["value"]
