@@ -42,6 +42,7 @@ WORDS = (
     (r"; fix (it|them), or take a simpler lens", "; take a simpler lens"),
     (r"\b(distortion|shape|orientation)=(['\"]?)(\w*)\2", r"--\1 \3"),
     (r"'(none|brown\d+|fisheye|auto)'", r"\1"),
+    (r"\bpaper=\((\d+), (\d+)\)", r"--paper \1,\2"),
     (r"\bformat='", "--to '"),
     (r"\bpixel_sigma=", "--pixel-sigma "),
     (r"\bskew=True", "--skew"),
