@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import diffproj as dp
-from diffproj import cli, synthetic
+from diffproj import __main__, cli, synthetic
 from diffproj.cli.calibrate_document import document
 from diffproj.cli.terminal import RESULTS
 from diffproj.files.document import Document
@@ -288,6 +288,15 @@ def test_files_are_read_once(
     code, _, err = run(capsys, *arguments)
     assert code == 0, err
     assert read == expected
+
+
+def test_interrupted_while_it_loads(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted() -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("diffproj.__main__.run", interrupted)
+    assert __main__.main() == 130
+    assert capsys.readouterr() == ("", "diffproj: interrupted\n")
 
 
 def test_of_a_damaged_video_one_line_tells(tmp_path: Path) -> None:
