@@ -323,9 +323,10 @@ _CHECKS: dict[type, str] = {
     Chessboard: "the numbers count inner corners (one less than the squares each way), that the whole board is in view "
     "with a margin around it, and that the photographs are sharp and evenly lit",
     CharucoBoard: "the numbers count squares, columns first, that marker, dictionary and legacy are those that the "
-    "board was made with, and that the photographs are sharp and evenly lit, with markers of 15 px or more",
+    "board was made with, and that the photographs are sharp, evenly lit and not mirrored, with markers of 15 px or "
+    "more",
     AprilGrid: "the numbers count tags, columns first, that the tags are of the family 36h11 and begin with number 0, "
-    "and that the photographs are sharp and evenly lit, with tags of 25 px or more",
+    "and that the photographs are sharp, evenly lit and not mirrored, with tags of 25 px or more",
     CircleGrid: "the numbers count circles, columns first, that every second line is shifted where asymmetric says so, "
     "that the whole board is in view, and that the photographs are sharp and evenly lit, with circles of 6 px or more",
 }
