@@ -174,7 +174,10 @@ def decoded(path: Path, orientation: Orientation, colour: bool = False) -> np.nd
     flags = (cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE) | cv2.IMREAD_ANYDEPTH
     if orientation == "sensor":
         flags |= cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(data, flags) if data.size else None
+    try:
+        image = cv2.imdecode(data, flags) if data.size else None
+    except cv2.error as error:  # as of a header that tells of a gigapixel and more
+        raise NotAnImageError(path, f"one that OpenCV refuses ({error.err})") from None
     if image is None:
         raise NotAnImageError(path, f"{data.size} bytes that {UNREADABLE}")
     if image.dtype not in (np.uint8, np.uint16, np.int16) and not np.issubdtype(image.dtype, np.floating):

@@ -5,13 +5,14 @@ import struct
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from diffproj.targets.exif import Exif, exif_of
-from diffproj.targets.images import decoded
+from diffproj.targets.images import NotAnImageError, decoded
 
 PICTURE = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
 EXIF_PART = 0x8769
@@ -96,3 +97,14 @@ def test_only_the_first_picture_of_a_tiff_counts_and_copies_of_it_do_not(tmp_pat
     file = io.BytesIO()
     pictures[0].save(file, "TIFF", save_all=True, append_images=[small])
     assert exif_of(file.getvalue()).pictures == 1
+
+
+def test_an_image_of_absurd_size_is_refused_and_not_a_mistake_of_ours(tmp_path: Path) -> None:
+    """OpenCV raises an error of its own, which a folder of good photographs failed by."""
+    whole = bytearray(cv2.imencode(".bmp", PICTURE)[1].tobytes())
+    struct.pack_into("<i", whole, 18, 2**30)
+    path = tmp_path / "large.bmp"
+    path.write_bytes(whole)
+    with pytest.raises(NotAnImageError, match=r"large\.bmp: want an image, got one that OpenCV refuses \(") as refused:
+        decoded(path, "sensor")
+    assert refused.value.readable
