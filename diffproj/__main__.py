@@ -9,6 +9,9 @@ def main() -> int:
     """Run the command line, or say what it needs."""
     try:
         return run()
+    except KeyboardInterrupt:  # while it loads what it needs, which takes seconds
+        print("diffproj: interrupted", file=sys.stderr)
+        return 130
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
         if missing not in ("matplotlib", "rich"):

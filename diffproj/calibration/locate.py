@@ -1,6 +1,5 @@
 """`locate`: where a known camera stood, from the corners of a target in each view."""
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Unpack
@@ -114,7 +113,7 @@ def locate(
     if isinstance(target, Chessboard | CircleGrid) and target.turns > 1:
         warn_caller(f"locate: {origin_doubt(target)}")
     if bool(found.ambiguous.any()):
-        warnings.warn(f"locate: {found.ambiguity}; {REMEDY}", AmbiguousPoseWarning, stacklevel=2)
+        warn_caller(f"locate: {found.ambiguity}; {REMEDY}", AmbiguousPoseWarning)
     calibrated = found.lens_region is not None
     if text := described(found.mismatch, views.names, calibrated):
         if calibrated and found.landmarks is not None:

@@ -75,15 +75,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def shielded(arguments: Sequence[str]) -> list[str]:
-    """Put a space before lists of numbers such as `-5,3`, so that argparse does not take them for options.
+    """Put a space before values such as `-5,3`, `-3mm` and `-1e-3`, so that argparse does not take them for options.
 
-    A single negative number needs no shield. `--points=-5,3` comes apart: argparse would take nothing behind it along.
+    A plain negative number needs no shield. `--points=-5,3` comes apart: argparse would take nothing behind it along.
     """
     apart = (re.fullmatch(r"(--[a-z-]+)=(-?[.\d][^,]*,.*)", text) for text in arguments)
     parts = [
         part for text, found in zip(arguments, apart, strict=True) for part in (found.groups() if found else [text])
     ]
-    return [f" {text}" if re.match(r"-[.\d][^,]*,", text) else text for text in parts]
+    lists, lengths = r"-[.\d][^,]*,.*", r"-[.\d]+((e[+-]?\d+)? ?[a-zµμ]{1,2}|e[+-]?\d+)"
+    return [f" {text}" if re.fullmatch(f"{lists}|{lengths}", text, re.IGNORECASE) else text for text in parts]
 
 
 def _complete() -> int:

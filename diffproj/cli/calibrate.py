@@ -63,7 +63,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         nargs="*",
         type=some_path,
         metavar="PHOTO",
-        help="photographs by one camera, folders of them, or videos (.mp4, .mov, .avi, .mkv, .m4v)",
+        help="photographs by one camera, folders of them, or videos (.mp4, .mov, .avi, .mkv, .webm, ...)",
     )
     board = command.add_argument_group("the board")
     add_kinds(board.add_mutually_exclusive_group(required=True))

@@ -7,6 +7,7 @@ from typing import Any
 from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.validation import CrossValidation
+from diffproj.cli.terminal import in_words
 from diffproj.lens.models import model_of
 
 
@@ -40,8 +41,8 @@ def document(options: argparse.Namespace, found: Calibration, folds: CrossValida
         "lenses_compared": None if found.comparison is None else found.comparison.to_dict(),
         "folds": None if folds is None else folds.to_dict(),
         "status": Status(int(found.status)).name,
-        "message": found.message,
-        "verdict": found.verdict,
+        "message": in_words(found.message, found.unit),
+        "verdict": in_words(found.verdict, found.unit),
         "warnings": options.warned,
     }
 

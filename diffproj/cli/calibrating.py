@@ -22,7 +22,7 @@ from diffproj.cli.terminal import (
     aligned,
     as_json,
     detail,
-    in_options,
+    in_words,
     progress_bars,
     result,
     rounded,
@@ -177,10 +177,5 @@ def _say_how_it_ended(calibration: Calibration, reject_outliers: bool) -> None:
         result(f"{count or 'no'} corner{'s' * (count > 1)} rejected as outlier{'s' * (count > 1)}".capitalize())
     result(f"Solver {SENTENCES[Status.CONVERGED]}")  # else there is a failure in its place
     for remark in told_of(calibration):
-        result(textwrap.fill(_with_unit(sentence(in_options(remark)), calibration.unit), 79))
-    result("\n" + textwrap.fill(_with_unit(in_options(calibration.verdict), calibration.unit), 79))
-
-
-def _with_unit(text: str, unit: str | None) -> str:
-    """A remark with the world's unit by its name."""
-    return text if unit is None else text.replace("world units", unit)
+        result(textwrap.fill(sentence(in_words(remark, calibration.unit)), 79))
+    result("\n" + textwrap.fill(in_words(calibration.verdict, calibration.unit), 79))

@@ -24,7 +24,7 @@ from diffproj.calibration.results.calibration import Calibration, CalibrationErr
 from diffproj.cli.fleet_file import append, done_before, line_of
 from diffproj.cli.fleet_folder import Folder, Searched, on_one_core, searched
 from diffproj.cli.inputs import check_writable, writing
-from diffproj.cli.terminal import RESULTS, as_json, counted, failure, in_options, note, progress_bars, result
+from diffproj.cli.terminal import RESULTS, as_json, counted, failure, in_words, note, progress_bars, result
 from diffproj.cli.which_board import KINDS, NEEDS, TAKES, given_board
 from diffproj.targets.boards import Board
 from diffproj.targets.tasks import as_done
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> int:
             lines += new
             waiting = []
             bars.update(task, completed=len(lines))
-    _tell(options, lines, len(left), time.perf_counter() - begin)
+    _tell(options, lines, len(left), time.perf_counter() - begin, side.unit)
     return 0 if any("camera" in line for line in lines) else 1
 
 
@@ -146,7 +146,7 @@ def _calibrated(
     return lines
 
 
-def _tell(options: argparse.Namespace, lines: list[dict[str, Any]], new: int, seconds: float) -> None:
+def _tell(options: argparse.Namespace, lines: list[dict[str, Any]], new: int, seconds: float, unit: str | None) -> None:
     """What came of it: how many, the worst, and the time by stage."""
     good = [line for line in lines if "camera" in line]
     failed = [line for line in lines if "camera" not in line]
@@ -160,9 +160,12 @@ def _tell(options: argparse.Namespace, lines: list[dict[str, Any]], new: int, se
             "cameras": len(lines),
             "calibrated": len(good),
             "failed": {line["name"]: line["error"] for line in failed},
-            "worst": [{"name": w["name"], "verdict": w["verdict"], **w["summary"]} for w in worst],
+            "worst": [{"name": w["name"], "verdict": in_words(w["verdict"], unit), **w["summary"]} for w in worst],
             "seconds": {"elapsed": round(seconds, 3), **{name: round(value, 3) for name, value in stages.items()}},
+            "unit": unit,
+            "notes": {line["name"]: line["notes"] for line in lines if line["notes"]},
             "output": str(options.output),
+            "warnings": options.warned,
         }
         as_json(document)
         return
@@ -174,11 +177,15 @@ def _tell(options: argparse.Namespace, lines: list[dict[str, Any]], new: int, se
             found = line["summary"]
             sure = f"{found['f_x']:.1f} ± {found['f_x_deviation']:.1f}"
             views = f"{found['views']} of {line['photographs']}"
-            verdict = in_options(line["verdict"].partition(". ")[0])
+            verdict = in_words(line["verdict"].partition(". ")[0], unit)
             table.add_row(escape(line["name"]), views, f"{found['rms']:.4f}", sure, escape(verdict))
         RESULTS.print(table)
     for line in failed:
         result(f"{line['name']}: {line['error']}")
+    noted = [line["name"] for line in good if line["notes"]]
+    if noted:
+        which = ", ".join(noted[:WORST]) + f" and {len(noted) - WORST} more" * (len(noted) > WORST)
+        result(f'Notes on photographs of {which}: see "notes" in the file')
     result(
         f"\n{counted(len(good), 'camera')} calibrated, {len(failed)} failed, in {seconds:.1f} s; seconds of work: "
         f"{stages['search']:.1f} to search, {stages['calibration']:.1f} to calibrate, {stages['report']:.1f} to report"

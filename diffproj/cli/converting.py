@@ -13,6 +13,7 @@ from diffproj.files.load import content_of, found_in
 from diffproj.files.own_json import holds_fleet
 from diffproj.files.save import save_camera
 from diffproj.geometry.camera import Camera
+from diffproj.lens.models import model_of
 
 REMEDIES = (
     ("or save camera.without_pose()", "or give --without-pose"),
@@ -40,12 +41,14 @@ def run(options: argparse.Namespace) -> int:
     told = _told(options, found)
     if options.json:
         as_json(told)
-    elif told["rig"] is not None:
-        result(f"{options.output}: a rig of {', '.join(told['rig'])}")
+    elif isinstance(found, RigCalibration):
+        result(f"{options.output}: a rig of {', '.join(found.names)}")
     else:
         many = "one camera" if told["cameras"] is None else f"{told['cameras']} cameras"
         size = "of unknown size" if told["size"] is None else "of {} x {} px".format(*told["size"])
-        result(f"{options.output}: {many} {size}, {told['lens'] or 'no lens'}")
+        camera = found.camera if isinstance(found, Calibration) else found
+        lens = "no lens" if camera.distortion is None else type(camera.distortion).__name__
+        result(f"{options.output}: {many} {size}, {lens}")
     return 0
 
 
@@ -53,14 +56,14 @@ def _told(options: argparse.Namespace, found: Camera | Calibration | RigCalibrat
     """What was written."""
     told = {"input": str(options.input), "output": str(options.output), "warnings": options.warned}
     if isinstance(found, RigCalibration):
-        return {**told, "rig": list(found.names)}
+        return {**told, "rig": list(found.names), "cameras": len(found.names), "size": None, "lens": None}
     camera = found.camera if isinstance(found, Calibration) else found
     return {
         **told,
         "rig": None,
         "cameras": camera.batch_shape.numel() if camera.batch_shape else None,
         "size": None if camera.size is None else list(camera.size),
-        "lens": None if camera.distortion is None else type(camera.distortion).__name__,
+        "lens": model_of(camera.distortion).name,
     }
 
 

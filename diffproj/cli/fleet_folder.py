@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from diffproj.cli.photographs import photographs, search_in_folders
-from diffproj.cli.terminal import NOTES, failure
+from diffproj.cli.terminal import NOTES, failure, in_options
 from diffproj.targets.boards import Board
 from diffproj.targets.views import Views
 
@@ -58,7 +58,7 @@ def searched(folder: Folder) -> Searched:
         except (ValueError, OSError, RuntimeError) as problem:
             error = failure(problem)
     lines = [line.removeprefix("diffproj: ") for line in said.get().splitlines()]
-    notes = (*lines, *(str(warning.message) for warning in warned))
+    notes = (*lines, *(in_options(str(warning.message)) for warning in warned))
     return Searched(views, count, time.perf_counter() - begin, notes, error)
 
 

@@ -11,7 +11,7 @@ from rich.table import Table
 from diffproj.calibration.evidence.adjustment import mounting_covariance
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.cli.landmarks_file import Surveyed
-from diffproj.cli.terminal import RESULTS, aligned, counted, in_options, known, result, rounded
+from diffproj.cli.terminal import RESULTS, aligned, counted, in_words, known, result, rounded
 from diffproj.cli.units import heading
 
 MOUNTING = ("tilt", "roll", "heading", "x", "y", "z")
@@ -84,8 +84,8 @@ def document(
         "landmarks": rows,
         "worst": max(used, key=lambda row: row["off"])["name"],
         "remarks": [BELOW] if _from_below(found) else [],
-        "message": found.message,
-        "verdict": found.verdict,
+        "message": in_words(found.message, found.unit),
+        "verdict": in_words(found.verdict, found.unit),
     }
 
 
@@ -132,7 +132,7 @@ def say(told: dict[str, Any]) -> None:
         result(f"\nFarthest off: {worst['name']}, {worst['off']:.3g} px")
     for remark in told["remarks"]:
         result("\n" + textwrap.fill(remark, 79))
-    result("\n" + textwrap.fill(in_options(told["verdict"]), 79))
+    result("\n" + textwrap.fill(told["verdict"], 79))
     result(textwrap.fill(_about_deviations(told), 79))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
+from diffproj._core.warn import warn_caller
 from diffproj.calibration.evidence.adjust import adjust
 from diffproj.calibration.evidence.adjusted_view import of_view
 from diffproj.calibration.evidence.observations import Seen
@@ -59,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     found = _located(options, camera, calibration, surveyed, view, size)
     for remark in found.findings[0]:
         if remark.kind == Kind.BELOW:
-            warnings.warn(f"{options.landmarks}: {remark.sentence}", stacklevel=1)
+            warn_caller(f"{options.landmarks}: {remark.sentence}")
     told = document(options, found, surveyed, _free(options, camera), calibration is not None)
     told["warnings"] = options.warned
     if options.draw is not None:

@@ -11,7 +11,7 @@ import torch
 from diffproj.cli.measure_plane import described, height_above_face
 from diffproj.cli.points_file import Pixel
 from diffproj.cli.scene import Scene
-from diffproj.cli.terminal import known
+from diffproj.cli.terminal import in_words, known
 from diffproj.geometry.back_projection import Reason, explain
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
@@ -92,7 +92,7 @@ def document(
         "points": points,
         "lengths": lengths,
         "area": area,
-        "doubts": measured.doubts or None,
+        "doubts": in_words(measured.doubts, scene.square.unit) or None,
         "remarks": remarks,
     }
 

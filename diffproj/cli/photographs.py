@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -13,11 +12,14 @@ import cv2
 import numpy as np
 from rich.progress import Progress
 
+from diffproj._core.warn import warn_caller
 from diffproj.cli.terminal import counted, detail, note, working
 from diffproj.targets import videos
 from diffproj.targets.boards import Board
 from diffproj.targets.detection import Searched, searched
+from diffproj.targets.exif import MIRRORED, as_recorded, exif_of
 from diffproj.targets.images import SUFFIXES, NotAnImageError, Orientation, Photograph, decoded, listed
+from diffproj.targets.one_camera import doubts
 
 HEIC = frozenset({".heic", ".heif", ".hif"})
 RAW = frozenset({".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2"})
@@ -70,7 +72,10 @@ def one_photograph(path: Path, orientation: Orientation, colour: bool = False) -
     if _is_video(files[0]):
         raise ValueError(f"PHOTO: want a photograph, got the video {path}; save one of its frames as a .png")
     with _silent_opencv():
-        return Photograph(files[0].name, str(files[0]), decoded(files[0], orientation, colour))
+        pixels = decoded(files[0], orientation, colour)
+    for doubt in doubts([str(files[0])], [exif_of(files[0].read_bytes())], orientation == "upright"):
+        warn_caller(doubt)
+    return Photograph(files[0].name, str(files[0]), pixels)
 
 
 def warn_if_shown_turned(path: Path, orientation: Orientation, pixels: str) -> None:
@@ -85,22 +90,23 @@ def warn_if_shown_turned(path: Path, orientation: Orientation, pixels: str) -> N
         return
     file = _named(path)[0]
     content = file.read_bytes()
-    if not any(mark in content for mark in (b"Exif", b"eXIf", b"EXIF")):  # of JPEG, PNG, WebP
+    asked = exif_of(content).orientation
+    if asked == 1:
         return
-    data = np.frombuffer(content, dtype=np.uint8)
     small = cv2.IMREAD_REDUCED_GRAYSCALE_8  # a copy is enough to see a turn, and decodes fast
     with _silent_opencv():
-        recorded, shown = (cv2.imdecode(data, flags) for flags in (small | cv2.IMREAD_IGNORE_ORIENTATION, small))
+        recorded = cv2.imdecode(np.frombuffer(as_recorded(content), np.uint8), small | cv2.IMREAD_IGNORE_ORIENTATION)
+        shown = cv2.imdecode(np.frombuffer(content, np.uint8), small)
         if recorded is None or shown is None or np.array_equal(recorded, shown):
             return
-        rows, columns = decoded(file, orientation).shape
-    places = {1: f"({columns - 1} - y, x)", 2: f"({columns - 1} - x, {rows - 1} - y)", 3: f"(y, {rows - 1} - x)"}
-    turns = [turn for turn in places if np.array_equal(np.rot90(recorded, turn), shown)]
-    where = f": one that they show at (x, y) is {places[turns[0]]}" if len(turns) == 1 else ""
-    warnings.warn(
-        f"{file}: its EXIF data ask programs to show it turned, and {pixels} count as the sensor recorded it, "
-        f"{columns} x {rows} px{where}",
-        stacklevel=2,
+        height, width = decoded(file, orientation).shape
+    right, bottom = f"{width - 1} - ", f"{height - 1} - "
+    place = {2: f"{right}x, y", 3: f"{right}x, {bottom}y", 4: f"x, {bottom}y", 5: "y, x"}
+    place |= {6: f"y, {bottom}x", 7: f"{right}y, {bottom}x", 8: f"{right}y, x"}
+    how = "mirrored" if asked in MIRRORED else "turned"
+    warn_caller(
+        f"{file}: its EXIF data ask programs to show it {how}, and {pixels} count as the sensor recorded it, "
+        f"{width} x {height} px: one that they show at (x, y) is ({place[asked]})"
     )
 
 
@@ -148,14 +154,14 @@ def search_in_folders(sources: list[Any], board: Board, folders: Collection[Path
     try:
         found = searched(sources, board, may_be_broken=folders, **how)
     except NotAnImageError as error:
-        if error.path.parent not in folders:
+        if error.path.parent not in folders or error.readable:
             raise
         raise ValueError(
             f"{error.path.parent}: want a folder with photographs ({', '.join(sorted(SUFFIXES))}), its "
             f"{counted(len(sources), 'image file')} cannot be read; copy them once more"
         ) from error
     for one in found.broken:
-        note(f"{one.label}: cannot be read as an image; skipped")
+        note(f"{one if one.readable else f'{one.path}: cannot be read as an image'}; skipped")
     return found
 
 
@@ -187,6 +193,9 @@ def _inside(folder: Path) -> str:
 def _in_folder(folder: Path) -> list[Path]:
     """The photographs in a folder."""
     files = [file for file in folder.iterdir() if not file.is_dir()]
+    for lost in sorted(file for file in files if not file.exists()):
+        note(f"{lost}: a link to a file that is not there; skipped")
+    files = [file for file in files if file.exists()]
     hidden = [file for file in files if file.name.startswith(".")]
     seen = [file for file in files if file not in hidden]
     kinds = {

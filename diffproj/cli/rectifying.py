@@ -17,12 +17,15 @@ from diffproj.cli.photographs import one_photograph
 from diffproj.cli.scene import Scene, check_size, new_photograph, stored_view
 from diffproj.cli.terminal import as_json, progress_bars, result
 from diffproj.cli.units import Length, in_unit, is_extent
-from diffproj.geometry.back_projection import ground_resolution
+from diffproj.geometry.back_projection import back_project, ground_resolution
 from diffproj.geometry.plane import Plane
 from diffproj.geometry.rectification import plane_axes, rectify
 
 MOST_PIXELS = 10**8
 """Of a top view: more is a resolution in the wrong unit."""
+
+RAYS = 33
+"""Along each side of the photograph that are tried before it is said not to show a plane."""
 
 STRIP = 2**20
 """Pixels that are made at a time: the memory for them is bounded, and the progress shows."""
@@ -84,6 +87,7 @@ def run(options: argparse.Namespace) -> int:
     origin, along_x, along_y = plane_axes(plane)
     if options.world_file and not _is_level(plane):
         raise ValueError("--world-file: want a plane z = const, whose x and y are the map's, got another; leave it out")
+    _check_in_view(options, np.asarray(photograph.source), scene, plane)
     view = _view(options, scene, plane)
     top, shown = _top_view(np.asarray(photograph.source), scene, plane, view)
     if not shown:
@@ -118,6 +122,23 @@ def run(options: argparse.Namespace) -> int:
     else:
         _say(told, scene, plane)
     return 0
+
+
+def _check_in_view(options: argparse.Namespace, image: Shaped[np.ndarray, "..."], scene: Scene, plane: Plane) -> None:
+    """Check that the photograph shows some of the plane, whatever part of it is asked for.
+
+    Raises:
+        ValueError: it does not.
+    """
+    height, width = image.shape[:2]
+    u, v = (torch.linspace(0.0, side - 1.0, RAYS, dtype=torch.float64, device="cpu") for side in (width, height))
+    if not bool(back_project(torch.cartesian_prod(u, v), scene.camera, plane)[1].any()):
+        words = described(plane, None if scene.has_landmarks else height_above_face(scene, plane), scene.square.unit)
+        option = "--height" if options.plane is None else "--plane"
+        raise ValueError(
+            f"{option}: want a plane that the photograph shows, got {words}, "
+            "which no ray of it meets: it lies behind the camera; check the height, its sign and its unit"
+        )
 
 
 def _view(options: argparse.Namespace, scene: Scene, plane: Plane) -> View:

@@ -1,12 +1,12 @@
 """Where the camera stood: at a view that it was calibrated with, or before a board in a new photograph."""
 
 import argparse
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
+from diffproj._core.warn import warn_caller
 from diffproj.calibration.locate import locate
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
 from diffproj.calibration.rigs.result import RigCalibration
@@ -119,7 +119,7 @@ def new_photograph(options: argparse.Namespace, photograph: Photograph) -> Scene
     if calibration is not None:
         square, doubt = agreed(square, _calibrated_square(calibration), options.camera, option)
         if doubt is not None:
-            warnings.warn(doubt, stacklevel=2)
+            warn_caller(doubt)
     with progress_bars() as bars:
         views = search([photograph], board, bars, orientation=options.orientation).views
     check_size(camera, views.size, options)

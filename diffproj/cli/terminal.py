@@ -40,8 +40,9 @@ WORDS = (
     (r"; or say how well the target was printed, such as priors=\{[^}]*\}", ""),
     (r": fixed=\([^)]*\) fits as well", ""),
     (r"; fix (it|them), or take a simpler lens", "; take a simpler lens"),
-    (r"\b(distortion|shape)=(['\"]?)(\w*)\2", r"--\1 \3"),
+    (r"\b(distortion|shape|orientation)=(['\"]?)(\w*)\2", r"--\1 \3"),
     (r"'(none|brown\d+|fisheye|auto)'", r"\1"),
+    (r"\bpaper=\((\d+), (\d+)\)", r"--paper \1,\2"),
     (r"\bformat='", "--to '"),
     (r"\bpixel_sigma=", "--pixel-sigma "),
     (r"\bskew=True", "--skew"),
@@ -134,6 +135,12 @@ def in_options(text: str) -> str:
     for python, option in WORDS:
         text = re.sub(python, option, text)
     return text
+
+
+def in_words(text: str, unit: str | None) -> str:
+    """What the library says of results, with the command's options, and with the world's unit by its name."""
+    text = in_options(text)
+    return text if unit is None else text.replace("world units", unit)
 
 
 def sentence(text: str) -> str:

@@ -22,7 +22,6 @@ tested is the rest. Where cameras disagree, nothing tells by itself which one is
 grows by chi-square over its degrees of freedom (Birge 1932), until its owner mends or leaves one out.
 """
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -34,6 +33,7 @@ from torch import Tensor
 
 from diffproj._core.arguments import called
 from diffproj._core.numerics import broadcast_batches
+from diffproj._core.warn import warn_caller
 from diffproj.calibration.results.mismatch import CameraDisagreementWarning
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.agreement import chances, chi_square, disagreeing, inverse, joined, without
@@ -179,7 +179,7 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
     )
     doubts = _doubts(names, disagrees)
     if doubts:
-        warnings.warn(doubts, CameraDisagreementWarning, stacklevel=2)
+        warn_caller(doubts, CameraDisagreementWarning)
     told = "; ".join(dict.fromkeys([doubts, *(one.doubts for one in found)])).strip("; ")
     includes = all(one.includes_intrinsics for one in found)
     each = {"names": names, "seen": seen, "chance": chance, "disagrees": disagrees, "scale": scale}

@@ -16,7 +16,7 @@ from diffproj.geometry.plane import Plane
 from diffproj.measurement.choices import HAND_PX
 from diffproj.report.document import Part, asset, data_uri, json_block, shortened
 from diffproj.report.measuring_model import as_one, measuring_model
-from diffproj.targets.images import Orientation, Photograph, as_8_bit, grey, listed
+from diffproj.targets.images import Orientation, Photograph, as_8_bit, decoded, grey, listed
 
 SCRIPTS = ("lens", "camera", "statistics", "errors", "tools", "view", "plan", "panel", "page", "hands", "start")
 """The files of the page's script, in their order; the first four are its mathematics."""
@@ -119,11 +119,8 @@ def colour(photograph: Photograph, orientation: Orientation = "sensor") -> np.nd
     """A photograph as 8-bit, `(H, W, 3)` in BGR where it has colours, else `(H, W)` as the detector sees it."""
     source = photograph.source
     if isinstance(source, Path):
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-        flags |= cv2.IMREAD_IGNORE_ORIENTATION if orientation == "sensor" else 0
-        data = np.frombuffer(source.read_bytes(), dtype=np.uint8)
-        image = cv2.imdecode(data, flags) if data.size else None
-        if image is not None and image.dtype == np.uint8:
+        image = decoded(source, orientation, colour=True)
+        if image.dtype == np.uint8:
             return image
     if isinstance(source, np.ndarray) and source.dtype == np.uint8 and source.ndim == 3 and source.shape[2] >= 3:
         return np.ascontiguousarray(source[..., :3])

@@ -1,4 +1,4 @@
-"""The part on the board's shape: where its points lie, against where they should."""
+"""The part on the target's shape: where the points of the board, or the landmarks, lie, against where they should."""
 
 import math
 
@@ -17,14 +17,20 @@ BALL = 7.0
 
 
 def shape_part(facts: Facts) -> Part:
-    """How the board was printed."""
+    """How the board was printed, or where the landmarks are."""
     calibration = facts.calibration
     fitted = calibration.shape != "flat" and facts.converged
     figure, rms = _figure(facts) if fitted else (Markup(), "")
     html = render(
-        "shape.html", fitted=fitted, bowed=calibration.shape == "bow", figure=figure, rms=rms, unit=facts.unit
+        "shape.html",
+        fitted=fitted,
+        bowed=calibration.shape == "bow",
+        board=facts.planar,
+        figure=figure,
+        rms=rms,
+        unit=facts.unit,
     )
-    return Part("The board's shape", "shape", html, svg.STYLE)
+    return Part("The board's shape" if facts.planar else "The landmarks' places", "shape", html, svg.STYLE)
 
 
 def _figure(facts: Facts) -> tuple[Markup, str]:
@@ -57,7 +63,8 @@ def _figure(facts: Facts) -> tuple[Markup, str]:
     parts.append(svg.segments(axes.at(nominal[:, :2]), axes.at(tips), ""))
     parts.append(_ellipses(facts, axes, tips, times))
     rms = svg.plain(float(np.sqrt((off**2).sum(-1).mean())))
-    label = f"Points of the board off by {rms} {facts.unit} (RMS), at most {svg.plain(most)} out of the plane"
+    points = "Points of the board" if facts.planar else "Landmarks"
+    label = f"{points} off by {rms} {facts.unit} (RMS), at most {svg.plain(most)} out of the plane"
     keys = svg.key(
         ("dot", f"out of the plane along z, at most {svg.plain(float(off[:, 2].max(initial=0)))} {facts.unit}"),
         ("dot-bad", f"against z, at most {svg.plain(float(-off[:, 2].min(initial=0)))} {facts.unit}"),

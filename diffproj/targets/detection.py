@@ -1,7 +1,6 @@
 """Detect a target's points in photographs, with sub-pixel accuracy and in a defined order."""
 
 import functools
-import warnings
 from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -13,14 +12,17 @@ import torch
 from jaxtyping import Float, Shaped
 
 from diffproj._core.arguments import function, whole_number
+from diffproj._core.warn import warn_caller
 from diffproj.targets.april_grid import AprilGrid
 from diffproj.targets.boards import Board, as_target, with_article
 from diffproj.targets.charuco import CharucoBoard
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.circle_grid import CircleGrid
+from diffproj.targets.exif import exif_of
 from diffproj.targets.finders import Found, find
 from diffproj.targets.images import NotAnImageError, Orientation, Photograph, Source, grey, listed
 from diffproj.targets.numbering import follow
+from diffproj.targets.one_camera import doubts, named
 from diffproj.targets.tasks import results_of
 from diffproj.targets.videos import Frame, distinct
 from diffproj.targets.views import Views
@@ -32,6 +34,7 @@ class BoardNotFoundWarning(UserWarning):
     Example:
         Where no photograph may be skipped, turn it into an error.
 
+        >>> import warnings
         >>> with warnings.catch_warnings():
         ...     warnings.simplefilter("error", BoardNotFoundWarning)  # ... and detect(...) here
     """
@@ -92,12 +95,13 @@ def detect(
             images. An image is an array as OpenCV has it, `(H, W)`, `(H, W, 1)`, `(H, W, 3)` in BGR or `(H, W, 4)` in
             BGRA, of 8-bit or 16-bit integers (16 bits: contrast-stretched) or floats from 0 to 1; or a tensor as
             Kornia has it, `(C, H, W)` in RGB, of the same types, or `(B, C, H, W)`. All of one size. Of a folder,
-            hidden files and those of other kinds are left out. A video (`.mp4`, `.avi`, `.mov`, `.mkv`) gives sharp
-            frames, at most 60 from all its parts, without those in which the board hardly moved.
+            hidden files and those of other kinds are left out. A video (`.mp4`, `.mov`, `.avi`, `.mkv`, ...) gives
+            sharp frames, at most 60 from all its parts, without those in which the board hardly moved.
         target: the board to look for; a chessboard has at least 3 x 3 inner corners.
         progress: called with `(done, total)` after each photograph.
         orientation: `"sensor"` counts a file's pixels as the sensor recorded them, whichever way up the camera was
-            held: one lens has one principal point. `"upright"` turns each file as its EXIF data ask, as viewers do.
+            held: one lens has one principal point. `"upright"` turns each file as its EXIF data ask, as viewers do,
+            and frames as their video asks.
         frames: of a video, take every n-th frame instead, sharp or not.
         executor: does the work on several cores or machines: any `concurrent.futures.Executor`, such as a
             `ProcessPoolExecutor`, Dask's `client.get_executor()` or `mpi4py.futures`. Each worker reads its own files.
@@ -106,7 +110,8 @@ def detect(
         The views in which the board was found, in float64 pixels, named by their files (`"image 1"`, ... for arrays).
         Photographs without it are left out, each with a `BoardNotFoundWarning` that names it, and the size of a pattern
         that is there instead. Where the board is seen more than once, the one that covers most of the photograph is
-        taken, with a warning.
+        taken, with a warning. A warning also names photographs whose EXIF data tell of another camera, lens or zoom,
+        of a mirror image, or, upright, of another turn than the others.
 
     Raises:
         BoardNotFoundError: no photograph shows the board.
@@ -125,9 +130,7 @@ def detect(
         >>> views.pixels[0, :2].round(decimals=1).tolist()  # each edge is half a pixel before its first pixel
         [[69.5, 69.5], [109.5, 69.5]]
     """
-    return searched(
-        photographs, target, progress, orientation=orientation, frames=frames, executor=executor, stacklevel=3
-    ).views
+    return searched(photographs, target, progress, orientation=orientation, frames=frames, executor=executor).views
 
 
 @dataclass(frozen=True)
@@ -139,14 +142,14 @@ class Searched:
         photographs: the photograph of each view.
         beside: what was made of each of these, while it was decoded; empty where nothing was asked for.
         without: photographs without the board.
-        broken: files that are no images, of those that may be.
+        broken: what is wrong with files that are no images, of those that may be.
     """
 
     views: Views
     photographs: tuple[Photograph, ...]
     beside: tuple[Any, ...]
     without: tuple[Photograph, ...]
-    broken: tuple[Photograph, ...]
+    broken: tuple[NotAnImageError, ...]
 
 
 def searched(
@@ -159,7 +162,6 @@ def searched(
     executor: Executor | None = None,
     beside: Callable[[Shaped[np.ndarray, "h w"], Float[np.ndarray, "n 2"]], object] | None = None,
     may_be_broken: Collection[Path] = (),
-    stacklevel: int = 2,
 ) -> Searched:
     """What `detect` does, with all that it learns of the photographs.
 
@@ -173,7 +175,6 @@ def searched(
         beside: makes something small of a grey photograph from 0 to 255 that shows the board, and of the corners' px,
             NaN where hidden. It runs where the photograph is decoded, so that nobody decodes it again.
         may_be_broken: folders, of which files that are no images are left out.
-        stacklevel: of the warnings.
 
     Raises:
         NotAnImageError: a file is no image, or none of those that may be broken is one.
@@ -195,11 +196,10 @@ def searched(
         _find, target=target, orientation=raster, beside=beside, may_be_broken=frozenset(may_be_broken)
     )
     results = results_of(search, listing, executor, progress)
-    broken = [photograph for photograph, one in zip(listing, results, strict=True) if one is None]
+    broken = [one for one in results if isinstance(one, NotAnImageError)]
     if len(broken) == len(listing):
-        path = Path(broken[0].label)
-        raise NotAnImageError(path, f"{path.stat().st_size} bytes that OpenCV cannot read as one")
-    pairs = [(photograph, one) for photograph, one in zip(listing, results, strict=True) if one is not None]
+        raise broken[0]
+    pairs = [(photograph, one) for photograph, one in zip(listing, results, strict=True) if isinstance(one, Found)]
     listing, found = [photograph for photograph, _ in pairs], [one for _, one in pairs]
     size = _common_size(listing, [one.size for one in found])
     pairs = [(photograph, one) for photograph, one in pairs if one.grid is not None]
@@ -208,11 +208,12 @@ def searched(
     without = [photograph for photograph, one in zip(listing, found, strict=True) if one.grid is None]
     for photograph, one in zip(listing, found, strict=True):
         if one.grid is None and _sharpness(photograph) is None:
-            text = f"{_miss(photograph, one, target)}; photograph skipped"
-            warnings.warn(text, BoardNotFoundWarning, stacklevel=stacklevel)
+            warn_caller(f"{_miss(photograph, one, target)}; photograph skipped", BoardNotFoundWarning)
+    for doubt in doubts([one.label for one, _ in pairs], [one.exif for _, one in pairs], raster == "upright"):
+        warn_caller(doubt)
     repeated = [photograph.label for photograph, one in pairs if one.again]
     if repeated:
-        warnings.warn(_twice(repeated, target), stacklevel=stacklevel)
+        warn_caller(_twice(repeated, target))
     seen = [photograph for photograph, _ in pairs]
     grids = [one.grid for _, one in pairs if one.grid is not None]
     grids = follow(grids, target) if isinstance(target, Chessboard | CircleGrid) else grids
@@ -233,17 +234,18 @@ def _find(
     orientation: Orientation,
     beside: Callable[..., object] | None,
     may_be_broken: frozenset[Path],
-) -> Found | None:
-    """Read one photograph and find the target in it, the work of one task; `None` for a broken one that may be so."""
+) -> Found | NotAnImageError:
+    """Read one photograph and find the target in it, the work of one task; of a broken one that may be so, why."""
     try:
         image = grey(photograph, orientation)
     except NotAnImageError as error:
         if error.path.parent in may_be_broken:
-            return None
+            return error
         raise
     size = image.shape[1], image.shape[0]
     try:
-        found = find(image, target)._replace(size=size)
+        exif = exif_of(photograph.source.read_bytes()) if isinstance(photograph.source, Path) else None
+        found = find(image, target)._replace(size=size, exif=exif)
         if beside is not None and found.grid is not None:
             found = found._replace(beside=beside(image, found.grid.reshape(-1, 2)))
     except Exception as error:
@@ -264,7 +266,7 @@ def _common_size(listing: list[Photograph], sizes: list[tuple[int, int]]) -> tup
     if len(groups) == 1:
         return sizes[0]
     most = max(groups, key=lambda size: len(groups[size]))
-    got = " and ".join(f"{w} x {h} px in {_named(labels)}" for (w, h), labels in groups.items())
+    got = " and ".join(f"{w} x {h} px in {named(labels)}" for (w, h), labels in groups.items())
     if set(groups) == {most, most[::-1]}:
         raise ValueError(
             f"photographs: want one size, got {got}; some were turned after they were taken: give all as the sensor "
@@ -274,10 +276,6 @@ def _common_size(listing: list[Photograph], sizes: list[tuple[int, int]]) -> tup
         f"photographs: want one size, got {got}; one camera with one zoom gives one size: give those of {most[0]} x "
         f"{most[1]} px alone, and calibrate the others by themselves"
     )
-
-
-def _named(labels: list[str]) -> str:
-    return ", ".join(labels[:3]) + (f" and {len(labels) - 3} more" if len(labels) > 3 else "")
 
 
 def _miss(photograph: Photograph, found: Found, target: Board) -> str:
@@ -293,7 +291,7 @@ def _twice(labels: list[str], target: Board) -> str:
     alone = isinstance(target, Chessboard | CircleGrid)
     differ = "another number of squares or circles" if alone else "markers of other numbers"
     return (
-        f"{_named(labels)}: the {target.title} is seen more than once; the one that covers most of the photograph was "
+        f"{named(labels)}: the {target.title} is seen more than once; the one that covers most of the photograph was "
         f"taken, which need not always be the same one: cover the others, crop them off, or give them {differ}"
     )
 
@@ -316,7 +314,7 @@ def _advice(labels: list[str], found: list[Found], target: Board) -> str:
     if hints:
         there = f" There is {hints[0]}."
     return (
-        f"photographs: want {with_article(target)}, found none in {_named(labels)}.{there} Check target, and that "
+        f"photographs: want {with_article(target)}, found none in {named(labels)}.{there} Check target, and that "
         f"{_CHECKS[type(target)]}"
     )
 
@@ -325,9 +323,10 @@ _CHECKS: dict[type, str] = {
     Chessboard: "the numbers count inner corners (one less than the squares each way), that the whole board is in view "
     "with a margin around it, and that the photographs are sharp and evenly lit",
     CharucoBoard: "the numbers count squares, columns first, that marker, dictionary and legacy are those that the "
-    "board was made with, and that the photographs are sharp and evenly lit, with markers of 15 px or more",
+    "board was made with, and that the photographs are sharp, evenly lit and not mirrored, with markers of 15 px or "
+    "more",
     AprilGrid: "the numbers count tags, columns first, that the tags are of the family 36h11 and begin with number 0, "
-    "and that the photographs are sharp and evenly lit, with tags of 25 px or more",
+    "and that the photographs are sharp, evenly lit and not mirrored, with tags of 25 px or more",
     CircleGrid: "the numbers count circles, columns first, that every second line is shifted where asymmetric says so, "
     "that the whole board is in view, and that the photographs are sharp and evenly lit, with circles of 6 px or more",
 }

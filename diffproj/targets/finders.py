@@ -12,6 +12,7 @@ from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.circle_grid import CircleGrid
 from diffproj.targets.circles import find_circles
 from diffproj.targets.corners import refine_grid
+from diffproj.targets.exif import Exif
 from diffproj.targets.images import as_8_bit
 from diffproj.targets.marked import find_marked, not_found
 from diffproj.targets.numbering import in_order
@@ -46,6 +47,7 @@ class Found(NamedTuple):
         size: `(width, height)` of the photograph, which who reads it fills in.
         beside: what else was made of the photograph.
         again: whether the board is seen elsewhere in it as well; the larger one was taken.
+        exif: what its file tells beside the pixels, which who reads it fills in.
     """
 
     grid: Float[np.ndarray, "rows columns 2"] | None
@@ -54,6 +56,7 @@ class Found(NamedTuple):
     size: tuple[int, int] = (0, 0)
     beside: object = None
     again: bool = False
+    exif: Exif | None = None
 
 
 def find(image: Shaped[np.ndarray, "h w"], target: Board) -> Found:

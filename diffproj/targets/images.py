@@ -14,9 +14,10 @@ from torch import Tensor
 from diffproj._core.arguments import listing
 from diffproj._core.dense import dense
 from diffproj.targets import videos
+from diffproj.targets.exif import as_recorded
 from diffproj.targets.videos import Frame
 
-SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".jp2", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
+SUFFIXES = frozenset({".bmp", ".jfif", ".jpeg", ".jpg", ".jp2", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
 """Suffixes of the files in a folder that count as photographs."""
 
 Orientation = Literal["sensor", "upright"]
@@ -125,7 +126,7 @@ def grey(photograph: Photograph, orientation: Orientation = "sensor") -> Shaped[
     if isinstance(source, Path):
         return _scaled(label, decoded(source, orientation))
     if isinstance(source, Frame):
-        return source.image
+        return source.upright if orientation == "upright" else source.image
     image = _channels_last(label, source) if isinstance(source, Tensor) else source
     if image.size == 0 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (1,), (3,), (4,)):
         raise ValueError(f"{label}: want {LAYOUTS}, got shape {tuple(source.shape)}")
@@ -140,16 +141,21 @@ def as_8_bit(image: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     return image if image.dtype == np.uint8 else np.rint(image).astype(np.uint8)
 
 
+UNREADABLE = "OpenCV cannot read as one"
+"""What is said of the bytes of a file that is no image, or a damaged one."""
+
+
 class NotAnImageError(ValueError):
     """A file that is no image, or a damaged one, or one whose values are no grey levels.
 
     Attributes:
         path: the file.
+        readable: whether it is an image, of a kind that is of no use here.
     """
 
     def __init__(self, path: Path, found: str) -> None:
         super().__init__(path, found)  # so that it can travel from process to process
-        self.path = path
+        self.path, self.readable = path, UNREADABLE not in found
 
     def __str__(self) -> str:
         return f"{self.path}: want an image, got {self.args[1]}"
@@ -163,13 +169,17 @@ def decoded(path: Path, orientation: Orientation, colour: bool = False) -> np.nd
         OSError: it cannot be read.
     """
     # cv2.imread does not distinguish a missing file from a broken one, and fails on some file names.
-    data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    content = path.read_bytes()
+    data = np.frombuffer(as_recorded(content) if orientation == "sensor" else content, dtype=np.uint8)
     flags = (cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE) | cv2.IMREAD_ANYDEPTH
     if orientation == "sensor":
         flags |= cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(data, flags) if data.size else None
+    try:
+        image = cv2.imdecode(data, flags) if data.size else None
+    except cv2.error as error:  # as of a header that tells of a gigapixel and more
+        raise NotAnImageError(path, f"one that OpenCV refuses ({error.err})") from None
     if image is None:
-        raise NotAnImageError(path, f"{data.size} bytes that OpenCV cannot read as one")
+        raise NotAnImageError(path, f"{data.size} bytes that {UNREADABLE}")
     if image.dtype not in (np.uint8, np.uint16, np.int16) and not np.issubdtype(image.dtype, np.floating):
         raise NotAnImageError(path, f"one of {image.dtype}; save it with 8 or 16 bits")
     if np.issubdtype(image.dtype, np.floating) and not (image.min() >= 0 and image.max() <= 1):  # NaN neither

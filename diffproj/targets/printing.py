@@ -30,6 +30,9 @@ PAPERS = {
 }
 """Widths and heights of papers, upright, in mm."""
 
+LARGEST = 5000
+"""Longer side in mm of the largest paper."""
+
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 """Units that a target may be described in, in mm."""
 
@@ -89,7 +92,8 @@ def draw_target(
         Traceback (most recent call last):
         ...
         ValueError: target: want at most 277 x 176 mm on A4 with its margins, got 360 x 270 mm; the largest square that
-        fits is 19.5 mm, and a larger paper takes more
+        fits is 19.5 mm, and a larger paper takes more, such as paper=(380, 304) of a print shop. A board goes on one
+        page, not over several: joined pieces are neither flat nor square enough
     """
     as_printed(target, "target")
     file = file_path("path", path)
@@ -143,9 +147,9 @@ def _page(target: Board, paper: str | Sequence[float], scale: float) -> tuple[fl
             raise ValueError(f"paper: want one of {', '.join(PAPERS)}, or (width, height) in mm, got {paper!r}")
         size = named[paper.lower()]
     else:
-        want = "(width, height) in mm, from 50 to 5000"
+        want = f"(width, height) in mm, from 50 to {LARGEST}"
         size = numbers("paper", paper, want, 2)
-        if not 50 <= min(size) <= max(size) <= 5000:
+        if not 50 <= min(size) <= max(size) <= LARGEST:
             raise ValueError(f"paper: want {want}, got {size}")
     width, height = (length * scale for length in target.artwork.size)
     room = {page: (page[0] - 2 * MARGIN, page[1] - 2 * MARGIN - FOOT) for page in ((*size,), (*reversed(size),))}
@@ -158,9 +162,12 @@ def _page(target: Board, paper: str | Sequence[float], scale: float) -> tuple[fl
         largest = math.floor(10 * target.side * scale * fill[best]) / 10
         name = paper if isinstance(paper, str) else f"{size[0]:g} x {size[1]:g} mm"
         across, down = room[best]
+        needed = math.ceil(width + 2 * MARGIN), math.ceil(height + 2 * MARGIN + FOOT)
+        own = f", such as paper=({needed[0]}, {needed[1]}) of a print shop" if max(needed) <= LARGEST else ""
         raise ValueError(
             f"target: want at most {across:g} x {down:g} mm on {name} with its margins, got {width:g} x {height:g} mm; "
-            f"the largest {what} that fits is {largest:g} mm, and a larger paper takes more"
+            f"the largest {what} that fits is {largest:g} mm, and a larger paper takes more{own}. A board goes on one "
+            "page, not over several: joined pieces are neither flat nor square enough"
         )
     return best[0], best[1]
 

@@ -9,7 +9,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4"})
+SUFFIXES = frozenset(
+    {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".webm", ".wmv"}
+)
 """Suffixes of files that count as videos."""
 
 MOST = 60
@@ -26,6 +28,7 @@ class Frame(NamedTuple):
         video: the file.
         number: of the frame, from 0.
         png: the grey image.
+        turn: by how many degrees clockwise the video asks to be turned when it is shown.
         sharpness: for which it was chosen, so that others may show the board at the same place; None where every
             n-th frame was asked for.
     """
@@ -33,12 +36,18 @@ class Frame(NamedTuple):
     video: Path
     number: int
     png: bytes
+    turn: int
     sharpness: float | None
 
     @property
     def image(self) -> UInt8[np.ndarray, "h w"]:
         """The grey image `(H, W)`."""
         return np.asarray(cv2.imdecode(np.frombuffer(self.png, dtype=np.uint8), cv2.IMREAD_GRAYSCALE))
+
+    @property
+    def upright(self) -> UInt8[np.ndarray, "_h _w"]:
+        """The grey image turned as the video asks, as players show it."""
+        return np.ascontiguousarray(np.rot90(self.image, -(self.turn // 90)))
 
 
 def frames_of(video: Path, every: int | None) -> list[Frame]:
@@ -54,7 +63,7 @@ def frames_of(video: Path, every: int | None) -> list[Frame]:
 
 
 def _each(video: Path, every: int) -> list[Frame]:
-    return [_kept(video, n, image, None) for n, image in islice(enumerate(_decoded(video)), 0, None, every)]
+    return [_kept(video, n, *one, None) for n, one in islice(enumerate(_decoded(video)), 0, None, every)]
 
 
 def _sharpest(video: Path) -> list[Frame]:
@@ -62,7 +71,7 @@ def _sharpest(video: Path) -> list[Frame]:
     length = -(-sum(1 for _ in _decoded(video)) // MOST)
     frames: list[Frame] = []
     best = -1.0
-    for number, image in enumerate(_decoded(video)):
+    for number, (image, turn) in enumerate(_decoded(video)):
         if number % length == 0:
             best = -1.0
         sharpness = _sharpness(image)
@@ -70,7 +79,7 @@ def _sharpest(video: Path) -> list[Frame]:
             if best >= 0:
                 frames.pop()
             best = sharpness
-            frames.append(_kept(video, number, image, sharpness))
+            frames.append(_kept(video, number, image, turn, sharpness))
     return frames
 
 
@@ -92,16 +101,17 @@ def _moved(one: Float[np.ndarray, "rows columns 2"], other: Float[np.ndarray, "r
     return float(np.nanmean(motion)) if np.isfinite(motion).any() else np.inf
 
 
-def _decoded(video: Path) -> Iterator[UInt8[np.ndarray, "_h _w"]]:
-    """All frames, grey, as they lie in the file."""
+def _decoded(video: Path) -> Iterator[tuple[UInt8[np.ndarray, "_h _w"], int]]:
+    """All frames, grey, as they lie in the file, and by how many degrees clockwise it asks to turn them."""
     capture = cv2.VideoCapture(str(video))
     try:
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        turn = int(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360
         while True:
             there, image = capture.read()
             if not there:
                 return
-            yield image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+            yield image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), turn
     finally:
         capture.release()
 
@@ -112,5 +122,6 @@ def _sharpness(image: UInt8[np.ndarray, "h w"]) -> float:
     return float(cv2.Laplacian(small, cv2.CV_32F).var())
 
 
-def _kept(video: Path, number: int, image: UInt8[np.ndarray, "h w"], sharpness: float | None) -> Frame:
-    return Frame(video, number, cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes(), sharpness)
+def _kept(video: Path, number: int, image: UInt8[np.ndarray, "h w"], turn: int, sharpness: float | None) -> Frame:
+    png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+    return Frame(video, number, png, turn, sharpness)

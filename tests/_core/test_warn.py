@@ -1,9 +1,12 @@
 """Warnings point at the line that called into the package."""
 
+import re
 import warnings
+from pathlib import Path
 
 import pytest
 
+import diffproj
 from diffproj._core.warn import warn_caller
 
 
@@ -24,3 +27,9 @@ def test_however_deep_it_arises(depth: int) -> None:
         warnings.simplefilter("always")
         outside["use"](depth)  # type: ignore[operator]
     assert [warning.filename for warning in seen] == ["theirs.py"]
+
+
+def test_nothing_warns_at_a_line_of_the_package() -> None:
+    room = Path(diffproj.__file__).parent
+    direct = [path.name for path in room.rglob("*.py") if re.search(r"\bwarnings\.warn\(", path.read_text())]
+    assert direct == ["warn.py"]

@@ -77,6 +77,11 @@ def test_a_page(tmp_path, capsys):
             "--diameter: want it in the unit of the board",
         ),
         (("--board", "9x6", "--square", "5cm"), 1, "the largest square that fits is 25.1 mm"),
+        (
+            ("--board", "9x6", "--square", "5cm"),
+            1,
+            "a larger paper takes more, such as --paper 520,384 of a print shop",
+        ),
         (("--board", "9x6", "--square", "5mm", "--paper", "B9"), 1, "--paper: want one of A0"),
         (("--target", "none.yaml"), 1, "none.yaml: No such file"),
     ],

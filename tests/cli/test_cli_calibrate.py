@@ -251,6 +251,7 @@ def test_what_is_no_photograph_in_a_folder_is_left_out_and_told(
     for name in ("._1.png", ".DS_Store", "film.mp4", "a.HEIC", "b.heic", "c.cr2"):
         (folder / name).write_bytes(b"something")
     (folder / "folder.png").mkdir()
+    (folder / "lost.png").symlink_to("nowhere.png")
     code, _, err = calibrate(capsys, folder, "--distortion", "none", "-o", file)
     assert code == 0
     assert dp.load_calibration(file).views.names == ("1.png", "2.png", "3.png", "4.png", "6.png")
@@ -258,6 +259,7 @@ def test_what_is_no_photograph_in_a_folder_is_left_out_and_told(
         line.removeprefix("diffproj: ").replace(f"{folder}/", "").replace(str(folder), "folder")
         for line in err.splitlines()
     ]
+    assert told.pop(0) == "lost.png: a link to a file that is not there; skipped"
     assert told[0].startswith("folder: skipped 2 HEIC photographs, which OpenCV does not read: convert to JPEG in full")
     assert told[1].startswith("folder: skipped 1 raw photograph, which OpenCV does not read: convert to TIFF or PNG")
     assert told[2] == "folder: skipped 1 video: name a video by itself, for its frames are of another size"
@@ -267,7 +269,7 @@ def test_what_is_no_photograph_in_a_folder_is_left_out_and_told(
     assert told[6:] == [
         "empty.jpg: cannot be read as an image; skipped",
         "half.png: cannot be read as an image; skipped",
-        "heights.tif: cannot be read as an image; skipped",
+        "heights.tif: want an image, got one of int32; save it with 8 or 16 bits; skipped",
     ]
 
 

@@ -39,6 +39,18 @@ def test_a_camera_goes_from_one_program_to_another(folder: Path, capsys: pytest.
     assert f"{folder}/a.json: one camera of 640 x 480 px, BrownConrady" in capsys.readouterr().out
 
 
+def test_convert_names_lenses_as_the_other_documents_do(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for source, lens in (("opencv.yml", "brown5"), ("camera.json", "none")):
+        if source == "camera.json":
+            dp.save_camera(folder / source, dp.Camera(dp.load_camera(folder / "opencv.yml").K, size=(640, 480)))
+        told = []
+        for command in (["convert", str(folder / source), str(folder / "b.json")], ["info", str(folder / source)]):
+            assert main([*command, "--json"]) == 0
+            told.append(json.loads(capsys.readouterr().out))
+        assert told[0]["lens"] == next(iter(told[1]["cameras"].values()))["lens"] == lens
+        assert (told[0]["rig"], told[0]["cameras"]) == (None, None)
+
+
 def test_a_whole_calibration_stays_whole(folder: Path) -> None:
     calibration = dp.calibrate(dp.example_views("left")[:4], dp.Chessboard())
     dp.save_camera(folder / "c.json", calibration)

@@ -118,6 +118,24 @@ def test_what_is_done_is_not_done_again(fleet, tmp_path, capsys, monkeypatch):
     assert len(file.read_text().splitlines()) == 5
 
 
+def test_the_document_speaks_of_options_and_tells_notes(fleet, tmp_path, capsys, monkeypatch):
+    photograph = benchmark.cv2.imread(str(fleet / "cam10" / "0.png"))
+    benchmark.cv2.imwrite(str(fleet / "cam10" / "9.png"), photograph * 0 + 90)
+    said = "Weak: 3 world units off; try distortion='brown8' ('auto' compares the lenses)."
+    monkeypatch.setattr(dp.Calibration, "verdict", property(lambda _: said))
+    code, out, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", tmp_path / "out.jsonl", "--json")
+    assert (code, err) == (0, "")
+    told = json.loads(out)
+    assert {one["verdict"] for one in told["worst"]} == {
+        "Weak: 3 mm off; try --distortion brown8 (auto compares the lenses)."
+    }
+    assert (told["warnings"], told["unit"]) == ([], "mm")
+    assert list(told["notes"]) == ["cam10"]
+    assert "9.png: found no board" in told["notes"]["cam10"][0]
+    code, out, _ = run(capsys, "--fleet", fleet, *GIVEN, "-o", tmp_path / "out.jsonl")
+    assert 'Notes on photographs of cam10: see "notes" in the file' in out
+
+
 def test_other_options_are_not_mixed(fleet, tmp_path, capsys):
     file = tmp_path / "out.jsonl"
     run(capsys, "--fleet", fleet, *GIVEN, "-o", file)

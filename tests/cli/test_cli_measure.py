@@ -358,6 +358,10 @@ def test_lists_of_numbers_are_no_options() -> None:
         "5,-3",
     ]
     assert shielded(["--csv=-a,b.csv"]) == ["--csv=-a,b.csv"]
+    lengths = ["-3mm", "-.5 cm", "-2.5IN", "-3 µm", "-1e-3", "-1E2m"]
+    assert shielded(lengths) == [f" {length}" for length in lengths]
+    others = ["-3", "-.5", "-1.jpg", "-v", "-mm", "3mm", "-"]
+    assert shielded(others) == others
 
 
 def test_equations_and_quantities_for_people() -> None:
@@ -392,6 +396,7 @@ def test_heights_are_above_the_face_in_every_frame(
     options = ("--camera", file, "--view", seen.names[3], "--points", "300,200", "420,300")
     above = parsed(capsys, *options, "--height", "12")
     below = parsed(capsys, *options, "--height", "-3")
+    assert parsed(capsys, "--height", "-3e0", *options) == below
     assert (above["plane"], above["height"]) == ([0, 0, 1, 12 * towards], 12)
     assert (below["plane"], below["height"]) == ([0, 0, 1, -3 * towards], -3)
     assert above["lengths"][0]["value"] < below["lengths"][0]["value"]
@@ -564,9 +569,12 @@ def test_a_hand_picks_as_the_library_says() -> None:
         (3, "(639 - x, 479 - y)", (602, 378)),
         (6, "(y, 479 - x)", (101, 442)),
         (8, "(639 - y, x)", (538, 37)),
-        (2, "", None),
+        (2, "(639 - x, y)", (602, 101)),
+        (4, "(x, 479 - y)", (37, 378)),
+        (5, "(y, x)", (101, 37)),
+        (7, "(639 - y, 479 - x)", (538, 442)),
     ],
-    ids=["as it is", "upside down", "right", "left", "mirrored"],
+    ids=["as it is", "upside down", "right", "left", "mirrored", "upside down in water", "about x = y", "about x = -y"],
 )
 def test_a_photograph_that_programs_show_turned_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], orientation: int, told: str, place: tuple[int, int] | None
@@ -578,9 +586,11 @@ def test_a_photograph_that_programs_show_turned_is_told(
     path.write_bytes(with_orientation(jpeg, orientation))
     code, _, err = run(capsys, path, "--camera", "camera.json", *BOARD, "--points", CORNERS[0])
     assert code == 0
-    assert ("ask programs to show it turned, and --points count as the sensor" in " ".join(err.split())) == (
+    how = "mirrored" if orientation in (2, 4, 5, 7) else "turned"
+    assert (f"ask programs to show it {how}, and --points count as the sensor" in " ".join(err.split())) == (
         orientation != 1
     )
+    assert ("x and y are those of a mirrored world: give --orientation upright" in err) == (how == "mirrored")
     assert ("one that they show at (x, y) is" in " ".join(err.split())) == bool(told)
     assert told in " ".join(err.split())
     if place is not None:  # of (37, 101)
@@ -589,9 +599,9 @@ def test_a_photograph_that_programs_show_turned_is_told(
     code, _, err = run(
         capsys, path, "--camera", "camera.json", *BOARD, "--points", CORNERS[0], "--orientation", "upright"
     )
-    assert "ask programs to show it turned" not in err
+    assert f"ask programs to show it {how}" not in err
     refused = "leave out --orientation upright, with which EXIF data turn this one" in " ".join(err.split())
-    assert refused == (code == 1) == (orientation in (6, 8))  # the camera's photographs are 640 x 480 px
+    assert refused == (code == 1) == (orientation in (5, 6, 7, 8))  # the camera's photographs are 640 x 480 px
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])

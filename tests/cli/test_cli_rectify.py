@@ -168,3 +168,28 @@ def test_a_tilted_plane_names_the_axes_that_its_extent_is_along(capsys: pytest.C
     assert "From (0, 36, 48), 0 to 100 mm along (1, 0, 0) and -20 to 40 mm along (0, 0.8, -0.6): 100 x 60 px" in text
     level = parsed(capsys, *GIVEN, "--extent", "0,0,100,60", "--resolution", "1")
     assert (level["origin"], level["axes"]) == ([0, 0, 0], [[1, 0, 0], [0, 1, 0]])
+
+
+@pytest.mark.parametrize(
+    ("given", "plane", "said"),
+    [
+        (
+            (*GIVEN,),
+            ("--height", "100m"),
+            "--height: want a plane that the photograph shows, got z = -100000, 100000 mm",
+        ),
+        (
+            ("mast.png", "--camera", "located.json", "--view", "mast.png"),
+            ("--height", "9"),
+            "shows, got z = 9, which no",
+        ),
+        ((*GIVEN, "--extent", "0,0,9,9"), ("--plane", "0,0,1,-1e5"), "--plane: want a plane that the photograph shows"),
+    ],
+)
+def test_a_plane_behind_the_camera_is_named_and_not_its_extent(
+    given: tuple[str, ...], plane: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, err = run(capsys, *given, *plane, "-o", "never.png")
+    assert code == 1
+    assert said in err
+    assert not Path("never.png").exists()

@@ -1,5 +1,6 @@
 """What all commands have in common: documents, how much is said, output that nobody takes, completion, inputs read once."""
 
+import argparse
 import errno
 import io
 import json
@@ -9,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,7 +18,8 @@ import numpy as np
 import pytest
 
 import diffproj as dp
-from diffproj import cli, synthetic
+from diffproj import __main__, cli, synthetic
+from diffproj.cli.calibrate_document import document
 from diffproj.cli.terminal import RESULTS
 from diffproj.files.document import Document
 from tests.cli.commands import runner
@@ -111,6 +114,16 @@ def test_the_document_of_a_calibration(capsys: pytest.CaptureFixture[str]) -> No
     assert (found["status"], found["lens"], found["size"], found["unit"]) == ("CONVERGED", "none", [640, 480], "mm")
     folds = dp.cross_validate(whole.views, dp.Chessboard(8, 5, 25.0), "none", 5)
     assert found["folds"]["held_out_px"] == pytest.approx(folds.held_out_px.tolist(), rel=1e-6)
+
+
+def test_documents_speak_of_options_and_units() -> None:
+    """And not of Python's arguments, as what is printed for people."""
+    found = dp.calibrate(dp.example_views("left"), dp.Chessboard(9, 6, 25.0))
+    assert "take shape='free'" in found.message
+    asked = argparse.Namespace(output="a.json", draw=None, report=None, warned=[])
+    told = document(asked, replace(found, unit="mm"), None)
+    assert "whose corners lie 0.069 mm (RMS) off the target's: take --shape free, which" in told["message"]
+    assert not re.search(r"\w=|world units", told["message"] + told["verdict"])
 
 
 def test_folds_are_printed_and_few_views_refused(capsys: pytest.CaptureFixture[str]) -> None:
@@ -275,6 +288,23 @@ def test_files_are_read_once(
     code, _, err = run(capsys, *arguments)
     assert code == 0, err
     assert read == expected
+
+
+def test_interrupted_while_it_loads(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted() -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("diffproj.__main__.run", interrupted)
+    assert __main__.main() == 130
+    assert capsys.readouterr() == ("", "diffproj: interrupted\n")
+
+
+def test_of_a_damaged_video_one_line_tells(tmp_path: Path) -> None:
+    (tmp_path / "film.mp4").write_bytes(b"something")
+    command = [sys.executable, "-m", "diffproj", "calibrate", str(tmp_path / "film.mp4"), *BOARD]
+    done = subprocess.run(command, capture_output=True, text=True)
+    told = f"diffproj: {tmp_path / 'film.mp4'}: want a video, got a file of which OpenCV reads no frame\n"
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", told)
 
 
 def test_frames_of_videos_are_decoded_once(read: Counter[str], capsys: pytest.CaptureFixture[str]) -> None:

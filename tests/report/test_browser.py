@@ -226,6 +226,15 @@ def test_it_fits_every_screen(file: Path, width: int, scheme: str, opened: Calla
 
 
 @pytest.mark.slow
+def test_where_scripts_do_not_run_it_says_so(file: Path, chromium: Any) -> None:
+    for runs in (False, True):
+        context = chromium.new_context(java_script_enabled=runs, offline=True)
+        page = context.new_page()
+        page.goto(file.as_uri())
+        assert ("Measuring takes JavaScript, which does not run here" in page.locator("body").inner_text()) != runs
+        context.close()
+
+
 def test_points_are_dragged_zoomed_named_and_deleted(file: Path, opened: Callable[..., Page]) -> None:
     page = opened(file)
     click(page, (244, 94), (512, 110))

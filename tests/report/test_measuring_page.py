@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import diffproj as dp
 from diffproj.report.measuring import SCRIPTS, SIDE, colour, embedded, measuring_part, script
 from diffproj.report.measuring_model import as_one, measuring_model
-from diffproj.targets.images import listed
+from diffproj.targets.images import grey, listed
 
 D = torch.float64
 GREY = np.full((480, 640), 90, np.uint8)
@@ -84,6 +85,19 @@ def test_colours_are_kept_where_there_are_8_bits(deep: bool, tmp_path: Path) -> 
     assert found.shape == ((20, 30) if deep else (20, 30, 3))
     assert deep or (found == image).all()
     assert (colour(listed(image.astype(np.uint8))[0]) == image).all()
+
+
+@pytest.mark.parametrize("orientation", range(2, 9))
+def test_a_tiff_is_shown_as_its_pixels_count(orientation: int, tmp_path: Path) -> None:
+    """OpenCV turns it, also where it is told not to: clicks would have been those of another image."""
+    image = np.random.default_rng(0).integers(0, 256, (20, 30)).astype(np.uint8)
+    path = tmp_path / "turned.tif"
+    Image.fromarray(image).save(path, tiffinfo={0x0112: orientation})
+    (photograph,) = listed(str(path))
+    np.testing.assert_array_equal(colour(photograph)[..., 0], image)
+    np.testing.assert_array_equal(grey(photograph), image)
+    turned = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(colour(photograph, "upright"), turned)
 
 
 def test_names_that_are_no_utf_8(calibration: dp.Calibration, tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from diffproj.report.folds import folds_part
 from diffproj.report.lens import curve
 from diffproj.report.parameters import parameters_part
 from diffproj.report.pictures import MOST_BYTES, pictures
+from diffproj.report.shape import shape_part
 from diffproj.report.suggestions import NINTHS, suggestions
 from diffproj.report.usage import usage_part
 from diffproj.report.verdict import verdict_part
@@ -508,6 +509,25 @@ def test_a_landmarks_plane_is_that_of_their_mean_height() -> None:
     for part in (accuracy_part(Facts(found, (640, 480))), usage_part(Facts(found, (640, 480)), "camera.json")):
         assert "board" not in words(part.html).replace("Board", "board")
         assert re.search("the plane of the landmarks.{1,2} mean z", words(part.html))
+
+
+def test_landmarks_are_no_board_whose_shape_was_designed() -> None:
+    """Where they have deviations of their own their places are found, too."""
+    found = landmarks()
+    part = shape_part(Facts(found, (640, 480)))
+    assert part.title == "The landmarks' places"
+    assert words(part.html).startswith("The landmarks were taken to be where they were surveyed.")
+    cameras = [
+        found.cameras[0].shifted(torch.tensor(offset, dtype=D)) for offset in ([0.0, 0, 0], [2, 0, 0], [0, 2, 0])
+    ]
+    pixels = torch.stack([camera.project(found.nominal)[0] for camera in cameras])
+    surveyed = dp.Landmarks(found.nominal, sigma=0.05)
+    moved = dp.refine(dp.Views(pixels, size=(640, 480)), surveyed, found.camera, pixel_sigma=0.3)
+    assert moved.shape == "free"
+    fitted = shape_part(Facts(moved, (640, 480)))
+    assert "The place of every landmark was fitted along with the camera: they lie " in words(fitted.html)
+    assert "board" not in (part.html + fitted.html).lower()
+    assert shape_part(Facts(few(5), (640, 480))).title == "The board's shape"
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

@@ -90,6 +90,9 @@ def test_the_warning_points_at_the_caller_s_line_through_the_package(tmp_path):
 
 
 def test_what_does_not_fit_is_refused_with_what_does(tmp_path):
+    with pytest.raises(ValueError, match=r"such as paper=\(770, 534\) of a print shop\. A board goes on one page"):
+        dp.draw_target(dp.Chessboard(14, 9, 50.0), tmp_path / "big.pdf")
+    dp.draw_target(dp.Chessboard(14, 9, 50.0), tmp_path / "big.pdf", paper=(770, 534))
     with pytest.raises(ValueError, match=r"277 x 176 mm on A4 .*, got 360 x 270 mm; the largest square .* 19\.5 mm"):
         dp.draw_target(dp.Chessboard(11, 8, 30.0), tmp_path / "board.pdf")
     dp.draw_target(dp.Chessboard(11, 8, 19.5), tmp_path / "board.pdf")

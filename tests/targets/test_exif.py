@@ -1,0 +1,110 @@
+"""What files tell beside their pixels, against Pillow that writes it and OpenCV that follows it."""
+
+import io
+import struct
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from diffproj.targets.exif import Exif, exif_of
+from diffproj.targets.images import NotAnImageError, decoded
+
+PICTURE = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
+EXIF_PART = 0x8769
+
+
+def written(kind: str, orientation: int = 1, focal: float = 24.0) -> bytes:
+    """A file as a camera writes it, with the parts that this package reads."""
+    exif = Image.Exif()
+    exif[0x0112], exif[0x010F], exif[0x0110] = orientation, "Nikon", "Nikon D7"
+    part = exif.get_ifd(EXIF_PART)
+    part[0x920A], part[0xA404] = IFDRational(round(100 * focal), 100), IFDRational(3, 2)
+    part[0xA405], part[0xA431], part[0xA434] = 36, "0042", "18-55mm"
+    file = io.BytesIO()
+    Image.fromarray(PICTURE).save(file, kind, exif=exif)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF"])
+def test_what_files_tell(kind: str) -> None:
+    found = exif_of(written(kind, 6))
+    expected = Exif(6, "Nikon D7") if kind == "TIFF" else Exif(6, "Nikon D7", "0042", "18-55mm", 24.0, 1.5, 36)
+    assert found._replace(turned_at=None) == expected  # into a TIFF Pillow writes no more
+    assert (found.turned_at is None) == (kind != "TIFF")
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF"])
+def test_files_without_it_and_damaged_ones_tell_nothing_wrong(kind: str) -> None:
+    plain = io.BytesIO()
+    Image.fromarray(PICTURE).save(plain, kind)
+    assert exif_of(plain.getvalue()) == Exif()
+    whole = written(kind)
+    for end in range(0, len(whole), 7):
+        found = exif_of(whole[:end])
+        assert found.focal in (None, 24.0)
+        assert found.orientation == 1
+    for seed in range(300):
+        draw = np.random.default_rng(seed)
+        damaged = bytearray(whole)
+        for place in draw.integers(2, min(len(whole), 400), 8):
+            damaged[place] = draw.integers(256)
+        assert 1 <= exif_of(bytes(damaged)).orientation <= 8
+    assert exif_of(b"") == exif_of(b"GIF89a") == exif_of(b"II*\0") == Exif()
+
+
+def tiff(order: Literal["<", ">"], picture: np.ndarray, orientation: int) -> bytes:
+    """A grey picture in a file of that order of bytes, with its orientation: little more than its ten entries."""
+    height, width = picture.shape
+    bits = 8 * picture.itemsize
+    pixels = picture.astype(picture.dtype.newbyteorder(order)).tobytes()
+    tags = {256: width, 257: height, 258: bits, 259: 1, 262: 1, 273: 200, 274: orientation, 277: 1, 278: height}
+    head = struct.pack(f"{order}2sHIH", b"II" if order == "<" else b"MM", 42, 8, len(tags) + 1)
+    for tag, value in tags.items():
+        head += struct.pack(f"{order}HHIHH", tag, 3, 1, value, 0)
+    head += struct.pack(f"{order}HHII", 279, 4, 1, len(pixels)) + bytes(4)
+    return head.ljust(200, b"\0") + pixels
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_tiffs_are_read_as_recorded(tmp_path: Path, dtype: type, order: Literal["<", ">"], orientation: int) -> None:
+    """OpenCV turns them even where it is told not to."""
+    picture = PICTURE.astype(dtype)
+    path = tmp_path / "turned.tif"
+    path.write_bytes(tiff(order, picture, orientation))
+    assert exif_of(path.read_bytes()).orientation == orientation
+    np.testing.assert_array_equal(decoded(path, "sensor"), picture)
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    turned = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    np.testing.assert_array_equal(decoded(path, "upright"), turned)
+
+
+def test_only_the_first_picture_of_a_tiff_counts_and_copies_of_it_do_not(tmp_path: Path) -> None:
+    pictures = [Image.fromarray(np.roll(PICTURE, n)) for n in range(3)]
+    file = io.BytesIO()
+    pictures[0].save(file, "TIFF", save_all=True, append_images=pictures[1:])
+    assert exif_of(file.getvalue()).pictures == 3
+    (tmp_path / "three.tif").write_bytes(file.getvalue())
+    np.testing.assert_array_equal(decoded(tmp_path / "three.tif", "sensor"), PICTURE)
+    small = pictures[1].resize((16, 12))
+    small.encoderinfo = {"tiffinfo": {0x00FE: 1}}
+    file = io.BytesIO()
+    pictures[0].save(file, "TIFF", save_all=True, append_images=[small])
+    assert exif_of(file.getvalue()).pictures == 1
+
+
+def test_an_image_of_absurd_size_is_refused_and_not_a_mistake_of_ours(tmp_path: Path) -> None:
+    """OpenCV raises an error of its own, which a folder of good photographs failed by."""
+    whole = bytearray(cv2.imencode(".bmp", PICTURE)[1].tobytes())
+    struct.pack_into("<i", whole, 18, 2**30)
+    path = tmp_path / "large.bmp"
+    path.write_bytes(whole)
+    with pytest.raises(NotAnImageError, match=r"large\.bmp: want an image, got one that OpenCV refuses \(") as refused:
+        decoded(path, "sensor")
+    assert refused.value.readable
