@@ -59,3 +59,31 @@ def test_of_many_cameras_those_are_named() -> None:
     assert "cameras 1 are larger than pixel_sigma says" in found.doubts
     measured = dp.measure([[600.0, 800.0]], found, dp.Plane.z(0.0), view=0, pixel_sigma=1.0)
     assert measured.doubts == found.doubts
+
+
+TOGETHER = "the views contradict each other"
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_noise_that_leaves_out_what_corners_of_a_view_have_in_common_is_told(side: str) -> None:
+    """Without it deviations are 2.5 and 2.8 times as large."""
+    views, board = dp.example_views(side), dp.Chessboard()
+    plain = dp.calibrate(views, board)
+    known = dp.calibrate(views, board, pixel_sigma=float(plain.pixel_sigma))  # type: ignore[arg-type]
+    times = float(plain.covariance.deviations["f_x"] / known.covariance.deviations["f_x"])
+    assert times > 2
+    assert f"{TOGETHER} {times:.2g} times as much as corners of that pixel_sigma would" in known.remarks[0]
+    assert known.verdict.startswith(f"Weak: {TOGETHER}")
+    assert TOGETHER not in plain.remarks[0]
+    assert TOGETHER not in dp.calibrate(views, board, pixel_sigma=2.5 * float(plain.pixel_sigma)).remarks[0]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("views", [2, 3, 5, 13])
+def test_views_of_independent_corners_do_not_contradict_each_other(views: int) -> None:
+    camera = dp.Camera(torch.tensor([[533.0, 0, 342], [0, 534, 235], [0, 0, 1]], dtype=D), size=(640, 480))
+    board = dp.Chessboard()
+    posed = dp.synthetic.random_cameras(camera, board, 40 * views, seed=1)
+    posed = camera.at(posed.R.unflatten(0, (40, views)), posed.t.unflatten(0, (40, views)))
+    seen = dp.synthetic.corner_views(posed, board, noise_px=0.1, seed=2)
+    found = dp.calibrate(seen, board, "none", pixel_sigma=0.1, throw=False)
+    assert not any(TOGETHER in remark for remark in found.remarks)

@@ -30,7 +30,8 @@ class LocateOptions(TypedDict, total=False):
             0 takes no part. 1 everywhere if left out.
         pixel_sigma: the standard deviation of the corners' coordinates in px where it is known, a number or
             broadcasting to `(*B, V, N)`: the covariance then is that of this noise, whatever the residuals are, and
-            intervals are the normal distribution's. If left out, the residuals tell it. Not with `weights` or
+            intervals are the normal distribution's; a remark says where views contradict each other by more than that.
+            If left out, the residuals tell it. Not with `weights` or
             `objective="plane"`; under a robust `loss` it only weighs, for wrong corners have no deviation.
         reject_outliers: leave out corners whose residual exceeds 5 (or so many) robust standard deviations, and
             repeat; `Calibration.rejected` and the summary name them. False if left out.

@@ -28,9 +28,9 @@ from diffproj.calibration.trust.adequacy import (
     wants_skew,
 )
 from diffproj.calibration.trust.discounted import discounted
-from diffproj.calibration.trust.dispersion import dispersion, pulls_of
+from diffproj.calibration.trust.dispersion import contradiction, dispersion, pulls_of
 from diffproj.calibration.trust.entangled import Entangled, Simpler
-from diffproj.calibration.trust.leftover import Leftover, leftover
+from diffproj.calibration.trust.leftover import Leftover, f_deviations, leftover
 from diffproj.calibration.trust.own_focal import OwnFocal, own_focal
 from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
 from diffproj.calibration.trust.prior_weight import Elsewhere, weighed_anew
@@ -47,6 +47,8 @@ CONTRADICTION = 1e-4
 """Chance of the residuals under the noise that was given below which they contradict it."""
 NOTABLE = 1.25
 """Times that noise that residuals must be for a word."""
+CLEAR = 4.0
+"""Deviations of chance from which on views contradict each other."""
 BETTER = 0.8
 """Part of what another lens would explain that two groups must save to be named in its place."""
 MOST_NAMED = 5
@@ -103,6 +105,9 @@ def remarks(
             "or give a larger pixel_sigma"
         )
         said[p].append(Remark(sentence, Kind.CONTRADICTION, reason))
+    for p, times in _contradict_each_other(found).items():
+        if bool(converged[p]):
+            said[p].append(_of_each_other(times))
     wrong = discounted(found)
     out = found.rejected if wrong is None else found.rejected | wrong
     few = converged & mostly_left_out(task.used & ~out, out).any(-1)
@@ -201,6 +206,30 @@ def _contradicts_noise(found: Fit) -> Tensor:
     squares = found.variance_of_residuals().detach().nan_to_num(0.0) * spare
     rare = torch.special.gammaincc(spare.clamp(min=1) / 2, squares / 2) < CONTRADICTION
     return rare & (squares > NOTABLE**2 * spare)
+
+
+def _contradict_each_other(found: Fit) -> dict[int, float]:
+    """How many times more than corners of the noise that was given the views contradict each other, where they do.
+
+    Where no noise is given the covariance holds it.
+    """
+    pulls = pulls_of(found) if found.knows_noise else None
+    if pulls is None:
+        return {}
+    told, level = contradiction(*pulls), found.variance_of_residuals().detach()
+    clear = f_deviations(told.phi, told.spare, found.degrees_of_freedom().to(told.phi).clamp(min=5)) > CLEAR
+    times = (dispersion(found, pulls) * level).sqrt()
+    return {p: float(times[p]) for p in (clear & (times > NOTABLE)).nonzero().flatten().tolist()}
+
+
+def _of_each_other(times: float) -> Remark:
+    reason = f"the views contradict each other {times:.2g} times as much as corners of that pixel_sigma would"
+    return Remark(
+        f"{reason}, and the deviations are too small by as much: corners of a view err together, for the board, the "
+        "lens model or the detector are not quite right; leave out pixel_sigma, then the deviations hold that",
+        Kind.CONTRADICTION,
+        reason,
+    )
 
 
 def _two_cameras(names: Sequence[str], group: TwoGroups) -> Remark:
