@@ -145,14 +145,14 @@ def _told(pulls: Pulls, along: Tensor, same: Tensor | None, everything: Contradi
     spare = (telling - 1).clamp(min=LEAST_SPARE)
     excess = (mean / phi - 1).clamp(min=0).nan_to_num(0.0)
     excess = excess.pow(3) / (excess.square() + 2 / spare)
-    variance = torch.where(grown > 0, excess * phi / grown.clamp(min=1e-300), 0.0) * (
-        1 + FEW_VIEWS / spare.clamp(min=1)
-    )
+    known = (grown > 0) & (views > FEWEST - 0.5)
+    counted = 1 + FEW_VIEWS / spare.clamp(min=1)
+    variance = torch.where(known, excess * phi / torch.where(known, grown, 1.0), 0.0) * counted
     moves = Sb @ W.mT
     more = variance[:, None, None] * (moves * share.unsqueeze(-1)).mT @ moves
     usual = everything.phi.clamp(min=1)
-    ratio = (mean / usual).nan_to_num(0.0)
-    spread = ((mean - usual).clamp(min=0) / grown.clamp(min=1e-300)).sqrt()
+    ratio = torch.where(known, mean / usual, 0.0).nan_to_num(0.0)
+    spread = ((mean - usual).clamp(min=0) / torch.where(known, grown, 1.0)).sqrt()
     return OwnFocal(variance, spread, more, ratio, f_deviations(ratio, spare, everything.spare.clamp(min=5)))
 
 

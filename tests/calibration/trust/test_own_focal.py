@@ -131,3 +131,14 @@ def test_what_is_added_is_what_views_move_that_focus_anew(options: dict) -> None
     want = float(own.variance) * moves.mT @ moves
     scale = want.diagonal().clamp(min=1e-300).rsqrt()
     torch.testing.assert_close(more * scale * scale[:, None], want * scale * scale[:, None], rtol=0, atol=1e-3)
+
+
+def test_views_without_corners_change_nothing() -> None:
+    """As of a camera that missed some moments, beside others in one batch."""
+    views = refocused(4, 8, 0.01)
+    for count in (2, 3, 5):
+        visible = views.visible.clone()
+        visible[:, count:] = False
+        padded = dp.calibrate(dp.Views(views.pixels, visible, size=SIZE), BOARD, "brown4", throw=False)
+        alone = dp.calibrate(dp.Views(views.pixels[:, :count], size=SIZE), BOARD, "brown4", throw=False)
+        torch.testing.assert_close(padded.covariance.shared, alone.covariance.shared, rtol=1e-5, atol=1e-9)
