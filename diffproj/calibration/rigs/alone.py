@@ -20,6 +20,7 @@ from diffproj.calibration.problem.constraints import held_at
 from diffproj.calibration.problem.parametrisation import Parametrisation
 from diffproj.calibration.results.ambiguity import OtherPoses
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
+from diffproj.calibration.results.remark import Remarks
 from diffproj.calibration.rigs.start import Seen
 from diffproj.calibration.rigs.views import RigViews
 from diffproj.geometry.camera import Camera, as_camera
@@ -79,7 +80,7 @@ class Alone(NamedTuple):
         parameters: which its own are.
         seen: they, and the target in each view.
         rms: RMS reprojection error in pixels.
-        remark: what is to be known of it, in one text; computed when called.
+        findings: what is to be known of it; computed when called.
         others: the other pose of each of its views, from the target's own frame; computed when called.
         restrained: whether its terms below the line are held near those of a poorer lens, for without that it folds.
     """
@@ -87,7 +88,7 @@ class Alone(NamedTuple):
     parameters: Parametrisation
     seen: Seen
     rms: float
-    remark: Callable[[], str]
+    findings: Callable[[], Remarks]
     others: Callable[[], OtherPoses]
     restrained: bool = False
 
@@ -203,7 +204,7 @@ def _located(asked: Asked, name: str) -> Alone:
     if fixed:  # what is held stays as it was given
         shared = held_at(shared.unsqueeze(0), shared.unsqueeze(0), found.parameters, fixed)[0]
     seen = Seen(shared, *data.frame.pose(R, t), found.used)
-    return Alone(found.parameters, seen, float(found.rms), str, partial(getattr, found, "other_poses"))
+    return Alone(found.parameters, seen, float(found.rms), tuple, partial(getattr, found, "other_poses"))
 
 
 def _calibrated(
@@ -251,7 +252,7 @@ def _calibrated(
         R, t = found.cameras.R[row, :count].detach(), found.cameras.t[row, :count].detach()
         seen = Seen(shared[row], *data.frame.pose(R, t), found.used[row, :count])
         part = _Part(first.who, data, fit.alone(row, count))
-        results.append(Alone(found.parameters, seen, rms[row], part.remark, part.others, restrained[row]))
+        results.append(Alone(found.parameters, seen, rms[row], part.findings, part.others, restrained[row]))
     return results
 
 
@@ -267,9 +268,9 @@ class _Part:
         who, data, fit = self._given
         return outcome(who, data, fit, data.views.size, throw=False)
 
-    def remark(self) -> str:
+    def findings(self) -> Remarks:
         """What is to be known of it."""
-        return self.calibration.remarks[0]
+        return self.calibration.findings[0]
 
     def others(self) -> OtherPoses:
         """The other pose of each of its views."""

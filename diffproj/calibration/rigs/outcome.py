@@ -13,6 +13,7 @@ from diffproj.calibration.results.ambiguity import OtherPoses
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.results.covariance import Covariance
 from diffproj.calibration.results.distinct import ALIKE_PX
+from diffproj.calibration.results.remark import Kind, text_of
 from diffproj.calibration.rigs.alone import Alone
 from diffproj.calibration.rigs.common_errors import CLEAR, CommonErrors, common_errors
 from diffproj.calibration.rigs.discounted import discounted
@@ -226,8 +227,10 @@ def _remarks(
         used = found.used[name]
         squares, count = residuals[name].square().sum((-2, -1)), used.sum(-1)
         flat = found.restraint is None and not found.parameters.bow
-        if alone[name].remark() and flat:  # on its own it had a flat target
-            said.append(f"{name}, on its own: {alone[name].remark()}")
+        # On its own it had a flat target; what that says of the tags' distance holds for a free one.
+        told = text_of(one for one in alone[name].findings() if flat or one.kind == Kind.SPACING)
+        if told:
+            said.append(f"{name}, on its own: {told}")
         rms = float((squares.sum() / count.sum().clamp(min=1)).sqrt())
         if rms > WORSE_TOGETHER * alone[name].rms and rms > 1e-6:
             said.append(

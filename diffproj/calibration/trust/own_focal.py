@@ -42,6 +42,8 @@ from diffproj.calibration.trust.leftover import f_deviations
 
 FEWEST = 3
 """Views from which on they are compared."""
+NOTHING = 1e-12
+"""Part of what the view that tells most does below which a view tells nothing of the focal length."""
 LEAST_SPARE = 0.5
 """Degrees of freedom that two views or fewer which tell it count as."""
 CLEAR = 4.0
@@ -107,7 +109,7 @@ def own_focal(found: Fit, phi: Tensor, pulls: Pulls | None) -> OwnFocal | None:
             return None
         task = found.task
         same = None if task.shares is None else alike(task.points, task.pixels, task.used).to(along)
-        told = _told(pulls, along, same, contradiction(*pulls), phi)
+        told = _judged(_moments(pulls, along, same), contradiction(*pulls), phi)
     return OwnFocal(*(part.clone() for part in told))
 
 
@@ -123,36 +125,56 @@ def _along(found: Fit) -> Tensor:
     return torch.where(free.unsqueeze(-1), along.squeeze(-1), 0.0)
 
 
-def _told(pulls: Pulls, along: Tensor, same: Tensor | None, everything: Contradiction, phi: Tensor) -> OwnFocal:
-    own_units, W = in_own_units(pulls)
-    u, S, K, share = own_units[:4]
+class _Moments(NamedTuple):
+    """What the views pull at the focal length, in the mean over the views of each camera `(P,)`.
+
+    Attributes:
+        mean: the square of a view's pull, over that of independent corners.
+        grown: by how much that grows with the variance of the views' own focal lengths.
+        views: how many there are; copies count as one.
+        spare: in how many of these the focal length is told, less one: they tell it unequally (Satterthwaite 1946).
+        moves: how the shared parameters follow each view's own `(P, V, q)`.
+        share: how much each view counts `(P, V)`.
+    """
+
+    mean: Tensor
+    grown: Tensor
+    views: Tensor
+    spare: Tensor
+    moves: Tensor
+    share: Tensor
+
+
+def _moments(pulls: Pulls, along: Tensor, same: Tensor | None) -> _Moments:
+    own, W = in_own_units(pulls)
     b = W.mT @ pulls.total @ along.unsqueeze(-1)  # W b = along
-    Sb = (S @ b.unsqueeze(1)).squeeze(-1)  # (P, V, q)
-    pull = (u @ b).squeeze(-1)
-    copied = None if same is None else _copied(pull, _along_both(K, b), share, same)
-    expected = _along_both(left_of_noise(own_units, copied), b)
-    counts = (expected > 1e-12 * expected.amax(1, keepdim=True)) & (share > 0)
-    share, safe = torch.where(counts, share, 0.0), torch.where(counts, expected, 1.0)
-    # Copies of a view have the focal length of that view: together they count as one.
-    across = Sb @ Sb.mT
-    own = (Sb @ b).squeeze(-1)
-    squares = own.square() - 2 * own * across.diagonal(dim1=1, dim2=2) + (across.square() @ share.unsqueeze(-1))[..., 0]
-    views = share.sum(1)
-    mean = (share * pull.square() / safe).sum(1) / views.clamp(min=1)
-    grown = (share * squares / safe).sum(1) / views.clamp(min=1)
-    # Views tell it unequally: the fewer do, the more is chance (Satterthwaite 1946).
-    telling = (share * expected).sum(1).square() / (share * expected.square()).sum(1).clamp(min=1e-300)
-    spare = (telling - 1).clamp(min=LEAST_SPARE)
+    pull, Sb = (own.u @ b).squeeze(-1), (own.S @ b.unsqueeze(1)).squeeze(-1)  # (P, V), (P, V, q)
+    copied = None if same is None else _copied(pull, _variances(own.K, b), own.share, same)
+    expected = _variances(left_of_noise(own, copied), b)
+    tells = (expected > NOTHING * expected.amax(1, keepdim=True)) & (own.share > 0)
+    share, expected = torch.where(tells, own.share, 0.0), torch.where(tells, expected, 1.0)
+    # G_vw^2 over all w: copies of a view have its focal length, so that together they count as one.
+    curve, size = (Sb @ b).squeeze(-1), Sb.square().sum(-1)
+    across = (Sb @ (Sb.mT @ (share.unsqueeze(-1) * Sb)) * Sb).sum(-1)
+    squares = curve.square() - 2 * curve * size + across
+    views, told = share.sum(1), torch.where(tells, expected, 0.0)
+    mean, grown = ((share * part / expected).sum(1) / views.clamp(min=1) for part in (pull.square(), squares))
+    telling = (share * told).sum(1).square() / (share * told.square()).sum(1).clamp(min=1e-300)
+    return _Moments(mean, grown, views, (telling - 1).clamp(min=LEAST_SPARE), Sb @ W.mT, share)
+
+
+def _judged(moments: _Moments, everything: Contradiction, phi: Tensor) -> OwnFocal:
+    """What is believed of the moments: the covariance holds phi already, and what is said goes by everything else."""
+    mean, grown, views, spare, moves, share = moments
+    known = (grown > 0) & (views > FEWEST - 0.5)
+    grown = torch.where(known, grown, 1.0)
     excess = (mean / phi - 1).clamp(min=0).nan_to_num(0.0)
     excess = excess.pow(3) / (excess.square() + 2 / spare)
-    known = (grown > 0) & (views > FEWEST - 0.5)
-    counted = 1 + FEW_VIEWS / spare.clamp(min=1)
-    variance = torch.where(known, excess * phi / torch.where(known, grown, 1.0), 0.0) * counted
-    moves = Sb @ W.mT
+    variance = torch.where(known, excess * phi / grown, 0.0) * (1 + FEW_VIEWS / spare.clamp(min=1))
     more = variance[:, None, None] * (moves * share.unsqueeze(-1)).mT @ moves
     usual = everything.phi.clamp(min=1)
     ratio = torch.where(known, mean / usual, 0.0).nan_to_num(0.0)
-    spread = ((mean - usual).clamp(min=0) / torch.where(known, grown, 1.0)).sqrt()
+    spread = ((mean - usual).clamp(min=0) / grown).sqrt()
     return OwnFocal(variance, spread, more, ratio, f_deviations(ratio, spare, everything.spare.clamp(min=5)))
 
 
@@ -166,6 +188,6 @@ def _copied(pull: Tensor, variance: Tensor, share: Tensor, same: Tensor) -> Tens
     return 1 - apart.clamp(max=1).unsqueeze(-1) * (1 - share)
 
 
-def _along_both(K: Tensor, b: Tensor) -> Tensor:
+def _variances(K: Tensor, b: Tensor) -> Tensor:
     """Variances `(P, V)` along a direction `(P, q, 1)` of covariances `(P, V, q, q)`."""
     return (b.mT.unsqueeze(1) @ K @ b.unsqueeze(1)).flatten(1).clamp(min=0)

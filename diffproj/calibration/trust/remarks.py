@@ -152,7 +152,7 @@ def remarks(
                 said[p].append(_two_cameras(names[p], groups[p]))
                 remark = None if remark is not None and remark.kind in OF_THE_CAMERA else remark
             elif remark is None and p not in wrong:
-                remark = _of_the_focus(own, p) or small.of(i)
+                remark = _of_the_focus(own, p, found.knows_noise) or small.of(i)
             said[p] += [] if remark is None else [remark]
     return tuple(map(tuple, said))
 
@@ -301,13 +301,15 @@ def _of_the_print(left: Leftover, i: int) -> Remark:
     )
 
 
-def _of_the_focus(own: OwnFocal | None, p: int) -> Remark | None:
+def _of_the_focus(own: OwnFocal | None, p: int, knows_noise: bool) -> Remark | None:
     if own is None or not bool(own.told[p]):
         return None
+    part = f"{100 * float(own.spread[p]):.1g} %"
+    held = "those of pixel_sigma, which do not count that" if knows_noise else "those of the mean focal length"
     return Remark(
-        f"the focal length differs by about {100 * float(own.spread[p]):.1g} % from view to view, as of a "
-        "camera that focuses for each photograph: hold focus and zoom, where a photograph is measured in, too; the "
-        "deviations are those of the mean",
+        f"the focal length differs by about {part} from view to view, as of a camera that focuses anew for each "
+        "photograph: switch autofocus off and hold the zoom, for calibrating and for measuring; the deviations are "
+        f"{held}, and in one photograph it may be off by {part}",
         Kind.FOCUS,
         "its focal length differs from view to view",
     )

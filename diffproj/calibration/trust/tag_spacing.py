@@ -59,7 +59,7 @@ def of_free_points(target: object, found: Fit, p: int) -> Remark | None:
     seen = task.used[p].any(0)
     points = task.points[seen, :2]
     off = found.solution.shared[p, task.parameters.few :].detach().unflatten(-1, (-1, 3))[seen, :2]
-    off, apart = (_without_similarity(field.to(points), points) for field in (off, moves[seen, :2]))
+    off, apart = (_without_similarity(field, points) for field in (off, moves.to(points)[seen, :2]))
     strength = float((off * apart).sum() / apart.square().sum())
     share = strength**2 * float(apart.square().sum() / off.square().sum().clamp(min=1e-300))
     scale = float((_spread(task.pixels[p], task.used[p]) / _spread(points, torch.ones_like(points[:, 0]) > 0)).amax())
@@ -68,12 +68,13 @@ def of_free_points(target: object, found: Fit, p: int) -> Remark | None:
     return _remark(target, strength, f"{100 * share:.0f} % of how far its points lie off, in squares")
 
 
-def _remark(target: AprilGrid, more: float, share: str) -> Remark:
-    told = target.spacing + more
+def _remark(target: AprilGrid, strength: float, share: str) -> Remark:
+    """That the tags stand apart by so much more, on a board that poses made as large as the one that was said."""
+    told = max(target.spacing + strength / (1 - strength / (1 + target.spacing)), 0.0)
     return Remark(
         f"the tags stand {told:.3g} of their side apart, not {target.spacing:.3g} ({share}), so lengths are wrong: "
-        "measure the side of a tag, with its black border and without the white one, and from one tag's edge to the "
-        f"same edge of the next, which must be {1 + told:.4g} sides, and give the board both",
+        "measure the side of a tag, with its black border and without the white rim, and the way from one edge of it "
+        f"to the same edge of the next, about {1 + told:.4g} sides; then correct the board's tag and spacing",
         Kind.SPACING,
         "the tags do not stand as far apart as the board says",
     )
