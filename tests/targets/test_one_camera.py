@@ -10,6 +10,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 import diffproj as dp
+from diffproj.cli.photographs import one_photograph
 from diffproj.targets.exif import Exif
 from diffproj.targets.one_camera import doubts
 
@@ -81,3 +82,20 @@ def test_a_file_of_several_pictures_is_told() -> None:
         "a.tif: want one picture a file, got several; the first was taken"
     ]
     assert doubts(["image 1"], [None], upright=True) == []
+
+
+def test_a_file_is_read_once_for_its_pixels_and_what_it_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a.png", "b.jpg", "c.tif"):
+        photograph(tmp_path / name, 3)
+    read, whole = [], Path.read_bytes
+
+    def counted(path: Path) -> bytes:
+        read.append(path.name)
+        return whole(path)
+
+    monkeypatch.setattr(Path, "read_bytes", counted)
+    dp.detect(tmp_path, BOARD)
+    assert read == ["a.png", "b.jpg", "c.tif"]
+    read.clear()
+    one_photograph(tmp_path / "a.png", "sensor")
+    assert read == ["a.png"]
