@@ -590,7 +590,9 @@ def test_a_photograph_that_programs_show_turned_is_told(
     assert (f"ask programs to show it {how}, and --points count as the sensor" in " ".join(err.split())) == (
         orientation != 1
     )
-    assert ("x and y are those of a mirrored world: give --orientation upright" in err) == (how == "mirrored")
+    assert ("x and y are mirrored; to count pixels as viewers show them, give --orientation upright" in err) == (
+        how == "mirrored"
+    )
     assert ("one that they show at (x, y) is" in " ".join(err.split())) == bool(told)
     assert told in " ".join(err.split())
     if place is not None:  # of (37, 101)
