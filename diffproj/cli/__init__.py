@@ -84,7 +84,8 @@ def shielded(arguments: Sequence[str]) -> list[str]:
         part for text, found in zip(arguments, apart, strict=True) for part in (found.groups() if found else [text])
     ]
     lists, lengths = r"-[.\d][^,]*,.*", r"-[.\d]+((e[+-]?\d+)? ?[a-zµμ]{1,2}|e[+-]?\d+)"
-    return [f" {text}" if re.fullmatch(f"{lists}|{lengths}", text, re.IGNORECASE) else text for text in parts]
+    other = r"-(\d+(\.\d+)?|\.\d+)(e[+-]?\d+)? ?([a-zµμ]+|[\"']+)"  # units that are not known, for a message on them
+    return [f" {text}" if re.fullmatch(f"{lists}|{lengths}|{other}", text, re.IGNORECASE) else text for text in parts]
 
 
 def _complete() -> int:

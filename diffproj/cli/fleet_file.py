@@ -55,7 +55,10 @@ def done_before(path: Path, asked: Mapping[str, Any]) -> dict[str, dict[str, Any
 def line_of(
     name: str, asked: Mapping[str, Any], searched: Searched, found: Calibration | str, seconds: float
 ) -> dict[str, Any]:
-    """What is said of a camera; of one that failed, why."""
+    """What is said of a camera; of one that failed, why.
+
+    Verdict and remarks are in the library's words, as it reads the line; notes and failures speak of options.
+    """
     line: dict[str, Any] = {
         "name": name,
         "asked": dict(asked),

@@ -71,9 +71,10 @@ def one_photograph(path: Path, orientation: Orientation, colour: bool = False) -
         raise ValueError(f"PHOTO: want one photograph, got {len(files)} of the form {path}; name one of them")
     if _is_video(files[0]):
         raise ValueError(f"PHOTO: want a photograph, got the video {path}; save one of its frames as a .png")
+    content = files[0].read_bytes()
     with _silent_opencv():
-        pixels = decoded(files[0], orientation, colour)
-    for doubt in doubts([str(files[0])], [exif_of(files[0].read_bytes())], orientation == "upright"):
+        pixels = decoded(files[0], orientation, colour, content)
+    for doubt in doubts([str(files[0])], [exif_of(content)], orientation == "upright"):
         warn_caller(doubt)
     return Photograph(files[0].name, str(files[0]), pixels)
 
@@ -99,7 +100,7 @@ def warn_if_shown_turned(path: Path, orientation: Orientation, pixels: str) -> N
         shown = cv2.imdecode(np.frombuffer(content, np.uint8), small)
         if recorded is None or shown is None or np.array_equal(recorded, shown):
             return
-        height, width = decoded(file, orientation).shape
+        height, width = decoded(file, orientation, content=content).shape
     right, bottom = f"{width - 1} - ", f"{height - 1} - "
     place = {2: f"{right}x, y", 3: f"{right}x, {bottom}y", 4: f"x, {bottom}y", 5: "y, x"}
     place |= {6: f"y, {bottom}x", 7: f"{right}y, {bottom}x", 8: f"{right}y, x"}

@@ -96,7 +96,8 @@ def _length(text: str) -> Length | None:
         return None
     unit = match[2].lower()
     if unit and unit not in METRES:
-        raise argparse.ArgumentTypeError(f"want one of the units {', '.join(METRES)}, such as 25mm, got {text!r}")
+        known = ", ".join(METRES)
+        raise argparse.ArgumentTypeError(f"want one of the units {known}, such as 25mm, got {text.strip()!r}")
     return Length(value, unit or None)
 
 

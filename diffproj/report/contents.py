@@ -78,7 +78,8 @@ def _measuring(facts: Facts, found: Pictures, orientation: Orientation) -> list[
         return []
     plane = Plane.z(facts.plane_z)
     source, name = found.sources[view], facts.names[view]
-    source = source.image if isinstance(source, Frame) else source
+    if isinstance(source, Frame):  # as its corners were counted; pixels alone are not turned any more
+        source = source.upright if orientation == "upright" else source.image
     return [measuring_part(source, facts.calibration, plane, view, orientation=orientation, name=name)]
 
 

@@ -236,15 +236,16 @@ def _find(
     may_be_broken: frozenset[Path],
 ) -> Found | NotAnImageError:
     """Read one photograph and find the target in it, the work of one task; of a broken one that may be so, why."""
+    content = photograph.source.read_bytes() if isinstance(photograph.source, Path) else None
     try:
-        image = grey(photograph, orientation)
+        image = grey(photograph, orientation, content)
     except NotAnImageError as error:
         if error.path.parent in may_be_broken:
             return error
         raise
     size = image.shape[1], image.shape[0]
     try:
-        exif = exif_of(photograph.source.read_bytes()) if isinstance(photograph.source, Path) else None
+        exif = None if content is None else exif_of(content)
         found = find(image, target)._replace(size=size, exif=exif)
         if beside is not None and found.grid is not None:
             found = found._replace(beside=beside(image, found.grid.reshape(-1, 2)))

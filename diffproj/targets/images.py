@@ -111,11 +111,18 @@ def _natural(path: Path) -> list[Any]:
     return [int(part) if place % 2 else part for place, part in enumerate(parts)]
 
 
-def grey(photograph: Photograph, orientation: Orientation = "sensor") -> Shaped[np.ndarray, "h w"]:
+def grey(
+    photograph: Photograph, orientation: Orientation = "sensor", content: bytes | None = None
+) -> Shaped[np.ndarray, "h w"]:
     """Convert a photograph to grey, `(H, W)`, from 0 to 255: uint8 for 8-bit input, float32 otherwise.
 
     Files are read as the sensor recorded them, or upright. The contrast of 16-bit images is stretched from their 0.1st
     to their 99.9th percentile, since cameras of 10, 12 or 14 bits use a part of the range.
+
+    Args:
+        photograph: the photograph.
+        orientation: of a file or a frame, how its pixels are counted.
+        content: of a file that was read already.
 
     Raises:
         ValueError: the file is no image, the shape is none of the layouts, or floats are not in 0..1.
@@ -124,7 +131,7 @@ def grey(photograph: Photograph, orientation: Orientation = "sensor") -> Shaped[
     """
     label, source = photograph.label, photograph.source
     if isinstance(source, Path):
-        return _scaled(label, decoded(source, orientation))
+        return _scaled(label, decoded(source, orientation, content=content))
     if isinstance(source, Frame):
         return source.upright if orientation == "upright" else source.image
     image = _channels_last(label, source) if isinstance(source, Tensor) else source
@@ -161,15 +168,21 @@ class NotAnImageError(ValueError):
         return f"{self.path}: want an image, got {self.args[1]}"
 
 
-def decoded(path: Path, orientation: Orientation, colour: bool = False) -> np.ndarray:
+def decoded(path: Path, orientation: Orientation, colour: bool = False, content: bytes | None = None) -> np.ndarray:
     """The pixels of a file, of 8 or 16 bits: grey `(H, W)`, or in colour `(H, W, 3)` BGR.
+
+    Args:
+        path: the file.
+        orientation: how its pixels are counted.
+        colour: whether in colour.
+        content: of the file, where it was read already.
 
     Raises:
         NotAnImageError: the file is no image.
         OSError: it cannot be read.
     """
     # cv2.imread does not distinguish a missing file from a broken one, and fails on some file names.
-    content = path.read_bytes()
+    content = path.read_bytes() if content is None else content
     data = np.frombuffer(as_recorded(content) if orientation == "sensor" else content, dtype=np.uint8)
     flags = (cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE) | cv2.IMREAD_ANYDEPTH
     if orientation == "sensor":

@@ -12,7 +12,7 @@ KEPT = (
     ("serial", "cameras of different serial numbers", ""),
     ("lens", "different lenses", ""),
     ("focal", "different focal lengths", " mm"),
-    ("zoom", "different digital zooms", " times"),
+    ("zoom", "different digital zooms", "x"),
     ("focal_35", "different focal lengths (as of 35 mm film)", " mm"),
 )
 """What stays as it is while one camera with one zoom photographs: in `Exif`, in words, its unit."""
@@ -34,23 +34,23 @@ def doubts(labels: Sequence[str], told: Sequence[Exif | None], upright: bool) ->
     return [text for text in found if text]
 
 
-def mirrored(which: str) -> str:
-    """What is said of photographs that are mirror images of what is shown of them."""
-    return (
-        f"{which}: EXIF data ask programs to show it mirrored, and pixels count as recorded: if what they show is not "
-        "the mirror image (writing reads well), lengths are right, but x and y are those of a mirrored world: give "
-        "orientation='upright'"
-    )
-
-
 def named(labels: Sequence[str]) -> str:
     """Names of some photographs, of many the first ones."""
     return ", ".join(labels[:3]) + (f" and {len(labels) - 3} more" if len(labels) > 3 else "")
 
 
 def _mirrored(files: list[tuple[str, Exif]]) -> str:
+    """Of photographs as recorded: whether they are mirror images of what is shown of them."""
     which = [label for label, one in files if one.orientation in MIRRORED]
-    return mirrored(named(which)) if which else ""
+    if not which:
+        return ""
+    holds, flips = (
+        ("this file holds a mirror image", "it") if len(which) == 1 else ("these files hold mirror images", "them")
+    )
+    return (
+        f"{named(which)}: {holds}, and viewers flip {flips} back, as EXIF data ask; pixels count as recorded, so "
+        "lengths are right, but x and y are mirrored; to count pixels as viewers show them, give orientation='upright'"
+    )
 
 
 def _turned_apart(files: list[tuple[str, Exif]]) -> str:
@@ -70,11 +70,7 @@ def _turned_apart(files: list[tuple[str, Exif]]) -> str:
 def _several(files: list[tuple[str, Exif]]) -> str:
     """Whether the camera or its zoom changed between photographs."""
     for field, what, unit in KEPT:
-        groups: dict[str | float, list[str]] = {}
-        for label, one in files:
-            value = getattr(one, field)
-            if value:
-                groups.setdefault(next((kept for kept in groups if _same(kept, value)), value), []).append(label)
+        groups = _groups([(label, getattr(one, field)) for label, one in files if getattr(one, field)])
         if len(groups) > 1:
             each = [
                 f"{value if isinstance(value, str) else f'{value:.4g}'}{unit} in {named(labels)}"
@@ -85,6 +81,21 @@ def _several(files: list[tuple[str, Exif]]) -> str:
                 f"{' and '.join(each)}; calibrate them by themselves"
             )
     return ""
+
+
+def _groups(told: list[tuple[str, str | float]]) -> dict[str | float, list[str]]:
+    """Names of photographs by what their files tell, the same for any order of these.
+
+    Numbers are compared with their median: with the first one, groups would depend on which that is.
+    """
+    groups: dict[str | float, list[str]] = {}
+    while told:
+        values = [value for _, value in told]
+        numbers = sorted(value for value in values if not isinstance(value, str))
+        usual = numbers[(len(numbers) - 1) // 2] if numbers else values[0]
+        groups[usual] = [label for label, value in told if _same(usual, value)]
+        told = [(label, value) for label, value in told if not _same(usual, value)]
+    return groups
 
 
 def _same(kept: str | float, value: str | float) -> bool:

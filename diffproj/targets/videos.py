@@ -20,6 +20,9 @@ MOST = 60
 MOVED = 0.02
 """Mean motion of the corners, relative to the frame's diagonal, from which two frames count as two views."""
 
+QUARTERS = frozenset({90, 180, 270})
+"""Turns that a video may ask for; what reads other videos than FFmpeg's answers with -1 where it knows none."""
+
 
 class Frame(NamedTuple):
     """One frame of a video, compressed without loss: many frames fit into memory, and travel to other machines.
@@ -106,7 +109,8 @@ def _decoded(video: Path) -> Iterator[tuple[UInt8[np.ndarray, "_h _w"], int]]:
     capture = cv2.VideoCapture(str(video))
     try:
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        turn = int(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360
+        asked = int(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360
+        turn = asked if asked in QUARTERS else 0
         while True:
             there, image = capture.read()
             if not there:

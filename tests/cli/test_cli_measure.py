@@ -26,6 +26,7 @@ from diffproj.cli.measure_plane import equation
 from diffproj.cli.measure_tables import coordinate, shown
 from diffproj.cli.measuring import length_in_words
 from diffproj.cli.photographs import warn_if_shown_turned
+from diffproj.cli.units import METRES
 from diffproj.measurement.choices import HAND_PX
 from diffproj.targets.images import decoded
 from tests.cli.commands import parser, runner
@@ -358,10 +359,21 @@ def test_lists_of_numbers_are_no_options() -> None:
         "5,-3",
     ]
     assert shielded(["--csv=-a,b.csv"]) == ["--csv=-a,b.csv"]
-    lengths = ["-3mm", "-.5 cm", "-2.5IN", "-3 µm", "-1e-3", "-1E2m"]
+    lengths = ["-3mm", "-.5 cm", "-2.5IN", "-3 µm", "-1e-3", "-1E2m", *(f"-3{unit}" for unit in METRES)]
+    lengths += ["-3inch", "-3 feet", "-.5e-2metres", '-3"', "-3'", "-3''"]  # which are no units here, as is told then
     assert shielded(lengths) == [f" {length}" for length in lengths]
     others = ["-3", "-.5", "-1.jpg", "-v", "-mm", "3mm", "-"]
     assert shielded(others) == others
+
+
+@pytest.mark.parametrize("height", ["-3inch", '-3"', "-3 feet", "-3yd"])
+def test_a_negative_height_in_an_unknown_unit_is_told_the_known_ones(
+    height: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, err = run(capsys, "photo.png", "--camera", "camera.json", *BOARD, "--points", "1,2", "--height", height)
+    assert code == 2
+    told = f"--height: want one of the units um, µm, mm, cm, m, in, ft, such as 25mm, got {height!r}"
+    assert told in " ".join(err.split())
 
 
 def test_equations_and_quantities_for_people() -> None:
@@ -590,7 +602,9 @@ def test_a_photograph_that_programs_show_turned_is_told(
     assert (f"ask programs to show it {how}, and --points count as the sensor" in " ".join(err.split())) == (
         orientation != 1
     )
-    assert ("x and y are those of a mirrored world: give --orientation upright" in err) == (how == "mirrored")
+    assert ("x and y are mirrored; to count pixels as viewers show them, give --orientation upright" in err) == (
+        how == "mirrored"
+    )
     assert ("one that they show at (x, y) is" in " ".join(err.split())) == bool(told)
     assert told in " ".join(err.split())
     if place is not None:  # of (37, 101)

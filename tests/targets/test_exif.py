@@ -70,6 +70,20 @@ def tiff(order: Literal["<", ">"], picture: np.ndarray, orientation: int) -> byt
     return head.ljust(200, b"\0") + pixels
 
 
+def big_tiff(order: Literal["<", ">"], picture: np.ndarray, orientation: int) -> bytes:
+    """The same with places of 64 bits, and with a focal length, which stands in its entry."""
+    height, width = picture.shape
+    bits = 8 * picture.itemsize
+    pixels = picture.astype(picture.dtype.newbyteorder(order)).tobytes()
+    tags = {256: width, 257: height, 258: bits, 259: 1, 262: 1, 273: 400, 274: orientation, 277: 1, 278: height}
+    head = struct.pack(f"{order}2sHHHQQ", b"II" if order == "<" else b"MM", 43, 8, 0, 16, len(tags) + 2)
+    for tag, value in tags.items():
+        head += struct.pack(f"{order}HHQHHI", tag, 3, 1, value, 0, 0)
+    head += struct.pack(f"{order}HHQQ", 279, 16, 1, len(pixels))
+    head += struct.pack(f"{order}HHQII", 0x920A, 5, 1, 2400, 100) + bytes(8)
+    return head.ljust(400, b"\0") + pixels
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -83,6 +97,76 @@ def test_tiffs_are_read_as_recorded(tmp_path: Path, dtype: type, order: Literal[
     content = np.frombuffer(path.read_bytes(), np.uint8)
     turned = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     np.testing.assert_array_equal(decoded(path, "upright"), turned)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_tiffs_of_64_bits_are_read_as_recorded(
+    tmp_path: Path, dtype: type, order: Literal["<", ">"], orientation: int
+) -> None:
+    """OpenCV turns them, too."""
+    picture = PICTURE.astype(dtype)
+    path = tmp_path / "turned.tif"
+    path.write_bytes(big_tiff(order, picture, orientation))
+    np.testing.assert_array_equal(decoded(path, "sensor"), picture)
+    found = exif_of(path.read_bytes())
+    assert (found.orientation, found.focal, found.pictures) == (orientation, 24.0, 1)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("place", [9, 2**31, 2**32 - 1])
+@pytest.mark.parametrize("what", ["EXIF part", "next picture", "focal length", "maker", "no end"])
+def test_a_tiff_with_damage_elsewhere_is_read_as_recorded(
+    tmp_path: Path, order: Literal["<", ">"], place: int, what: str
+) -> None:
+    """What asks OpenCV to turn it is read nevertheless."""
+    whole = bytearray(tiff(order, PICTURE, 6))
+    end = 10 + 12 * 10
+    entry = {"EXIF part": (EXIF_PART, 4, 1), "focal length": (0x920A, 5, 1), "maker": (0x010F, 2, 99)}.get(what)
+    if entry is not None:
+        struct.pack_into(f"{order}H", whole, 8, 11)
+        struct.pack_into(f"{order}HHIII", whole, end, *entry, place, 0)
+    elif what == "next picture":
+        struct.pack_into(f"{order}I", whole, end, place)
+    else:  # the directory is the last of the file, without a word of the next
+        whole = whole[:4] + struct.pack(f"{order}I", len(whole)) + whole[8:] + whole[8:end]
+    path = tmp_path / "turned.tif"
+    path.write_bytes(whole)
+    found = exif_of(bytes(whole))
+    assert found.orientation == 6
+    assert found.pictures == 1 or place == 9  # where numbers can be read that may be those of a picture
+    np.testing.assert_array_equal(decoded(path, "sensor"), PICTURE)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("kind", [1, 3, 4])
+def test_an_orientation_of_any_type_that_opencv_follows_is_read(
+    tmp_path: Path, order: Literal["<", ">"], kind: int
+) -> None:
+    whole = bytearray(tiff(order, PICTURE, 6))
+    entry = 10 + 12 * 6
+    form = {1: "BBH", 3: "HH", 4: "I"}[kind]
+    struct.pack_into(f"{order}HHI{form}", whole, entry, 274, kind, 1, *(6, 0, 0)[: len(form)])
+    path = tmp_path / "turned.tif"
+    path.write_bytes(whole)
+    shown = cv2.imdecode(np.frombuffer(whole, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert shown is not None
+    assert shown.shape == PICTURE.shape[::-1]
+    assert exif_of(bytes(whole)).orientation == 6
+    np.testing.assert_array_equal(decoded(path, "sensor"), PICTURE)
+
+
+def test_of_two_orientations_the_first_counts(tmp_path: Path) -> None:
+    """So OpenCV takes them."""
+    whole = bytearray(tiff("<", PICTURE, 6))
+    struct.pack_into("<HHIHH", whole, 10 + 12 * 7, 274, 3, 1, 1, 0)  # in place of the samples of a pixel, which are one
+    path = tmp_path / "turned.tif"
+    path.write_bytes(whole)
+    shown = cv2.imdecode(np.frombuffer(whole, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert shown is not None
+    assert shown.shape == PICTURE.shape[::-1]
+    np.testing.assert_array_equal(decoded(path, "sensor"), PICTURE)
 
 
 def test_only_the_first_picture_of_a_tiff_counts_and_copies_of_it_do_not(tmp_path: Path) -> None:

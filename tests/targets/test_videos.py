@@ -41,6 +41,31 @@ def test_frames_are_turned_where_they_are_to_be_upright(tmp_path: Path, turn: in
     assert abs(grey(first, "upright").astype(int) - shown).mean() < 5
 
 
+@pytest.mark.parametrize("answer", [-1.0, 0.0, 45.0, 360.0])
+def test_frames_are_not_turned_where_nothing_tells_how(
+    tmp_path: Path, answer: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OpenCV answers -1 where it reads a video by something else than FFmpeg."""
+    frame = np.zeros((48, 64), np.uint8)
+    frame[:24, :32] = 255
+    film(tmp_path / "film.mp4", 0, [frame] * 3)
+
+    class Capture:
+        def __init__(self, name: str) -> None:
+            self.whole = opened(name)
+
+        def get(self, what: int) -> float:
+            return answer if what == cv2.CAP_PROP_ORIENTATION_META else self.whole.get(what)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.whole, name)
+
+    opened = cv2.VideoCapture
+    monkeypatch.setattr(cv2, "VideoCapture", Capture)
+    first = listed(tmp_path / "film.mp4")[0]
+    np.testing.assert_array_equal(grey(first, "upright"), grey(first))
+
+
 def test_the_size_of_views_is_that_of_upright_frames(tmp_path: Path) -> None:
     squares = np.kron(np.indices((5, 6)).sum(axis=0) % 2, np.ones((32, 32))).astype(np.uint8) * 255
     frame = cv2.copyMakeBorder(squares, 32, 32, 48, 48, cv2.BORDER_CONSTANT, value=255)
