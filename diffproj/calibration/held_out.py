@@ -45,11 +45,28 @@ class Errors(NamedTuple):
 
 
 def table_of_folds(*columns: Tensor) -> str:
-    """Errors `(k,)` of fitted and of held-out corners, in pixels and in world units: each fold, and all together."""
-    rows = [*torch.stack(columns, dim=-1).tolist(), [float(c.square().mean().sqrt()) for c in columns]]
+    """Errors `(k,)` of fitted and of held-out corners, in pixels and in world units: each fold, and all together.
+
+    Folds without an error (NaN) take no part in what all have together.
+    """
+    rows = [*torch.stack(columns, dim=-1).tolist(), [over_folds(c) for c in columns]]
     names = [*map(str, range(1, len(rows))), "all"]
     lines = [f"{n:<4} {a:11.4f} {b:13.4f} {c:14.4f} {d:16.4f}" for n, (a, b, c, d) in zip(names, rows, strict=True)]
-    return "\n".join(["fold   fitted px   held out px   fitted world   held out world", *lines])
+    lines = ["fold   fitted px   held out px   fitted world   held out world", *lines]
+    if (missing := without_error(columns[1])) != "":
+        lines.append(f"{missing}: no view there had corners enough, and 'all' is of the others")
+    return "\n".join(lines)
+
+
+def over_folds(errors: Tensor) -> float:
+    """The root mean square of the errors of folds `(k,)` that have one; NaN where none has."""
+    return float(errors.square().nanmean().sqrt())
+
+
+def without_error(errors: Tensor) -> str:
+    """How many folds could not be evaluated, of their errors `(k,)`; nothing where all could."""
+    missing = int(errors.isnan().sum())
+    return f"{missing} of {len(errors)} folds not evaluated" if missing else ""
 
 
 def repeated(views: Views, count: int) -> Views:

@@ -17,7 +17,15 @@ from diffproj._core.shown import Shown
 from diffproj.calibration.circle_centres import with_true_centres
 from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.options import CalibrationOptions, Options, calibration_options
-from diffproj.calibration.held_out import errors_of, folds_of, repeated, table_of_folds, without_views
+from diffproj.calibration.held_out import (
+    errors_of,
+    folds_of,
+    over_folds,
+    repeated,
+    table_of_folds,
+    without_error,
+    without_views,
+)
 from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.one_lens import calibrated
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
@@ -57,8 +65,9 @@ class CrossValidation(Shown):
         return columns | {name: getattr(self, name).tolist() for name in names}
 
     def _facts(self) -> list[str]:
-        held_out, fitted = (float(part.square().mean().sqrt()) for part in (self.held_out_px, self.in_sample_px))
-        return [f"{len(self.lost)} folds", f"held out RMS {held_out:.4f} px", f"fitted {fitted:.4f} px"]
+        held_out, fitted = (over_folds(part) for part in (self.held_out_px, self.in_sample_px))
+        missing = without_error(self.held_out_px)
+        return [f"{len(self.lost)} folds", f"held out RMS {held_out:.4f} px", f"fitted {fitted:.4f} px", missing]
 
     def _columns(self) -> dict[str, list[Any]]:
         return self.to_dict()

@@ -1,7 +1,8 @@
 """Joining cameras, planes, lenses and views to batches, by hand and in a `DataLoader`."""
 
 import copy
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections import UserDict
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 from torch.utils.data import default_collate
@@ -82,9 +83,9 @@ def _joined(samples: list[Any]) -> Any:
             raise type(error)(str(error).replace("items:", "samples:")) from None
     if isinstance(first, Mapping):
         joined = {key: _joined([sample[key] for sample in samples]) for key in first}
-        if kind is dict or not isinstance(first, MutableMapping):
+        if kind is dict or not isinstance(first, dict | UserDict):
             return joined
-        batch = copy.copy(first)  # of its own kind, as default_collate does it
+        batch = copy.copy(first)  # of its own kind, as default_collate does it; others' copies may share their values
         batch.update(joined)
         return batch
     if isinstance(first, tuple | list):

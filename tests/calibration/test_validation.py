@@ -1,5 +1,7 @@
 """Held-out errors and bootstrap deviations."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -43,6 +45,17 @@ def test_held_out_errors_are_larger_and_in_their_place() -> None:
     lines = outcome.summary().splitlines()
     assert len(lines) == 5
     assert lines[-1].startswith("all")
+    assert "evaluated" not in repr(outcome)
+
+
+def test_folds_without_an_error_are_left_out_of_the_total() -> None:
+    found = dp.cross_validate(dp.example_views("left"), BOARD, folds=3)
+    gaps = replace(found, held_out_px=torch.tensor([0.3, torch.nan, 0.4], dtype=D))
+    assert "held out RMS 0.3536 px" in repr(gaps)
+    assert "1 of 3 folds not evaluated" in repr(gaps)
+    assert "0.3536" in gaps.summary()
+    none = replace(found, held_out_px=torch.full((3,), torch.nan, dtype=D))
+    assert "3 of 3 folds not evaluated" in repr(none)
 
 
 @pytest.mark.parametrize("who", ["camera", "rig"])

@@ -1,8 +1,10 @@
 """Many cameras in one projector, chosen by index; parts of a pose; and batches of cameras from a `DataLoader`."""
 
 from collections import OrderedDict, UserDict, defaultdict
+from collections.abc import Iterator, MutableMapping
 from functools import partial
 from types import MappingProxyType
+from typing import Any
 
 import pytest
 import torch
@@ -173,6 +175,38 @@ def test_a_loader_joins_cameras(cameras: dp.Camera) -> None:
         ValueError, match=r"samples: want .* got Tensor of shape \(2, 2\), Tensor of shape \(3, 2\): stack"
     ):
         dp.collate([(torch.zeros(2, 2), 1), (torch.zeros(3, 2), 2)])
+
+
+class Sample(MutableMapping[str, Any]):
+    """Keeps its values in an attribute, which a copy of it shares."""
+
+    def __init__(self, values: dict[str, Any]) -> None:
+        self.values_of = values
+
+    def __getitem__(self, key: str) -> Any:
+        return self.values_of[key]
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        self.values_of[key] = value
+
+    def __delitem__(self, key: str) -> None:
+        del self.values_of[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values_of)
+
+    def __len__(self) -> int:
+        return len(self.values_of)
+
+
+def test_samples_of_any_kind_stay_as_they_are(cameras: dp.Camera) -> None:
+    samples = [Sample({"camera": camera, "number": n}) for n, camera in enumerate(cameras)]
+    batch = dp.collate(samples)
+    assert type(batch) is dict
+    assert torch.equal(batch["camera"].t, cameras.t)
+    assert batch["number"].tolist() == [0, 1, 2]
+    assert [sample["number"] for sample in samples] == [0, 1, 2]
+    assert not samples[0]["camera"].batch_shape
 
 
 def test_cameras_are_joined_in_dictionaries_of_any_kind(cameras: dp.Camera) -> None:

@@ -20,7 +20,14 @@ from diffproj.calibration.rigs.discounted import discounted
 from diffproj.calibration.rigs.fit import RigFit
 from diffproj.calibration.rigs.prior_contradiction import contradicted_priors
 from diffproj.calibration.rigs.result import RigCalibration
-from diffproj.calibration.rigs.uncertainty import CameraNoise, camera_noise, of_camera, plain_covariance, rig_covariance
+from diffproj.calibration.rigs.uncertainty import (
+    CameraNoise,
+    camera_noise,
+    of_camera,
+    of_right_corners,
+    plain_covariance,
+    rig_covariance,
+)
 from diffproj.calibration.trust.verdict import FEWEST_FOR_A_SHAPE, MAX_RELATIVE_STD
 from diffproj.geometry.camera import Camera
 
@@ -121,9 +128,12 @@ class _Late:
 
     @cached_property
     def common(self) -> CommonErrors | None:
-        """Errors that all corners of a view share."""
-        noise = self.noise
-        return common_errors(self.found, noise.variance / noise.bend, noise.freedom, noise.bend)
+        """Errors that all corners of a view share; of these, wrong ones tell nothing."""
+        found, noise = self.found, self.noise
+        if self.wrong is not None and any(bool(part.any()) for part in self.wrong.values()):
+            found = of_right_corners(found, self.wrong)
+            noise = camera_noise(found)
+        return common_errors(found, noise.variance / noise.bend, noise.freedom, noise.bend)
 
     def __call__(self) -> Covariance:
         if self.known is None:

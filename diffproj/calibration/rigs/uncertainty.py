@@ -7,8 +7,9 @@ each camera's share. With s_c the noise of camera c, and all views of a moment o
     H = sum_c sum w J^T J       M = sum_c s_c^2 sum w J^T J       covariance = phi H^-1 M H^-1
 
 where the corners of a camera clearly scatter more at a moment than at others, their own noise stands for s_c there
-(`noisy_views.py`). A corner that a robust loss holds for wrong counts as if it had not been seen, but for what the loss
-lets through of its pull, so that a moment of few corners has the covariance of the right ones. phi is the dispersion
+(`noisy_views.py`). A corner that a robust loss holds for wrong counts as if it had not been seen, and so do all of a
+moment whose pose the others do not tell. What the loss lets through of its pull goes into the pose alone, as in
+`trust/robust_loss.py`, so that a moment of few corners has the covariance of the right ones. phi is the dispersion
 (`dispersion.py`): how much the moments contradict each other. Errors that all corners of a view share are a part of M
 of their own (`common_errors.py`), and phi multiplies the corners' part by what these leave of the dispersion.
 """
@@ -21,7 +22,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.least_squares.eliminated import local_inverse, reduced
-from diffproj.calibration.least_squares.losses import slope_and_bend
+from diffproj.calibration.least_squares.losses import Loss, slope_and_bend
 from diffproj.calibration.least_squares.normal_equations import Equations
 from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.results.covariance import Covariance, Scores, covariance, points_turned, reshaped
@@ -184,17 +185,15 @@ def rig_covariance(
     _, M = found.problem.totals(*state, scale=scale, by_moment=True)
     phi, of_corners = _dispersion(found, M, None if common is None else common.scores)
     pulls = None
-    if wrong is not None and any(bool(part.any()) for part in wrong.values()):
-        pulls = wrong_pulls(found, wrong)
-        found = without(found, wrong)
+    if found.loss is not None and wrong is not None and any(bool(part.any()) for part in wrong.values()):
+        pulls = wrong_pulls(found, found.loss, wrong)
+        found = of_right_corners(found, wrong)
         noise = camera_noise(found)
         scale = (noise.variance * noise.inflation).nan_to_num(0.0)
     H, noisy = found.curvature(noise.bend), noisy_moments(found, noise)
     if pulls is not None or bool((noisy > 1).any()):
         _, M = found.problem.totals(*state, scale=scale.unsqueeze(-1) * noisy, by_moment=True)
     scores = Scores(M.U, M.E, M.W)
-    if pulls is not None:
-        scores = Scores(*(a + b for a, b in zip(scores, pulls, strict=True)))
     if common is not None:  # of all dispersion, the part that common errors do not explain is the corners'
         scores = Scores(*((of_corners * a + b) / phi for a, b in zip(scores, common.scores, strict=True)))
     precision = (
@@ -214,6 +213,9 @@ def rig_covariance(
         dispersion=phi,
         unseen=unseen(found),
     )
+    if pulls is not None:
+        inverse, _ = local_inverse(H.W)
+        found_one = replace(found_one, _alone=found_one._alone + of_corners * inverse @ pulls @ inverse)
     middle, axes = found.views.middle, found.views.frame.axes
     if axes is not None:
         found_one = points_turned(found_one, axes.mT, found.parameters.few + 2 * found.parameters.bow)
@@ -228,23 +230,29 @@ def without(found: RigFit, wrong: Mapping[str, Tensor]) -> RigFit:
     return replace(found, problem=problem, used=used)
 
 
-def wrong_pulls(found: RigFit, wrong: Mapping[str, Tensor]) -> Scores:
-    """What a robust loss lets through of the pulls of wrong corners `(V_c, N)`, as a part of the scores' covariance.
+def of_right_corners(found: RigFit, wrong: Mapping[str, Tensor]) -> RigFit:
+    """The fit as if wrong corners `(V_c, N)` had not been seen, nor moments whose pose the others do not tell."""
+    found = without(found, wrong)
+    _, H = found.problem.totals(found.shared, found.local, None)
+    _, unknown = local_inverse(H.W)
+    return without(found, {name: unknown[0, found.views.where[name], None] & part for name, part in found.used.items()})
+
+
+def wrong_pulls(found: RigFit, loss: Loss, wrong: Mapping[str, Tensor]) -> Tensor:
+    """What a loss lets through of wrong corners' `(V_c, N)` pulls at poses: a part of their covariance `(1, M, 6, 6)`.
 
     They count by their own size, taken to be of any direction.
     """
-    views, loss = found.views, found.loss
+    views = found.views
     strength = found.shared.new_zeros(len(views.names), len(views.moments))
     for c, (name, residual) in enumerate(found.by_camera.items()):
-        if loss is None:
-            continue
         squared, weights = residual.square().sum(-1), views.data[name].weights
         pull = squared * slope_and_bend(loss, squared)[0].square() / 2
         pull = (pull if weights is None else pull * weights[0]) * wrong[name]
         strength[c, views.where[name]] = pull.sum(-1) / wrong[name].sum(-1).clamp(min=1)
     problem = RigProblem(views, found.parameters, found.problem.base[0], wrong)
     _, M = problem.totals(found.shared, found.local, None, scale=strength, by_moment=True)
-    return Scores(M.U, M.E, M.W)
+    return M.W
 
 
 def noisy_moments(found: RigFit, noise: CameraNoise) -> Tensor:

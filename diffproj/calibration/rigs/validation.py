@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffproj._core.arguments import whole_number
 from diffproj._core.shown import Shown
-from diffproj.calibration.held_out import LEAST_CORNERS, halves, table_of_folds
+from diffproj.calibration.held_out import LEAST_CORNERS, halves, over_folds, table_of_folds, without_error
 from diffproj.calibration.least_squares.losses import Loss
 from diffproj.calibration.locate import located
 from diffproj.calibration.results.calibration import Calibration
@@ -73,8 +73,9 @@ class RigCrossValidation(Shown):
         return table_of_folds(self.in_sample_px, self.held_out_px, self.in_sample_world, self.held_out_world)
 
     def _facts(self) -> list[str]:
-        held_out, fitted = (float(part.square().mean().sqrt()) for part in (self.held_out_px, self.in_sample_px))
-        return [f"{len(self.fits)} folds", f"held out RMS {held_out:.4f} px", f"fitted {fitted:.4f} px"]
+        held_out, fitted = (over_folds(part) for part in (self.held_out_px, self.in_sample_px))
+        missing = without_error(self.held_out_px)
+        return [f"{len(self.fits)} folds", f"held out RMS {held_out:.4f} px", f"fitted {fitted:.4f} px", missing]
 
     def _columns(self) -> dict[str, list[Any]]:
         return self.to_dict()

@@ -65,6 +65,12 @@ def test_of_a_fold_without_corners_enough_nothing_is_said(two: Scene) -> None:
     assert found.held_out_world.isnan().tolist() == [False, True, False, False]
     assert found.in_sample_px.isfinite().all()
     assert "nan" in found.summary()
+    total = float(found.held_out_px[[0, 2, 3]].square().mean().sqrt())
+    assert f"held out RMS {total:.4f} px" in repr(found)  # NaN, as that of one fold, before
+    assert "1 of 4 folds not evaluated" in repr(found)
+    *_, all_folds, remark = found.summary().splitlines()
+    assert all_folds.split()[2] == f"{total:.4f}"
+    assert remark.startswith("1 of 4 folds not evaluated")
 
 
 def test_with_a_robust_loss_poses_are_found_by_it() -> None:
