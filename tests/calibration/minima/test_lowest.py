@@ -26,7 +26,7 @@ def test_the_minimum_of_a_rational_lens_that_does_not_fold() -> None:
 
     From the true cameras and from OpenCV's start one lens folds at its corners and two do not reach the whole image.
     The second, whose true focal length is 818.5 px, has a minimum with factors at 30.987, with 838.7 px +- 47.8: held, it
-    is known to 1.2 px (0.9 without what the views contradict each other about the focal length).
+    is known to 0.9 px.
     """
     problems, rows = KINDS["any brown8"](25, Draw(0)), [1, 12, 15]
     views = dp.Views(problems.views.pixels[rows], problems.views.visible[rows], size=problems.views.size)
@@ -37,5 +37,5 @@ def test_the_minimum_of_a_rational_lens_that_does_not_fold() -> None:
     cost = found.residuals.square().sum((-3, -2, -1))
     torch.testing.assert_close(cost, cost.new_tensor([14.588, 31.129, 27.794]), rtol=1e-3, atol=0)
     f_x, deviation = found.shared[1, 0], found.covariance.shared[1, 0, 0].sqrt()
-    assert float(deviation) < 1.3
+    assert float(deviation) < 1
     assert abs(float(f_x - problems.truth.K[12, ..., 0, 0].flatten()[0])) < 2 * float(deviation)
