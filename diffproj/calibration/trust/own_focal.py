@@ -46,9 +46,9 @@ NOTHING = 1e-12
 """Part of what the view that tells most does below which a view tells nothing of the focal length."""
 LEAST_SPARE = 0.5
 """Degrees of freedom that two views or fewer which tell it count as."""
-CHANCE = 1.0
+CHANCE = 1.5
 """Deviations of chance that count as nothing; half of what is beyond counts at one more. Corners with noise alone get
-deviations that are 1 % (20 views) to 3 % (8) larger in the mean by it, and would get 5 to 8 % larger ones with 0."""
+deviations that are .3 % (20 views) to 2 % (8) larger in the mean by it, and would get 5 to 8 % larger ones with 0."""
 CLEAR = 4.0
 """Deviations of chance from which on the views may be said to differ in it."""
 ALONE = 4.5
