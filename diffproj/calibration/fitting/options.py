@@ -31,8 +31,8 @@ class LocateOptions(TypedDict, total=False):
         pixel_sigma: the standard deviation of the corners' coordinates in px where it is known, a number or
             broadcasting to `(*B, V, N)`: the covariance then is that of this noise, whatever the residuals are, and
             intervals are the normal distribution's; a remark says where views contradict each other by more than that.
-            If left out, the residuals tell it. Not with `weights` or
-            `objective="plane"`; under a robust `loss` it only weighs, for wrong corners have no deviation.
+            If left out, the residuals tell it. Not with `weights` or `objective="plane"`; under a robust `loss` it only
+            weighs, for wrong corners have no deviation.
         reject_outliers: leave out corners whose residual exceeds 5 (or so many) robust standard deviations, and
             repeat; `Calibration.rejected` and the summary name them. False if left out.
         loss: a robust loss such as `dp.Huber(0.5)`, its scale in pixels (in world units for the plane objective);

@@ -53,7 +53,7 @@ CLEAR = 4.0
 """Deviations of chance from which on the views may be said to differ in it."""
 ALONE = 4.5
 """And how many times more they must contradict each other about it than about everything. Errors that are smooth over a
-board are up to four times, one view in ten: they look like another perspective."""
+board are, in one of ten sets of views, by up to four times: they look like another perspective."""
 
 
 class OwnFocal(NamedTuple):

@@ -28,7 +28,7 @@ from diffproj.calibration.trust.adequacy import (
     wants_skew,
 )
 from diffproj.calibration.trust.discounted import discounted
-from diffproj.calibration.trust.dispersion import contradiction, dispersion, pulls_of
+from diffproj.calibration.trust.dispersion import Pulls, contradiction, dispersion, pulls_of
 from diffproj.calibration.trust.entangled import Entangled, Simpler
 from diffproj.calibration.trust.leftover import Leftover, f_deviations, leftover
 from diffproj.calibration.trust.own_focal import OwnFocal, own_focal
@@ -105,7 +105,8 @@ def remarks(
             "or give a larger pixel_sigma"
         )
         said[p].append(Remark(sentence, Kind.CONTRADICTION, reason))
-    for p, times in _contradict_each_other(found).items():
+    pulls = pulls_of(found)
+    for p, times in _contradict_each_other(found, pulls).items():
         if bool(converged[p]):
             said[p].append(_of_each_other(times))
     wrong = discounted(found)
@@ -127,7 +128,6 @@ def remarks(
         # What is known beforehand and does not fit holds the camera where turned photographs would fit better.
         turned = turned_photographs(found, which[~found.has_prior()[which]], sizes)
         small = SmallEffects(found, which, left, of_landmarks)
-        pulls = pulls_of(found)
         own = own_focal(found, dispersion(found, pulls), pulls)
         for i, p in enumerate(map(int, which.tolist())):
             saved = groups[p].saved if p in groups else 0.0
@@ -208,13 +208,12 @@ def _contradicts_noise(found: Fit) -> Tensor:
     return rare & (squares > NOTABLE**2 * spare)
 
 
-def _contradict_each_other(found: Fit) -> dict[int, float]:
+def _contradict_each_other(found: Fit, pulls: Pulls | None) -> dict[int, float]:
     """How many times more than corners of the noise that was given the views contradict each other, where they do.
 
     Where no noise is given the covariance holds it.
     """
-    pulls = pulls_of(found) if found.knows_noise else None
-    if pulls is None:
+    if pulls is None or not found.knows_noise:
         return {}
     told, level = contradiction(*pulls), found.variance_of_residuals().detach()
     clear = f_deviations(told.phi, told.spare, found.degrees_of_freedom().to(told.phi).clamp(min=5)) > CLEAR
