@@ -17,6 +17,9 @@ REACH = 0.35
 OPPOSITE = -0.5
 """Greatest cosine between the phases of neighbours on a pattern."""
 
+KEPT = 0.75
+"""Share of a sheared pattern's points that it must have along its columns, too: what stood there by chance may go."""
+
 SMALLEST = 9
 """Points of the smallest pattern worth looking at."""
 
@@ -28,7 +31,8 @@ def lattices(saddles: Saddles) -> Iterator[dict[Cell, int]]:
 
     A pattern starts at a point that stands midway between two others of opposite phase in two directions. It grows
     cell by cell to the point nearest to where its row goes on: steps along a row keep their direction and the ratio of
-    their lengths, which perspective and lens change slowly.
+    their lengths, which perspective and lens change slowly. Where it turns out sheared, as it may from a point at its
+    edge, it grows once more along its columns.
     """
     count = len(saddles.points)
     if count < SMALLEST:
@@ -40,6 +44,10 @@ def lattices(saddles: Saddles) -> Iterator[dict[Cell, int]]:
     used: set[int] = set()
     for seed, axes in _seeds(points, partners, used):
         found = _grown(seed, axes, points, partners, used)
+        upright = _upright(found, axes)
+        if upright != axes:
+            again = _grown(seed, upright, points, partners, used)
+            found = again if len(again) >= KEPT * len(found) else found
         if len(found) >= SMALLEST:
             used.update(found.values())
             yield found
@@ -108,6 +116,30 @@ def _grown(
                 taken.add(best)
                 waiting.append(cell)
     return cells
+
+
+def _upright(cells: dict[Cell, int], axes: tuple[complex, complex]) -> tuple[complex, complex]:
+    """The steps along rows and columns, or shorter ones along which a pattern fills less of a rectangle.
+
+    At its edge, a board has no corner on one side. Then one far aside may stand, by chance, where it makes a pair with
+    one of the next row but two columns on: the same corners, numbered along rows that slant.
+    """
+    where = np.array(list(cells))
+    row, column = where.T
+    best, least = axes, _box(row, column)
+    for two in (-2, 2):
+        for shorter, size in (
+            ((axes[0], axes[1] + two * axes[0]), _box(row, column - two * row)),
+            ((axes[0] + two * axes[1], axes[1]), _box(row - two * column, column)),
+        ):
+            if size < least and abs(shorter[0]) + abs(shorter[1]) < abs(axes[0]) + abs(axes[1]):
+                best, least = shorter, size
+    return best
+
+
+def _box(row: Int[np.ndarray, " n"], column: Int[np.ndarray, " n"]) -> int:
+    """How many cells the rectangle around these has."""
+    return int((np.ptp(row) + 1) * (np.ptp(column) + 1))
 
 
 def _step(cells: dict[Cell, int], points: list[complex], cell: Cell, direction: Cell) -> complex | None:

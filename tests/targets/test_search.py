@@ -13,7 +13,7 @@ from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.detection import BoardNotFoundError, BoardNotFoundWarning, detect
 from diffproj.targets.lattice import as_grid, lattices
 from diffproj.targets.numbering import follow
-from diffproj.targets.saddles import saddle_points
+from diffproj.targets.saddles import Saddles, saddle_points
 from diffproj.targets.search import Pattern, extent_of, find_pattern, matched
 from diffproj.targets.synthetic import photograph
 
@@ -226,6 +226,16 @@ def test_patterns_of_a_chessboard_are_one_pattern():
     saddles = saddle_points(seen(board, scene(board, 20))[0])
     (cells,) = lattices(saddles)
     assert sorted(as_grid(cells, saddles.points).shape) == [2, 6, 9]
+
+
+def test_a_pattern_is_numbered_along_its_columns_from_a_point_at_its_edge_too():
+    """Below the board stands a saddle point by chance, midway across from one of the row above but two columns on."""
+    row, column = (np.append(place.ravel(), more) for place, more in zip(np.indices((6, 8)), (6, -1), strict=True))
+    order = np.lexsort((column, row, (row != 5) | (column != 1)))  # the pattern starts at the last row
+    points = np.stack([20.0 * column, 21.0 * row], axis=-1)[order].astype(np.float32) + 100
+    phases = np.stack([1.0 - 2 * ((row + column) % 2), 0 * row], axis=-1)[order].astype(np.float32)
+    (cells,) = lattices(Saddles(points, phases))
+    assert as_grid(cells, points).shape == (6, 8, 2)
 
 
 # ------------------------------------------------------------------------------------------- boards that look alike
