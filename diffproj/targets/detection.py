@@ -27,9 +27,12 @@ from diffproj.targets.tasks import results_of
 from diffproj.targets.videos import Frame, distinct
 from diffproj.targets.views import Views
 
+MANY = 5
+"""Photographs without a board for one and the same reason above which they are named together."""
+
 
 class BoardNotFoundWarning(UserWarning):
-    """A photograph was skipped because no board was found in it.
+    """A photograph was skipped because no board was found in it; many that have nothing else to tell, together.
 
     Example:
         Where no photograph may be skipped, turn it into an error.
@@ -206,9 +209,16 @@ def searched(
     if not pairs:
         raise BoardNotFoundError(_advice([photograph.label for photograph in listing], found, target))
     without = [photograph for photograph, one in zip(listing, found, strict=True) if one.grid is None]
+    missed: dict[str, list[str]] = {}
     for photograph, one in zip(listing, found, strict=True):
         if one.grid is None and _sharpness(photograph) is None:
-            warn_caller(f"{_miss(photograph, one, target)}; photograph skipped", BoardNotFoundWarning)
+            missed.setdefault(_miss(one, target), []).append(photograph.label)
+    for why, labels in missed.items():
+        if len(labels) > MANY:
+            warn_caller(f"{named(labels)}: {why}; photographs skipped", BoardNotFoundWarning)
+        else:
+            for label in labels:
+                warn_caller(f"{label}: {why}; photograph skipped", BoardNotFoundWarning)
     for doubt in doubts([one.label for one, _ in pairs], [one.exif for _, one in pairs], raster == "upright"):
         warn_caller(doubt)
     repeated = [photograph.label for photograph, one in pairs if one.again]
@@ -279,9 +289,9 @@ def _common_size(listing: list[Photograph], sizes: list[tuple[int, int]]) -> tup
     )
 
 
-def _miss(photograph: Photograph, found: Found, target: Board) -> str:
-    """What is said of a photograph without the board."""
-    text = f"{photograph.label}: found no {target.title}"
+def _miss(found: Found, target: Board) -> str:
+    """What is said of a photograph without the board, after its name."""
+    text = f"found no {target.title}"
     if found.hint:
         return f"{text}, but {found.hint}"
     return text + (f", but a pattern with {found.seen[0]} x {found.seen[1]}" if _telling(found.seen) else "")

@@ -419,6 +419,19 @@ def test_a_photograph_without_a_board_is_skipped_and_named(tmp_path):
     assert {warning.category for warning in caught} == {BoardNotFoundWarning}
 
 
+def test_many_photographs_without_a_board_are_named_together():
+    """A camera of a rig does not see the board in most of its photographs; one that shows another board is by itself."""
+    image, _ = photograph()
+    other, _ = photograph(Chessboard(7, 5))
+    with pytest.warns(BoardNotFoundWarning) as caught:
+        views = detect([image, *[np.zeros_like(image)] * 6, other], BOARD)
+    assert views.names == ("image 1",)
+    assert [str(warning.message) for warning in caught] == [
+        "image 2, image 3, image 4 and 3 more: found no board with 9 x 6 inner corners; photographs skipped",
+        "image 8: found no board with 9 x 6 inner corners, but a pattern with 7 x 5; photograph skipped",
+    ]
+
+
 def test_no_board_anywhere():
     """One error that says what to check, and no warnings before it."""
     image, _ = photograph()

@@ -174,7 +174,8 @@ def _verdict(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone]) -> t
         said = "" if found.problem.known is None else "are the priors right, "
         return Status.DEGENERATE, (
             f"no rig explains what the cameras see ({'; '.join(worse)}): {said}do the moments fit together (moments=), "
-            "did the cameras stand still, and are the corners numbered from the same end?"
+            "were their photographs taken at once or of a board at rest, did the cameras keep their places, and are "
+            "the corners numbered from the same end?"
         )
     if not float(noise.freedom.sum()) > 0:
         return Status.DEGENERATE, "there are fewer corners than unknowns: add moments"
