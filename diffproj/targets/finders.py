@@ -1,12 +1,13 @@
 """Find a target in one photograph: each kind of target by its own detector."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from diffproj.targets.april_grid import AprilGrid
-from diffproj.targets.boards import Board
+from diffproj.targets.boards import Board, with_article
 from diffproj.targets.charuco import CharucoBoard, with_other_start
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.circle_grid import CircleGrid
@@ -61,6 +62,18 @@ class Found(NamedTuple):
 
 def find(image: Shaped[np.ndarray, "h w"], target: Board) -> Found:
     """Find the target in a grey image from 0 to 255, uint8 or float32."""
+    found = _found(image, target)
+    if isinstance(target, Chessboard) or target.rows == target.columns or found.grid is not None or found.hint:
+        return found
+    exchanged = replace(target, columns=target.rows, rows=target.columns)
+    other = _found(image, exchanged)
+    if other.grid is None and not other.hint:
+        return found
+    besides = f", {other.hint.removeprefix('one ')}" if other.hint else ""
+    return found._replace(hint=f"{with_article(exchanged)}, columns first{besides}")
+
+
+def _found(image: Shaped[np.ndarray, "h w"], target: Board) -> Found:
     if isinstance(target, Chessboard):
         return _chessboard(image, target)
     if isinstance(target, AprilGrid):

@@ -123,6 +123,26 @@ def test_the_other_pattern_is_told(board):
         dp.detect(image, other)
 
 
+@pytest.mark.parametrize(
+    ("board", "exchanged", "told"),
+    [
+        (SMALL, dp.CharucoBoard(5, 7, 20.0, 14.0, "5X5_100"), "a ChArUco board with 7 x 5 squares, columns first."),
+        (
+            LEGACY,
+            dp.CharucoBoard(6, 8, 20.0, 15.0, "4X4_1000"),
+            "a ChArUco board with 8 x 6 squares, columns first, of the legacy pattern: give legacy=True.",
+        ),
+        (APRIL, dp.AprilGrid(4, 5, tag=20.0, spacing=0.3), "an AprilGrid with 5 x 4 tags, columns first."),
+    ],
+    ids=["charuco", "legacy", "april"],
+)
+def test_columns_and_rows_exchanged_are_told(board, exchanged, told):
+    image = photographed(camera_before(board, 1, 24), board)
+    with pytest.raises(dp.BoardNotFoundError) as caught:
+        dp.detect(image, exchanged)
+    assert f"There is {told}" in str(caught.value)
+
+
 def test_another_dictionary_is_not_found():
     image = photographed(camera_before(CHARUCO, 1, 22), CHARUCO)
     with pytest.raises(dp.BoardNotFoundError, match=r"want a ChArUco board with 8 x 6 squares.*dictionary and legacy"):
