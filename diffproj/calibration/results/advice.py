@@ -131,7 +131,9 @@ def judged(seen: Evidence) -> Judgement:
     bare = [] if covered is None else _bare(covered)
     if bare:
         remedies.append(f"the board in the {_listed(bare)} of the image, up to the edge")
-    if seen.sigma > COARSE_PX and not seen.other_model:
+    if Kind.FLEXING in seen.kinds:
+        remedies.append("a board that does not bend, glued to glass or aluminium, at rest in each photograph")
+    elif seen.sigma > COARSE_PX and not seen.other_model:
         remedies.append("sharper photographs: more light, a camera at rest, a flat print")
     odd = _odd(seen)
     if odd:
@@ -225,6 +227,7 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
             Kind.SPACING,
             Kind.FOCUS,
             Kind.BENT,
+            Kind.FLEXING,
             *OF_THE_CAMERA,
         ),
     ]

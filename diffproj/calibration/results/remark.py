@@ -27,6 +27,8 @@ class Kind(StrEnum):
     """The focal length differs from view to view."""
     BENT = "bent board"
     """The board is bent."""
+    FLEXING = "flexing board"
+    """The corners of a view err together, another way in each view, as on a board that bends."""
     CONTRADICTION = "contradiction"
     """The residuals contradict the deviations that were given."""
     BELOW = "below"

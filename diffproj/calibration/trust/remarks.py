@@ -30,6 +30,7 @@ from diffproj.calibration.trust.adequacy import (
 from diffproj.calibration.trust.discounted import discounted
 from diffproj.calibration.trust.dispersion import Pulls, contradiction, dispersion, pulls_of
 from diffproj.calibration.trust.entangled import Entangled, Simpler
+from diffproj.calibration.trust.flexing import of_a_flexing_board
 from diffproj.calibration.trust.leftover import Leftover, f_deviations, leftover
 from diffproj.calibration.trust.own_focal import OwnFocal, own_focal
 from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
@@ -147,7 +148,10 @@ def remarks(
             if not of_landmarks and _uneven_print(task, left, i, p, saved):
                 said[p].append(_of_the_print(left, i))
                 continue
-            remark = _left_over(task, left, i, p, 0.0 if of_landmarks else float(sigma[p]))
+            remark = _left_over(task, left, i, p)
+            if not of_landmarks and (remark is None or remark.kind not in OF_THE_CAMERA):
+                flexing = of_a_flexing_board(found, p, float(sigma[p]), float(left.shape.share[i]))
+                remark = flexing or remark or _noisy(float(sigma[p]))
             if p in groups and saved > BETTER * float(left.smooth.share[i]):
                 said[p].append(_two_cameras(names[p], groups[p]))
                 remark = None if remark is not None and remark.kind in OF_THE_CAMERA else remark
@@ -314,7 +318,7 @@ def _of_the_focus(own: OwnFocal | None, p: int, knows_noise: bool) -> Remark | N
     )
 
 
-def _left_over(task: Task, left: Leftover, i: int, p: int, sigma: float) -> Remark | None:
+def _left_over(task: Task, left: Leftover, i: int, p: int) -> Remark | None:
     """The remark on the residuals of camera `p`, number `i` of those that were tested; none where they are noise."""
     if wants_skew(task, left, i):
         part = f"{100 * float(left.skew.share[i]):.0f} % of their sum of squares"
@@ -344,9 +348,13 @@ def _left_over(task: Task, left: Leftover, i: int, p: int, sigma: float) -> Rema
             f"the residuals repeat on the board, whose corners lie {float(left.moved[i]):.2g} world units (RMS) "
             "off the target's: take shape='free', which finds where they are, or a flatter or better print"
         )
-    if sigma > NOISY_PX:
-        return Remark(
-            f"the corners scatter by {sigma:.1f} px in each coordinate, in sharp photographs by 0.1 to 0.3: "
-            "look for blur and for wrong corners"
-        )
     return None
+
+
+def _noisy(sigma: float) -> Remark | None:
+    if sigma <= NOISY_PX:
+        return None
+    return Remark(
+        f"the corners scatter by {sigma:.1f} px in each coordinate, in sharp photographs by 0.1 to 0.3: "
+        "look for blur and for wrong corners"
+    )
