@@ -86,6 +86,7 @@ class Leftover:
         proportion: the same as a proportion of the board changes them, such as the distance of its tags; `None` for
             boards without one.
         moved: how far the points lie off the board within its plane, `(n,)`, RMS in world units, without the noise.
+        lifted: how far they lie off that plane `(n,)`, likewise.
     """
 
     radial: Effect
@@ -96,6 +97,7 @@ class Leftover:
     print: Effect
     proportion: Effect | None
     moved: Tensor
+    lifted: Tensor
 
 
 def leftover(found: Fit, which: Tensor, shape_deviations: float, by_proportion: Tensor | None = None) -> Leftover:
@@ -167,7 +169,7 @@ class _Scores:
         proportion = None
         if by_proportion is not None and not self.task.free:
             proportion = self._added(self._moving(by_proportion), self.residual, self.count)
-        return Leftover(radial, smooth, skew, shape, bow, uneven, proportion, self._spread(moves))
+        return Leftover(radial, smooth, skew, shape, bow, uneven, proportion, *self._spread(moves))
 
     def _radial(self) -> Tensor:
         off = self.projected - self.middle[:, None, None]
@@ -286,13 +288,20 @@ class _Scores:
         moves = (inverse @ h.unsqueeze(-1)).squeeze(-1)
         return (moves * h).sum((1, 2)), 3 * self.task.used.any(1).sum(-1), moves
 
-    def _spread(self, moves: Tensor) -> Tensor:
-        A = torch.einsum("pvikn,pvjkn->pnij", self.by_point[:, :, :2], self.by_point[:, :, :2])
+    def _spread(self, moves: Tensor) -> tuple[Tensor, Tensor]:
+        """How far the points `(n, N, 3)` moved within the board's plane, and off it `(n,)`, RMS without the noise."""
         variance = _total(self.residual) / self.count.clamp(min=1)
-        noise = _inverse(A, 1e-6).diagonal(dim1=-2, dim2=-1).sum(-1) * variance.unsqueeze(-1)
         seen = self.task.used.any(1)
-        excess = torch.where(seen, moves[..., :2].square().sum(-1) - noise, 0.0).sum(-1) / seen.sum(-1).clamp(min=1)
-        return excess.clamp(min=0).sqrt()
+        spread = []
+        for axes in (slice(0, 2), slice(2, 3)):
+            by = self.by_point[:, :, axes]
+            A = torch.einsum("pvikn,pvjkn->pnij", by, by)
+            noise = _inverse(A, 1e-6).diagonal(dim1=-2, dim2=-1).sum(-1) * variance.unsqueeze(-1)
+            excess = torch.where(seen, moves[..., axes].square().sum(-1) - noise, 0.0).sum(-1) / seen.sum(-1).clamp(
+                min=1
+            )
+            spread.append(excess.clamp(min=0).sqrt())
+        return spread[0], spread[1]
 
 
 def _joined(parts: list[Leftover]) -> Leftover:

@@ -52,6 +52,8 @@ CLEAR = 4.0
 """Deviations of chance from which on views contradict each other."""
 BETTER = 0.8
 """Part of what another lens would explain that two groups must save to be named in its place."""
+LIFTED = 2.0
+"""Times as far off the board's plane as within it that corners must lie for the plane to be named."""
 MOST_NAMED = 5
 """Views that are named."""
 NO_DENOMINATOR = {"brown8": "'brown5'"} | dict.fromkeys(("brown12", "brown14"), "fixed=('k4', 'k5', 'k6')")
@@ -344,9 +346,13 @@ def _left_over(task: Task, left: Leftover, i: int, p: int) -> Remark | None:
                 Kind.BENT,
                 "the board is bent",
             )
+        moved, lifted = float(left.moved[i]), float(left.lifted[i])
+        off = f"{moved:.2g} world units (RMS) off the target's"
+        if lifted > LIFTED * moved:
+            off = f"{lifted:.2g} world units (RMS) off the target's plane"
         return Remark(
-            f"the residuals repeat on the board, whose corners lie {float(left.moved[i]):.2g} world units (RMS) "
-            "off the target's: take shape='free', which finds where they are, or a flatter or better print"
+            f"the residuals repeat on the board, whose corners lie {off}: take shape='free', which finds where they "
+            "are, or a flatter or better print"
         )
     return None
 

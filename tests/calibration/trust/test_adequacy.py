@@ -112,6 +112,17 @@ def test_the_boards_shape() -> None:
     assert silent(dp.calibrate(views, BOARD, shape="bow"))
 
 
+def test_a_board_that_is_not_flat() -> None:
+    """A twist is no bow, and moves no corner within the plane."""
+    twisted = BOARD.points.clone()
+    x, y = (twisted[:, :2] / twisted[:, :2].amax(0) * 2 - 1).unbind(-1)
+    twisted[:, 2] = 1.5 * x * y
+    for text in dp.calibrate(seen(camera(600, BROWN), 3, points=twisted), BOARD).remarks:
+        assert "off the target's plane: take shape='free'" in text
+        far = float(text.split("lie ")[1].split()[0])
+        assert far == pytest.approx(float(twisted[:, 2].square().mean().sqrt()), rel=0.3)
+
+
 def test_corners_that_scatter() -> None:
     found = dp.calibrate(seen(camera(600, BROWN), 2, noise=2.0), BOARD)
     assert all(text.startswith("the corners scatter by 2.0 px in each coordinate") for text in found.remarks)
