@@ -35,6 +35,7 @@ from diffproj.calibration.trust.uncertainty import covariance_of
 from diffproj.calibration.trust.verdict import verdicts
 from diffproj.geometry.camera import Camera
 from diffproj.targets.landmarks import Landmarks
+from diffproj.targets.one_camera import against_one_camera
 from diffproj.targets.views import Views
 
 BELOW = (
@@ -180,6 +181,11 @@ def outcome(
 def remarks_on(found: Fit, status: Tensor, doubt: Entangled, data: Data, views: Sequence[Views]) -> tuple[Remarks, ...]:
     """The remarks on each of P cameras, of its own views, and on how it stands to landmarks, if the target is that."""
     said = remarks(found, status, doubt, [own.names for own in views], [own.size for own in views], data.target)
+    if not poses_only(found.task):
+        used = found.task.used.any(-1)
+        converged = (status == Status.CONVERGED).tolist()
+        apart = [_told_apart(own, used[p]) if converged[p] else () for p, own in enumerate(views)]
+        said = tuple((*more, *one) for more, one in zip(apart, said, strict=True))
     if not isinstance(data.target, Landmarks) or found.task.solid:
         return said
     below = upside_down(data.frame, *_state(found)[1]) & found.task.used.any(-1)
@@ -187,6 +193,14 @@ def remarks_on(found: Fit, status: Tensor, doubt: Entangled, data: Data, views: 
     return tuple(
         (*one, Remark(BELOW.format(", ".join(own.names[v] for v in where)), Kind.BELOW)) if where else one
         for one, where, own in zip(said, (row.nonzero().flatten().tolist() for row in below), views, strict=True)
+    )
+
+
+def _told_apart(views: Views, used: Tensor) -> Remarks:
+    """What the files of those of one camera's views that were used tell against one camera with one zoom."""
+    views = views[used[: len(views)]] if views.told else views  # a camera of several has fewer views than the others
+    return tuple(
+        Remark(sentence, Kind.TOLD_APART, reason) for sentence, reason in against_one_camera(views.names, views.told)
     )
 
 

@@ -28,6 +28,9 @@ WHOLE = {1: "B", SHORT: "H", 4: "I", 16: "Q"}
 ORIENTATION, KIND, MAKER, MODEL, EXIF_PART = 0x0112, 0x00FE, 0x010F, 0x0110, 0x8769
 FOCAL, ZOOM, FOCAL_35, SERIAL, LENS = 0x920A, 0xA404, 0xA405, 0xA431, 0xA434
 
+Told = tuple[tuple[str, str | float], ...]
+"""What a file tells of its photograph: a name and a value each."""
+
 
 class Exif(NamedTuple):
     """What a file tells of a photograph; what it does not tell is empty, or `None`.

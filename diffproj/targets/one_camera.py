@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from diffproj.targets.exif import MIRRORED, Exif
+from diffproj.targets.exif import MIRRORED, Exif, Told
 
 SAME = 0.005
 """Relative difference up to which two numbers of EXIF data count as the same: they are rounded."""
@@ -16,6 +16,9 @@ KEPT = (
     ("focal_35", "different focal lengths (as of 35 mm film)", " mm"),
 )
 """What stays as it is while one camera with one zoom photographs: in `Exif`, in words, its unit."""
+
+TURN, FLIP = "turn", "flip"
+"""In `Views.told`: how a photograph was turned, and whether its file holds a mirror image (1) or not (0)."""
 
 
 def doubts(labels: Sequence[str], told: Sequence[Exif | None], upright: bool) -> list[str]:
@@ -32,6 +35,44 @@ def doubts(labels: Sequence[str], told: Sequence[Exif | None], upright: bool) ->
     if many:
         found.append(f"{named(many)}: want one picture a file, got several; the first was taken")
     return [text for text in found if text]
+
+
+def told_of(exif: Exif | None, upright: bool) -> Told:
+    """What a file tells of its photograph that all photographs of one calibration have in common, for `Views.told`."""
+    if exif is None:
+        return ()
+    kept = [(field, getattr(exif, field)) for field, _, _ in KEPT if getattr(exif, field)]
+    turn = (TURN, float(exif.orientation)) if upright else (FLIP, float(exif.orientation in MIRRORED))
+    return (*kept, turn)
+
+
+def against_one_camera(names: Sequence[str], told: Sequence[Told]) -> list[tuple[str, str]]:
+    """What files tell against these views being of one camera that counts its pixels one way.
+
+    Args:
+        names: of the views.
+        told: what their files tell, see `Views.told`; empty where nothing is known.
+
+    Returns:
+        A sentence each, and the same in a few words.
+    """
+    if not told:
+        return []
+    known = [dict(one) for one in told]
+    found = []
+    for field, what, unit in KEPT:
+        each = _told_apart([(name, one[field]) for name, one in zip(names, known, strict=True) if field in one], unit)
+        if each:
+            reason = f"EXIF data tell of {what}"
+            found.append((f"{reason}, {each}: calibrate them by themselves", reason))
+            break
+    for field, what in ((TURN, "of photographs that were turned apart"), (FLIP, "of mirror images among the others")):
+        groups = _groups([(name, one[field]) for name, one in zip(names, known, strict=True) if field in one])
+        if len(groups) > 1:
+            fewest = min(groups.values(), key=len)
+            reason = f"EXIF data tell {what}"
+            found.append((f"{reason}, {named(fewest)}, which have another principal point: leave them out", reason))
+    return found
 
 
 def named(labels: Sequence[str]) -> str:
@@ -70,17 +111,24 @@ def _turned_apart(files: list[tuple[str, Exif]]) -> str:
 def _several(files: list[tuple[str, Exif]]) -> str:
     """Whether the camera or its zoom changed between photographs."""
     for field, what, unit in KEPT:
-        groups = _groups([(label, getattr(one, field)) for label, one in files if getattr(one, field)])
-        if len(groups) > 1:
-            each = [
-                f"{value if isinstance(value, str) else f'{value:.4g}'}{unit} in {named(labels)}"
-                for value, labels in groups.items()
-            ]
+        each = _told_apart([(label, getattr(one, field)) for label, one in files if getattr(one, field)], unit)
+        if each:
             return (
-                f"photographs: want those of one camera with one zoom, got {what} by their EXIF data: "
-                f"{' and '.join(each)}; calibrate them by themselves"
+                f"photographs: want those of one camera with one zoom, got {what} by their EXIF data: {each}; "
+                "calibrate them by themselves"
             )
     return ""
+
+
+def _told_apart(told: list[tuple[str, str | float]], unit: str) -> str:
+    """Which photographs tell what of one thing; empty where all tell the same."""
+    groups = _groups(told)
+    if len(groups) < 2:
+        return ""
+    return " and ".join(
+        f"{value if isinstance(value, str) else f'{value:.4g}'}{unit} in {named(labels)}"
+        for value, labels in groups.items()
+    )
 
 
 def _groups(told: list[tuple[str, str | float]]) -> dict[str | float, list[str]]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
@@ -125,3 +126,61 @@ def test_a_file_is_read_once_for_its_pixels_and_what_it_tells(tmp_path: Path, mo
     read.clear()
     one_photograph(tmp_path / "a.png", "sensor")
     assert read == ["a.png"]
+
+
+def zoomed(folder: Path, focal: dict[int, float], orientation: dict[int, int]) -> Path:
+    """Rendered photographs of one camera, with EXIF data."""
+    camera = dp.Camera([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]], size=(320, 240))
+    turns = ((0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0, -0.5, 0), (0.3, 0.3, 0.2), (0.4, -0.4, 0.1))
+    for n, turn in enumerate(turns):
+        R = dp.rotation_from_euler(*torch.tensor(turn, dtype=torch.float64))
+        t = torch.tensor([0.0, 0, 200 + 10 * n], dtype=torch.float64) - R @ BOARD.points.double().mean(0)
+        pixels = np.asarray(dp.synthetic.photograph(camera.at(R, t), BOARD, seed=n))
+        exif = Image.Exif()
+        exif[0x0112] = orientation.get(n, 1)
+        exif.get_ifd(0x8769)[0x920A] = IFDRational(round(100 * focal.get(n, 24.0)), 100)
+        Image.fromarray(pixels).save(folder / f"{n}.png", exif=exif)
+    return folder
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_what_files_tell_of_two_zooms_is_in_the_verdict_and_in_the_file(tmp_path: Path) -> None:
+    views = dp.detect(zoomed(tmp_path, {1: 28.0}, {}), BOARD)
+    found = dp.calibrate(views, BOARD, "none")
+    assert found.verdict.startswith("Weak")
+    assert "EXIF data tell of different focal lengths" in found.verdict
+    assert "24 mm in 0.png, 2.png, 3.png and 2 more and 28 mm in 1.png: calibrate them by" in found.remarks[0]
+    dp.save_camera(tmp_path / "camera.json", found)
+    again = dp.load_calibration(tmp_path / "camera.json")
+    assert again.verdict == found.verdict
+    assert "EXIF" in dp.refine(again.views, BOARD, again.camera).verdict
+    several = dp.calibrate([views, views[[0, 2, 3, 4, 5]]], BOARD, "none")
+    assert [isinstance(one, dp.Calibration) and "EXIF" in one.verdict for one in several] == [True, False]
+    for alone in (views[[0, 2, 3, 4, 5]], views[2:]):
+        assert "EXIF" not in dp.calibrate(alone, BOARD, "none").verdict
+    hidden = torch.zeros_like(views.visible)
+    hidden[1] = True  # the one that is zoomed does not count
+    assert "EXIF" not in dp.calibrate(views.hiding(hidden), BOARD, "none").verdict
+    one = dp.Views.stack([views, views])
+    assert "EXIF" not in dp.calibrate(one, BOARD, "none").remarks[0]
+    assert not dp.locate(views, BOARD, found.camera).doubts
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_views_turned_apart_are_in_the_verdict(tmp_path: Path) -> None:
+    folder = zoomed(tmp_path, {}, {2: 3, 4: 2})
+    upright = dp.calibrate(dp.detect(folder, BOARD, orientation="upright"), BOARD, "none")
+    assert "EXIF data tell of photographs that were turned apart" in upright.verdict
+    as_recorded = dp.calibrate(dp.detect(folder, BOARD), BOARD, "none")
+    assert "EXIF data tell of mirror images among the others, 4.png, which" in as_recorded.remarks[0]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_rig_is_told_of_a_camera_that_changed(tmp_path: Path) -> None:
+    folder = zoomed(tmp_path, {1: 28.0}, {})
+    views = dp.detect(folder, BOARD)
+    other = dp.Views(views.pixels, views.visible, views.names, views.size)
+    rig = dp.calibrate_rig({"a": views, "b": other}, BOARD, "none")
+    told = [one for one in rig.remarks if "EXIF" in one]
+    assert len(told) == 1
+    assert told[0].startswith("a: EXIF data tell of different focal lengths, 24 mm in 0.png")
