@@ -177,7 +177,8 @@ def _tell(options: argparse.Namespace, lines: list[dict[str, Any]], new: int, se
     if worst:
         table = Table(title="The worst", title_justify="left")
         for title in ("camera", "views", "RMS in px", "f_x in px", "verdict"):
-            table.add_column(title, overflow="fold", justify="left" if title in ("camera", "verdict") else "right")
+            words = title in ("camera", "verdict")
+            table.add_column(title, overflow="fold", justify="left" if words else "right", no_wrap=not words)
         for line in worst:
             found = line["summary"]
             sure = f"{found['f_x']:.1f} ± {found['f_x_deviation']:.1f}"

@@ -64,7 +64,7 @@ def _points_table(document: dict[str, Any], unit: str) -> Table:
     found = [row for row in document["points"] if row["valid"]]
     columns = []
     for axis, name in enumerate("xyz"):
-        table.add_column(f"{name} ± deviation", overflow="fold")
+        table.add_column(f"{name} ± deviation", no_wrap=True)
         pairs = [coordinate(row["world"], row["deviation"], axis) for row in found]
         starts = aligned([value for value, _ in pairs]) if pairs else []
         columns.append([start + rest for start, (_, rest) in zip(starts, pairs, strict=True)])
@@ -89,8 +89,9 @@ def coordinate(world: list[float], deviations: list[float | None], axis: int) ->
 
 def _lengths_table(lengths: list[dict[str, Any]], unit: str | None) -> Table:
     table = Table(title="Lengths" + (f" in {unit}" if unit else ""), title_justify="left")
-    for name in ("from, to", "length", "standard deviation", "95 % interval"):
-        table.add_column(name, overflow="fold")
+    table.add_column("from, to", overflow="fold")
+    for name in ("length", "standard deviation", "95 % interval"):
+        table.add_column(name, no_wrap=True)
     rows = [shown(length) for length in lengths]
     values, deviations = (aligned(column) for column in zip(*((row[0], row[1]) for row in rows), strict=True))
     for length, value, deviation, (_, _, interval) in zip(lengths, values, deviations, rows, strict=True):

@@ -313,3 +313,19 @@ def test_frames_of_videos_are_decoded_once(read: Counter[str], capsys: pytest.Ca
     assert read == {"grey": 5}
     assert run(capsys, "calibrate", *arguments, "--report", "a.html")[0] == 0
     assert read == {"grey": 5 + 5 + 1}  # grey as they are kept, that to measure in, too
+
+
+@pytest.mark.parametrize("columns", [20, 40, 80])
+def test_numbers_in_tables_stay_whole_in_any_terminal(
+    folder: Path, columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, told, _ = run(capsys, *COMMANDS["measure"], "--json")
+    point = json.loads(told)["points"][0]
+    monkeypatch.setenv("COLUMNS", str(columns))
+    _, out, _ = run(capsys, *COMMANDS["measure"])
+    x = re.search(r"210, 133\s*│\s*(-?[\d.]+) ± [\d.]+ │\s*(-?[\d.]+) ± [\d.]+ │", out)
+    assert x is not None
+    assert [float(one) for one in x.groups()] == pytest.approx(point["world"][:2], abs=0.06)
+    assert re.search(r"│ 1, 2 +│ [\d.]+ │ [\d.]+ +│ [\d.]+ to [\d.]+ │", out)
+    _, out, _ = run(capsys, *COMMANDS["calibrate"])
+    assert re.search(r"│\s+\d+\.\d+ │ \d+\.\d+ +│", out)
