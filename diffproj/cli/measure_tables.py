@@ -9,6 +9,9 @@ from diffproj.cli.scene import Scene
 from diffproj.cli.terminal import RESULTS, aligned, result, rounded
 from diffproj.cli.units import heading
 
+ALL = 3
+"""What deviations may hold: noise of pixels, pose and camera."""
+
 EXACT = 1e-9
 """Standard deviation, as a part of the point's largest coordinate, that is rounding error: the plane alone says what
 such a coordinate is."""
@@ -45,15 +48,20 @@ def say(document: dict[str, Any], scene: Scene) -> None:
     for remark in document["remarks"]:
         RESULTS.print(remark, markup=False)
     result("")
+    RESULTS.print(about_deviations(document), markup=False)
+
+
+def about_deviations(document: dict[str, Any]) -> str:
+    """What the deviations hold, and what they do not, in a sentence."""
     noise = NOISE[document["pixel_sigma_from"]].format(f"{document['pixel_sigma']:.2g}")
     sentence = {
-        3: f"The deviations hold {noise}, and how surely the pose and the camera are known.",
+        ALL: f"The deviations hold {noise}, and how surely the pose and the camera are known.",
         2: f"The deviations hold {noise} and how surely the pose is known, but NOT how surely the camera is, for its "
         "file does not tell: the truth may lie further off. A .json from 'diffproj calibrate' tells it.",
         1: f"The deviations hold {noise} ONLY, and not how surely the pose and the camera are known, for the file does "
         "not tell: the truth may lie further off. A .json from 'diffproj calibrate' tells it.",
     }
-    RESULTS.print(sentence[len(document["deviations_include"])], markup=False)
+    return sentence[len(document["deviations_include"])]
 
 
 def _points_table(document: dict[str, Any], unit: str) -> Table:

@@ -14,11 +14,11 @@ from diffproj.cli.measure_csv import as_csv
 from diffproj.cli.measure_document import PixelNoise, document
 from diffproj.cli.measure_page import check_page, write_page
 from diffproj.cli.measure_plane import plane_of
-from diffproj.cli.measure_tables import say, shown
+from diffproj.cli.measure_tables import ALL, about_deviations, say, shown
 from diffproj.cli.photographs import warn_if_shown_turned
 from diffproj.cli.points_file import Pixel, read_points
 from diffproj.cli.scene import Scene, scene_of
-from diffproj.cli.terminal import as_json, result
+from diffproj.cli.terminal import alert, as_json, result
 from diffproj.measurement.choices import detector_noise
 from diffproj.measurement.measure import measure
 from diffproj.targets.images import grey
@@ -59,6 +59,8 @@ def run(options: argparse.Namespace) -> int:
         as_json(found)
     elif options.csv:
         result(as_csv(found).rstrip())
+        if len(found["deviations_include"]) < ALL:  # what a table has no place for
+            alert(about_deviations(found))
     else:
         say(found, scene)
         if options.draw is not None:

@@ -475,6 +475,16 @@ def test_tables_for_spreadsheets(capsys: pytest.CaptureFixture[str]) -> None:
     assert (first["name"], first["unit"], rows[-1]["unit"], rows[-1]["value"]) == ("1, 2", "mm", "mm^2", "")
 
 
+def test_with_a_table_it_is_told_what_its_deviations_lack(capsys: pytest.CaptureFixture[str]) -> None:
+    """A table has no place for it, so that those of a camera without deviations looked like all others."""
+    options = ("photo.png", *BOARD, "--points", *CORNERS, "--csv", "--quiet")
+    code, out, err = run(capsys, *options, "--camera", "camera.yaml")
+    assert code == 0
+    assert err.startswith("diffproj: The deviations hold 0.5 px for each pixel, as for points picked by hand")
+    assert "but NOT how surely the camera is, for its file does not tell" in err
+    assert out.startswith("what,name,u,v")
+
+
 def test_the_table_says_what_is_doubtful(capsys: pytest.CaptureFixture[str]) -> None:
     """What is measured by another camera stood there like everything else: doubts were on standard error alone."""
     options = ("photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS, "-9000,100", "--json")
