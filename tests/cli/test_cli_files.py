@@ -51,6 +51,20 @@ def test_convert_names_lenses_as_the_other_documents_do(folder: Path, capsys: py
         assert (told[0]["rig"], told[0]["cameras"]) == (None, None)
 
 
+def test_what_a_format_has_no_place_for_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = str(folder / "whole.json")
+    dp.save_camera(source, dp.calibrate(dp.example_views("left")[:4], dp.Chessboard()))
+    for options in (["e.yml"], ["e.txt"], ["e.npz"], ["e.json", "--without-pose"]):
+        out, *more = options
+        assert main(["convert", source, str(folder / out), *more]) == 0
+        assert (
+            f"{folder / out} holds the camera alone: error bars, views and unit of {source}" in capsys.readouterr().err
+        )
+    for inside, out in ((source, "f.json"), (str(folder / "e.yml"), "g.json"), (str(folder / "e.yml"), "g.xml")):
+        assert main(["convert", inside, str(folder / out)]) == 0
+        assert capsys.readouterr().err == ""
+
+
 def test_a_whole_calibration_stays_whole(folder: Path) -> None:
     calibration = dp.calibrate(dp.example_views("left")[:4], dp.Chessboard())
     dp.save_camera(folder / "c.json", calibration)
