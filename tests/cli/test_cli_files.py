@@ -1,6 +1,7 @@
 """`diffproj convert` and `diffproj info`."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -143,9 +144,20 @@ def test_info_refuses_height_and_width(folder: Path, capsys: pytest.CaptureFixtu
 
 
 def test_info_of_a_calibration_and_of_damage(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    dp.save_camera(folder / "c.json", dp.calibrate(dp.example_views("left")[:4], dp.Chessboard()))
+    found = replace(dp.calibrate(dp.example_views("left")[:4], dp.Chessboard()), unit="mm")
+    dp.save_camera(folder / "c.json", found)
     assert main(["info", str(folder / "c.json")]) == 0
-    assert "a calibration of 4 views, RMS" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "a calibration of 4 views, RMS" in out
+    assert "px; lengths in mm\nWeak: only 4 views differ" in out
+    assert main(["info", str(folder / "c.json"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["calibration"]
+    assert told["verdict"].startswith("Weak: only 4 views differ")
+    assert told["unit"] == "mm"
+    both = torch.stack([dp.example_views(side).pixels[:5] for side in ("left", "right")])
+    dp.save_camera(folder / "c.json", dp.calibrate(dp.Views(both, size=(640, 480)), dp.Chessboard()))
+    assert main(["info", str(folder / "c.json"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["calibration"]["verdict"] is None
     (folder / "d.npz").write_bytes(npz(mtx=K, dist=K))
     assert main(["info", str(folder / "d.npz")]) == 1
     assert "d.npz: dist: want one row or column of coefficients, got 3 x 3" in capsys.readouterr().err
