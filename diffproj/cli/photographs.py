@@ -74,9 +74,10 @@ def one_photograph(path: Path, orientation: Orientation, colour: bool = False) -
     content = files[0].read_bytes()
     with _silent_opencv():
         pixels = decoded(files[0], orientation, colour, content)
-    for doubt in doubts([str(files[0])], [exif_of(content)], orientation == "upright"):
+    exif = exif_of(content)
+    for doubt in doubts([str(files[0])], [exif], orientation == "upright"):
         warn_caller(doubt)
-    return Photograph(files[0].name, str(files[0]), pixels)
+    return Photograph(files[0].name, str(files[0]), pixels, exif)
 
 
 def warn_if_shown_turned(path: Path, orientation: Orientation, pixels: str) -> None:

@@ -20,6 +20,18 @@ KEPT = (
 TURN, FLIP = "turn", "flip"
 """In `Views.told`: how a photograph was turned, and whether its file holds a mirror image (1) or not (0)."""
 
+ANOTHER = (
+    ("camera", "another camera", ""),
+    ("serial", "another camera, by its serial number,", ""),
+    ("lens", "another lens", ""),
+    ("focal", "another focal length", " mm"),
+    ("zoom", "another digital zoom", "x"),
+    ("focal_35", "another focal length (as of 35 mm film)", " mm"),
+    (TURN, "another turn", ""),
+    (FLIP, "another way of counting pixels, mirrored,", ""),
+)
+"""The same of a photograph, against those that its camera was calibrated on."""
+
 
 def doubts(labels: Sequence[str], told: Sequence[Exif | None], upright: bool) -> list[str]:
     """What speaks against calibrating photographs as those of one camera, a warning each.
@@ -73,6 +85,38 @@ def against_one_camera(names: Sequence[str], told: Sequence[Told]) -> list[tuple
             reason = f"EXIF data tell {what}"
             found.append((f"{reason}, {named(fewest)}, which have another principal point: leave them out", reason))
     return found
+
+
+def of_another_camera(before: Sequence[Told], names: Sequence[str], told: Sequence[Told]) -> str:
+    """What files tell against views being of the camera of others, with its zoom and turn; empty where nothing.
+
+    Args:
+        before: what the files of the camera's own photographs tell, see `Views.told`.
+        names: of the views.
+        told: what their files tell.
+    """
+    kept, known = [dict(one) for one in before], [dict(one) for one in told]
+    for field, what, unit in ANOTHER:
+        own = list(dict.fromkeys(one[field] for one in kept if field in one))
+        others = [
+            (name, one[field])
+            for name, one in zip(names, known, strict=False)
+            if field in one and own and not any(_same(value, one[field]) for value in own)
+        ]
+        if not others:
+            continue
+        which = named([name for name, _ in others])
+        text = f"{which}: EXIF data tell of {what} than those of the photographs that the camera was calibrated on"
+        if field in (TURN, FLIP):
+            return text
+        here, there = (_in_words(list(dict.fromkeys(values)), unit) for values in ([v for _, v in others], own))
+        return f"{text}: {here}, not {there}"
+    return ""
+
+
+def _in_words(values: Sequence[str | float], unit: str) -> str:
+    """Some values, of many the first ones."""
+    return named([value if isinstance(value, str) else f"{value:.4g}{unit}" for value in values])
 
 
 def named(labels: Sequence[str]) -> str:

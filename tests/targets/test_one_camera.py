@@ -1,6 +1,7 @@
 """Photographs that their files say are not of one camera, one zoom or one turn, or that are mirror images."""
 
 import itertools
+import json
 import warnings
 from pathlib import Path
 
@@ -12,9 +13,10 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 import diffproj as dp
+from diffproj.cli import main
 from diffproj.cli.photographs import one_photograph
 from diffproj.targets.exif import Exif
-from diffproj.targets.one_camera import doubts
+from diffproj.targets.one_camera import doubts, of_another_camera, told_of
 
 BOARD = dp.Chessboard(5, 4)
 
@@ -184,3 +186,67 @@ def test_a_rig_is_told_of_a_camera_that_changed(tmp_path: Path) -> None:
     told = [one for one in rig.remarks if "EXIF" in one]
     assert len(told) == 1
     assert told[0].startswith("a: EXIF data tell of different focal lengths, 24 mm in 0.png")
+
+
+@pytest.mark.filterwarnings("ignore:photographs:UserWarning")
+def test_a_photograph_of_another_zoom_than_the_calibration_s_is_doubtful(tmp_path: Path) -> None:
+    """Of four corners or of a lens that moved little residuals do not tell; the file does, also from the saved camera."""
+    views = dp.detect(zoomed(tmp_path, {1: 28.0, 3: 24.05}, {}), BOARD)
+    dp.save_camera(tmp_path / "camera.json", dp.calibrate(views[[0, 2, 4, 5]], BOARD, "none"))
+    known = dp.load_calibration(tmp_path / "camera.json")
+    said = (
+        "1.png: EXIF data tell of another focal length than those of the photographs that the camera was calibrated on"
+    )
+    with pytest.warns(dp.CameraMismatchWarning, match=f"locate: {said}: 28 mm, not 24 mm"):
+        located = dp.locate(views[[1, 3]], BOARD, known)
+    assert located.doubts == f"{said}: 28 mm, not 24 mm"
+    assert dp.measure([[100.0, 100.0]], located, dp.Plane.z(0.0), 0, 0.5).doubts == located.doubts
+    assert not dp.locate(views[[0, 3]], BOARD, known).doubts
+    assert not dp.locate(views[[1]], BOARD, known.camera).doubts
+    with pytest.warns(dp.CameraMismatchWarning, match=said):
+        fixed = dp.locate(views[[1]], BOARD, known, priors={"height": (200.0, 100.0)}, pixel_sigma=0.1)
+    assert said in fixed.doubts
+
+
+def test_other_cameras_are_told_by_what_differs_first() -> None:
+    own = [told_of(Exif(1, "Canon", "12", "50mm", 50.0), False)] * 2
+    assert of_another_camera(own, ["a"], [told_of(Exif(1, "Canon", "12", "50mm", 50.1), False)]) == ""
+    assert of_another_camera(own, ["a"], [told_of(Exif(), False)]) == ""
+    assert of_another_camera([()], ["a"], [told_of(Exif(2, "Nikon"), True)]) == ""
+    assert of_another_camera(own, ["a"], []) == ""
+    for exif, words in (
+        (
+            Exif(1, "Nikon", "13"),
+            "another camera than those of the photographs that the camera was calibrated on: Nikon,",
+        ),
+        (Exif(1, "Canon", "13"), "another camera, by its serial number, than"),
+        (Exif(1, "Canon", "12", "35mm"), "another lens than"),
+        (Exif(2, "Canon"), "another way of counting pixels, mirrored, than"),
+    ):
+        assert words in of_another_camera(own, ["a"], [told_of(exif, False)])
+    turned = [told_of(Exif(6), True)]
+    assert "another turn than" in of_another_camera(turned, ["a"], [told_of(Exif(1), True)])
+
+
+def test_commands_tell_a_photograph_of_another_zoom_than_the_camera_s(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They read a photograph's pixels before it is searched, and what its file tells has to go along."""
+    folder = zoomed(tmp_path, {1: 28.0}, {})
+    views = dp.detect([folder / f"{n}.png" for n in (0, 2, 3, 4, 5)], BOARD)
+    dp.save_camera(tmp_path / "camera.json", dp.calibrate(views, BOARD, "none"))
+    corners = dp.detect(folder / "1.png", BOARD).pixels[0]
+    rows = [",".join(map(str, (*p, *x))) for p, x in zip(corners.tolist(), BOARD.points.tolist(), strict=True)]
+    (tmp_path / "points.csv").write_text("\n".join(["u,v,x,y,z", *rows]))
+    camera, on = ("--camera", str(tmp_path / "camera.json")), ("--board", "5x4", "--square", "25", "--points", "99,99")
+    for command in (
+        ["measure", str(folder / "1.png"), *camera, *on],
+        ["locate", str(folder / "1.png"), *camera, "--landmarks", str(tmp_path / "points.csv")],
+    ):
+        assert main([*command, "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        said = "1.png: EXIF data tell of another focal length than those of the photographs"
+        assert [text for text in told["warnings"] if said in text]
+        assert said in told.get("doubts", told.get("verdict"))
+    assert main([*["measure", str(folder / "2.png"), *camera, *on], "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["warnings"] == []
