@@ -56,7 +56,8 @@ def run(options: argparse.Namespace) -> int:
         picture, told_by_file = grey(photograph), (told_of(photograph.exif, options.orientation == "upright"),)
         size = picture.shape[1], picture.shape[0]
         check_size(camera, size, options)
-        warn_if_shown_turned(options.photograph, options.orientation, f"the pixels in {options.landmarks}")
+        pixels = f"the pixels in {options.landmarks}"
+        warn_if_shown_turned(options.photograph, options.orientation, pixels, photograph.exif)
     if size is None and options.draw is not None:
         raise ValueError(f"--draw: want PHOTO, or the image's size in {options.camera}, got neither")
     view = options.photograph.name if options.photograph is not None else options.landmarks.stem

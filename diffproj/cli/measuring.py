@@ -34,7 +34,8 @@ def run(options: argparse.Namespace) -> int:
     scene = scene_of(options)
     if given and options.photograph is not None:
         option = "--points" if options.points_file is None else "--points-file"
-        warn_if_shown_turned(options.photograph, options.orientation, option)
+        exif = None if scene.photograph is None else scene.photograph.exif
+        warn_if_shown_turned(options.photograph, options.orientation, option, exif)
     noise = _noise(options, scene)
     plane = plane_of(scene, options)
     sigma = DETECTOR if noise.source == DETECTOR else noise.sigma

@@ -290,6 +290,18 @@ def test_files_are_read_once(
     assert read == expected
 
 
+@pytest.mark.parametrize("command", ["measure", "locate"])
+def test_a_photograph_s_file_is_read_once(
+    command: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether it is shown turned was read off the file anew."""
+    read, whole = [], Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path.name) or whole(path))
+    given = COMMANDS["measure"] if command == "measure" else ("locate", "photo.png", *COMMANDS["locate"][1:])
+    assert run(capsys, *given)[0] == 0
+    assert read.count("photo.png") == 1
+
+
 def test_interrupted_while_it_loads(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def interrupted() -> int:
         raise KeyboardInterrupt
