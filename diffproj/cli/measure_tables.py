@@ -43,12 +43,18 @@ def say(document: dict[str, Any], scene: Scene) -> None:
         known = f"{value} ± {deviation}{unit}, 95 % interval {interval}"
         text = "not known, for not all points are on the plane" if area["value"] is None else known
         result(f"\nArea of the outline {area['name']}: {text}")
-    if document["remarks"]:
+    doubts = doubtful(document)
+    if document["remarks"] or doubts:
         result("")
-    for remark in document["remarks"]:
+    for remark in [*document["remarks"], *doubts]:
         RESULTS.print(remark, markup=False)
     result("")
     RESULTS.print(about_deviations(document), markup=False)
+
+
+def doubtful(document: dict[str, Any]) -> list[str]:
+    """A sentence on why no number is to be trusted, for results that are handed on without their warnings."""
+    return [f"DOUBTFUL: {document['doubts']}"] if document["doubts"] else []
 
 
 def about_deviations(document: dict[str, Any]) -> str:

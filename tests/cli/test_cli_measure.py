@@ -14,10 +14,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
 import diffproj as dp
-from diffproj import synthetic
+from diffproj import figures, synthetic
 from diffproj.cli import shielded
 from diffproj.cli.inputs import HAND
 from diffproj.cli.measure_csv import as_csv
@@ -648,3 +649,22 @@ def test_a_photograph_that_is_turned_is_not_called_resized(tmp_path: Path, capsy
     code, _, err = run(capsys, tmp_path / "turned.png", "--camera", "camera.json", *BOARD, "--points", CORNERS[0])
     assert code == 1
     assert "it is turned against those that the camera was calibrated on" in " ".join(err.split())
+
+
+def test_a_doubt_is_told_with_the_numbers_and_in_the_drawing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was on standard error alone, so that a file with the output, and a drawing, looked like any other."""
+    photograph = cv2.imread("photo.png", cv2.IMREAD_GRAYSCALE)
+    assert photograph is not None
+    part = cv2.resize(photograph[:, 40:600], (640, 480), interpolation=cv2.INTER_CUBIC)
+    cv2.imwrite(str(tmp_path / "stretched.png"), part)
+    drawn = []
+    monkeypatch.setattr(figures, "measured", lambda *_, title, **__: drawn.append(title) or Figure())
+    options = ("--camera", "camera.json", *BOARD, "--points", *CORNERS, "--draw", str(tmp_path / "a.png"))
+    _, out, err = run(capsys, str(tmp_path / "stretched.png"), *options)
+    assert "another camera, zoom or focus" in err
+    assert "DOUBTFUL: the residuals of stretched.png are" in out
+    assert "\nDOUBTFUL: the residuals of stretched.png are" in drawn[0]
+    _, out, err = run(capsys, "photo.png", *options)
+    assert "DOUBTFUL" not in out + err + drawn[1]
