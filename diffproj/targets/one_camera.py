@@ -1,5 +1,6 @@
 """Whether photographs are of one camera with one zoom, lie one way and are no mirror images, as far as files tell."""
 
+import hashlib
 from collections.abc import Sequence
 
 from diffproj.targets.exif import MIRRORED, Exif, Told
@@ -50,9 +51,14 @@ def doubts(labels: Sequence[str], told: Sequence[Exif | None], upright: bool) ->
 
 
 def told_of(exif: Exif | None, upright: bool) -> Told:
-    """What a file tells of its photograph that all photographs of one calibration have in common, for `Views.told`."""
+    """What a file tells of its photograph that all photographs of one calibration have in common, for `Views.told`.
+
+    It goes into files of calibrations, which are handed on: of a serial number a digest is enough.
+    """
     if exif is None:
         return ()
+    if exif.serial:
+        exif = exif._replace(serial=f"#{hashlib.blake2b(exif.serial.encode(), digest_size=4).hexdigest()}")
     kept = [(field, getattr(exif, field)) for field, _, _ in KEPT if getattr(exif, field)]
     turn = (TURN, float(exif.orientation)) if upright else (FLIP, float(exif.orientation in MIRRORED))
     return (*kept, turn)

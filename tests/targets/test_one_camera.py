@@ -1,5 +1,6 @@
 """Photographs that their files say are not of one camera, one zoom or one turn, or that are mirror images."""
 
+import hashlib
 import itertools
 import json
 import warnings
@@ -210,6 +211,9 @@ def test_a_photograph_of_another_zoom_than_the_calibration_s_is_doubtful(tmp_pat
 
 def test_other_cameras_are_told_by_what_differs_first() -> None:
     own = [told_of(Exif(1, "Canon", "12", "50mm", 50.0), False)] * 2
+    assert [value for name, value in own[0] if name == "serial"] == [
+        "#" + hashlib.blake2b(b"12", digest_size=4).hexdigest()
+    ]
     assert of_another_camera(own, ["a"], [told_of(Exif(1, "Canon", "12", "50mm", 50.1), False)]) == ""
     assert of_another_camera(own, ["a"], [told_of(Exif(), False)]) == ""
     assert of_another_camera([()], ["a"], [told_of(Exif(2, "Nikon"), True)]) == ""
