@@ -1,7 +1,9 @@
 """The picture of a camera's landmarks: where a photograph shows them, and where the camera sees them."""
 
+from collections.abc import Sequence
+
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Float, Shaped
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
@@ -11,6 +13,14 @@ SEEN, PROJECTED, REJECTED = "#d6336c", "#0b6bcb", "#e8590c"
 OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
 WIDTH, HIGHEST = 8.0, 12.0
 """Width of the picture, and its greatest height, in inches."""
+FIELD = 0.9
+"""Part of that which the photograph takes, about."""
+SIDES = ((1, 1), (-1, 1), (1, -1), (-1, -1))
+"""Where a name may stand beside its mark, right and up, the best first."""
+Box = tuple[float, float, float, float]
+"""A rectangle: left, top, right and bottom."""
+LETTER, LINE = 5.5, 11.0
+"""Width of a letter and height of a line in points, about."""
 
 
 def landmarks(
@@ -61,20 +71,24 @@ def landmarks(
     for mask, colour in ((seen & ~rejected, SEEN), (rejected, REJECTED)):
         axes.plot(*pixels[mask].T, "+", color=colour, markersize=9, markeredgewidth=1.5, path_effects=OUTLINE)
     names = calibration.landmarks or tuple(str(number + 1) for number in range(len(pixels)))
-    for name, pixel, place, has, shown in zip(
-        names, pixels.tolist(), projected.tolist(), seen.tolist(), inside.tolist(), strict=True
-    ):
-        if has or shown:
-            axes.annotate(
-                name,
-                pixel if has else place,
-                (6, 6),
-                textcoords="offset points",
-                color=SEEN if has else PROJECTED,
-                fontsize=9,
-                path_effects=OUTLINE,
-                parse_math=False,
-            )
+    each = zip(names, pixels.tolist(), projected.tolist(), seen.tolist(), inside.tolist(), strict=True)
+    told = [(name, (*(pixel if has else place),), has) for name, pixel, place, has, shown in each if has or shown]
+    points_of_px = 72 * FIELD * min(WIDTH / width, figure.get_figheight() / height)
+    marks = points_of_px * np.array([place for _, place, _ in told]).reshape(-1, 2)
+    sides = _sides([name for name, _, _ in told], marks)
+    for (name, place, has), (right, up) in zip(told, sides, strict=True):
+        axes.annotate(
+            name,
+            place,
+            (6 * right, 6 * up),
+            ha="left" if right > 0 else "right",
+            va="bottom" if up > 0 else "top",
+            textcoords="offset points",
+            color=SEEN if has else PROJECTED,
+            fontsize=9,
+            path_effects=OUTLINE,
+            parse_math=False,
+        )
     axes.set_aspect("equal")
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     axes.set_xlabel("u, px", labelpad=1, fontsize=9)
@@ -82,3 +96,31 @@ def landmarks(
     axes.tick_params(labelsize=8)
     axes.set_title(title, fontsize=10, parse_math=False)
     return figure
+
+
+def _sides(names: Sequence[str], places: Float[np.ndarray, "n 2"]) -> list[tuple[int, int]]:
+    """On which side of its mark each name stands, so that it covers no other name and no other mark, if that can be.
+
+    Args:
+        names: what is to be written.
+        places: of the marks, in points, down.
+    """
+    taken, found = [(x - 5, y - 5, x + 5, y + 5) for x, y in places.tolist()], []
+    for n, (name, (x, y)) in enumerate(zip(names, places.tolist(), strict=True)):
+        across, boxes = LETTER * len(name) + 6, []
+        for right, up in SIDES:
+            left, top = x + (6 if right > 0 else -across), y + (-6 - LINE if up > 0 else 6)
+            boxes.append((left, top, left + across - 6, top + LINE))
+        others = [box for k, box in enumerate(taken) if k != n]
+        covered = [sum(_overlap(box, other) for other in others) for box in boxes]
+        best = covered.index(min(covered))
+        taken.append(boxes[best])
+        found.append(SIDES[best])
+    return found
+
+
+def _overlap(one: Box, other: Box) -> float:
+    """The area that two rectangles share."""
+    across = min(one[2], other[2]) - max(one[0], other[0])
+    down = min(one[3], other[3]) - max(one[1], other[1])
+    return max(0.0, across) * max(0.0, down)

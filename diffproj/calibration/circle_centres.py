@@ -45,7 +45,7 @@ def with_true_centres(fit: Callable[[Views], Calibration], views: Views, target:
         change = (shift - before).norm(dim=-1)[views.visible]
         if not bool((change > SETTLED).any()):
             break
-        found = fit(Views.unchecked(views.pixels - shift, views.visible, views.names, views.size))
+        found = fit(Views.unchecked(views.pixels - shift, views.visible, views.names, views.size, views.told))
     return found
 
 

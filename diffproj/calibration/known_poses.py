@@ -340,7 +340,7 @@ def _remarks(data: Data, task: Task, found: Found, plain: Calibration) -> tuple[
     cost, left = (torch.where(seen, z.reshape(seen.shape), 0).sum(-1) for z in (found.cost, spare(task, found)))
     chance = torch.special.gammaincc(left.clamp(min=1).to(cost) / 2, cost)
     for p in ((chance < CONTRADICTION) & (left > 0)).nonzero().flatten().tolist():
-        if all(one.kind == Kind.BELOW for one in told[p]) and plain.converged.flatten()[p]:
+        if all(one.kind in (Kind.BELOW, Kind.TOLD_APART) for one in told[p]) and plain.converged.flatten()[p]:
             times = float((2 * cost[p] / left[p]).sqrt())
             reason = f"residuals and priors are {times:.2g} times what their deviations say"
             sentence = (

@@ -30,6 +30,7 @@ from diffproj.geometry.camera import Camera, as_camera
 from diffproj.targets.boards import origin_doubt
 from diffproj.targets.chessboard import Chessboard
 from diffproj.targets.circle_grid import CircleGrid
+from diffproj.targets.one_camera import of_another_camera
 from diffproj.targets.target import Target
 from diffproj.targets.views import Views
 
@@ -118,6 +119,8 @@ def locate(
     if text := described(found.mismatch, views.names, calibrated):
         if calibrated and found.landmarks is not None:
             text += " Pixels that were picked by hand are less exact than a detector's: pixel_sigma=0.5 says so"
+        warn_caller(f"locate: {text}", CameraMismatchWarning)
+    if isinstance(camera, Calibration) and (text := of_another_camera(camera.views.told, views.names, views.told)):
         warn_caller(f"locate: {text}", CameraMismatchWarning)
     return found
 

@@ -34,7 +34,9 @@ from diffproj.calibration.trust.remarks import remarks
 from diffproj.calibration.trust.uncertainty import covariance_of
 from diffproj.calibration.trust.verdict import verdicts
 from diffproj.geometry.camera import Camera
+from diffproj.targets.exif import Told
 from diffproj.targets.landmarks import Landmarks
+from diffproj.targets.one_camera import against_one_camera, of_another_camera
 from diffproj.targets.views import Views
 
 BELOW = (
@@ -166,7 +168,15 @@ def outcome(
         rig=None if known is None else known.rig,
         _covariance=partial(_covariance, found, data, before, known, doubt),
         _others=partial(_others, found, data, before),
-        _remarks=partial(remarks_on, found, status, doubt, data, [data.views] * len(status)),
+        _remarks=partial(
+            remarks_on,
+            found,
+            status,
+            doubt,
+            data,
+            [data.views] * len(status),
+            () if known is None else known.views.told,
+        ),
         landmarks=landmarks,
         uncertain=data.uncertain,
         discounted=None if wrong is None else shaped(wrong),
@@ -177,9 +187,23 @@ def outcome(
     return calibration
 
 
-def remarks_on(found: Fit, status: Tensor, doubt: Entangled, data: Data, views: Sequence[Views]) -> tuple[Remarks, ...]:
-    """The remarks on each of P cameras, of its own views, and on how it stands to landmarks, if the target is that."""
+def remarks_on(
+    found: Fit,
+    status: Tensor,
+    doubt: Entangled,
+    data: Data,
+    views: Sequence[Views],
+    before: Sequence[Told] = (),
+) -> tuple[Remarks, ...]:
+    """The remarks on each of P cameras, of its own views, and on how it stands to landmarks, if the target is that.
+
+    `before` is what the files of the photographs tell that intrinsics which were held were calibrated on.
+    """
     said = remarks(found, status, doubt, [own.names for own in views], [own.size for own in views], data.target)
+    used, held = found.task.used.any(-1), poses_only(found.task)
+    converged = (status == Status.CONVERGED).tolist()
+    apart = [_told_apart(own, used[p], before, held) if converged[p] else () for p, own in enumerate(views)]
+    said = tuple((*more, *one) for more, one in zip(apart, said, strict=True))
     if not isinstance(data.target, Landmarks) or found.task.solid:
         return said
     below = upside_down(data.frame, *_state(found)[1]) & found.task.used.any(-1)
@@ -187,6 +211,17 @@ def remarks_on(found: Fit, status: Tensor, doubt: Entangled, data: Data, views: 
     return tuple(
         (*one, Remark(BELOW.format(", ".join(own.names[v] for v in where)), Kind.BELOW)) if where else one
         for one, where, own in zip(said, (row.nonzero().flatten().tolist() for row in below), views, strict=True)
+    )
+
+
+def _told_apart(views: Views, used: Tensor, before: Sequence[Told], held: bool) -> Remarks:
+    """What the files of those of one camera's views that were used tell against one camera with one zoom."""
+    views = views[used[: len(views)]] if views.told else views  # a camera of several has fewer views than the others
+    if held:
+        sentence = of_another_camera(before, views.names, views.told)
+        return (Remark(sentence, Kind.TOLD_APART, sentence),) if sentence else ()
+    return tuple(
+        Remark(sentence, Kind.TOLD_APART, reason) for sentence, reason in against_one_camera(views.names, views.told)
     )
 
 

@@ -32,7 +32,8 @@ sharp frames in which the board has moved.
 
 With --fleet, each folder in a folder holds the photographs of one camera. They
 are calibrated on all cores, and one line of JSON is written for each. A run
-that was stopped goes on where it was; cameras that failed are tried again.
+that was stopped goes on where it was; cameras that failed are tried again, and
+so are those whose photographs were added, removed or changed since.
 """
 
 EPILOG = """\

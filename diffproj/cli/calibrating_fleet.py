@@ -22,7 +22,7 @@ from rich.table import Table
 from diffproj.calibration.calibrate import calibrate_and_tell
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
 from diffproj.cli.fleet_file import append, done_before, line_of
-from diffproj.cli.fleet_folder import Folder, Searched, on_one_core, searched
+from diffproj.cli.fleet_folder import Folder, Searched, on_one_core, searched, state_of
 from diffproj.cli.inputs import check_writable, writing
 from diffproj.cli.terminal import RESULTS, as_json, counted, failure, in_words, note, progress_bars, result
 from diffproj.cli.which_board import KINDS, NEEDS, TAKES, given_board
@@ -42,11 +42,15 @@ def run(options: argparse.Namespace) -> int:
     board, side, _ = given_board(options)
     folders = _folders(options.fleet)
     asked = _asked(options)
-    done = done_before(options.output, asked)
+    states = {folder.name: state_of(folder) for folder in folders}  # before any is searched: later ones count as new
+    done, changed = done_before(options.output, asked, states)
     lines = [done[folder.name] for folder in folders if folder.name in done]
     left = [folder for folder in folders if folder.name not in done]
     if lines:
         note(f"{counted(len(lines), 'camera')} of {len(folders)} done before, by {options.output}")
+    if changed:
+        which = ", ".join(changed[:WORST]) + f" and {len(changed) - WORST} more" * (len(changed) > WORST)
+        note(f"{which}: photographs were added, removed or changed since {options.output} was written; done anew")
     with progress_bars() as bars, _workers(options, len(left)) as executor:
         task = bars.add_task("Calibrating", total=len(folders), completed=len(lines))
         waiting: list[tuple[str, Searched]] = []
@@ -55,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
             waiting.append((left[place].name, one))
             if len(waiting) < TOGETHER and number < len(left):
                 continue
-            new = _calibrated(waiting, board, options, asked, side.unit)
+            new = _calibrated(waiting, board, options, asked, states, side.unit)
             with writing("--output", options.output):
                 append(options.output, new)
             lines += new
@@ -123,6 +127,7 @@ def _calibrated(
     board: Board,
     options: argparse.Namespace,
     asked: dict[str, Any],
+    states: dict[str, str],
     unit: str | None,
 ) -> list[dict[str, Any]]:
     """The lines of cameras that were searched."""
@@ -140,7 +145,7 @@ def _calibrated(
         begin = time.perf_counter()
         end = ends.get(name, ValueError(one.error))
         said = replace(end, unit=unit) if isinstance(end, Calibration) else failure(end)
-        line = line_of(name, asked, one, said, each)
+        line = line_of(name, asked, states[name], one, said, each)
         line["seconds"]["report"] = round(time.perf_counter() - begin, 4)
         lines.append(line)
     return lines
@@ -172,7 +177,8 @@ def _tell(options: argparse.Namespace, lines: list[dict[str, Any]], new: int, se
     if worst:
         table = Table(title="The worst", title_justify="left")
         for title in ("camera", "views", "RMS in px", "f_x in px", "verdict"):
-            table.add_column(title, overflow="fold", justify="left" if title in ("camera", "verdict") else "right")
+            words = title in ("camera", "verdict")
+            table.add_column(title, overflow="fold", justify="left" if words else "right", no_wrap=not words)
         for line in worst:
             found = line["summary"]
             sure = f"{found['f_x']:.1f} ± {found['f_x_deviation']:.1f}"

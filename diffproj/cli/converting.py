@@ -6,14 +6,18 @@ from typing import Any
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.cli.inputs import check_not_the_same, check_writable
-from diffproj.cli.terminal import as_json, result
+from diffproj.cli.terminal import as_json, note, result
+from diffproj.files import own_json
 from diffproj.files.document import Document
+from diffproj.files.formats import format_to_write
 from diffproj.files.found import Found
 from diffproj.files.load import content_of, found_in
-from diffproj.files.own_json import holds_fleet
 from diffproj.files.save import save_camera
 from diffproj.geometry.camera import Camera
 from diffproj.lens.models import model_of
+
+WHOLE = Calibration | RigCalibration
+"""What has error bars."""
 
 REMEDIES = (
     ("or save camera.without_pose()", "or give --without-pose"),
@@ -31,7 +35,8 @@ def run(options: argparse.Namespace) -> int:
     check_writable("OUT", options.output)
     check_not_the_same("OUT", options.output, [options.input])
     try:
-        found = _wanted(options)
+        document = Document.read(options.input)
+        found = _wanted(options, document)
         save_camera(options.output, found, options.to)
     except ValueError as error:
         said = str(error)
@@ -39,6 +44,12 @@ def run(options: argparse.Namespace) -> int:
             said = said.replace(python, remedy)
         raise ValueError(said) from error
     told = _told(options, found)
+    own = format_to_write(options.output, options.to) is own_json
+    if _is_whole(document) and not (own and isinstance(found, WHOLE)):
+        note(
+            f"{options.output} holds the camera alone: error bars, views and unit of {options.input} stay there, and "
+            "what is measured with the camera alone has error bars that are too small"
+        )
     if options.json:
         as_json(told)
     elif isinstance(found, RigCalibration):
@@ -67,9 +78,13 @@ def _told(options: argparse.Namespace, found: Camera | Calibration | RigCalibrat
     }
 
 
-def _wanted(options: argparse.Namespace) -> Camera | Calibration | RigCalibration:
+def _is_whole(document: Document) -> bool:
+    """Whether a file holds a calibration, or a rig, or those of a fleet."""
+    return own_json.holds_fleet(document) or isinstance(content_of(document), WHOLE)
+
+
+def _wanted(options: argparse.Namespace, document: Document) -> Camera | Calibration | RigCalibration:
     """What to write: a whole calibration or rig where nothing of it is to change."""
-    document = Document.read(options.input)
     plain = options.source is None and options.size is None and not options.without_pose
     if plain and options.camera is None:
         found = content_of(document)
@@ -78,7 +93,7 @@ def _wanted(options: argparse.Namespace) -> Camera | Calibration | RigCalibratio
         try:
             one = named(among, options.camera)
             found = among.chosen(one)
-            if plain and holds_fleet(document):
+            if plain and own_json.holds_fleet(document):
                 found = content_of(document, name_in(among, one))
         except ValueError as error:
             raise ValueError(f"{options.input}: {error}") from error

@@ -114,7 +114,7 @@ def _table(outcome: Experiment, board: str) -> Table:
     unit = heading(outcome.fit.unit) or "world units"
     table = Table(title=f"Table 1. Errors on the board ({unit}), mean ± standard deviation; {board}")
     table.add_column("view", overflow="fold")
-    table.add_column("corners", justify="right")
+    table.add_column("corners", justify="right", no_wrap=True)
     for axis in ("E_x", "E_y", "E_z"):
         table.add_column(axis, justify="right", no_wrap=True)
     *rows, total = outcome.rows

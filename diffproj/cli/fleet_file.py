@@ -16,21 +16,29 @@ BEGINNING = '{"name": '
 """How each line starts."""
 DONE = "camera"
 """The key that only lines of cameras have, and not those of failures."""
+STATE = "files"
+"""The key of what tells whether a camera's photographs are those of its line, see `state_of`."""
 
 
-def done_before(path: Path, asked: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def done_before(
+    path: Path, asked: Mapping[str, Any], states: Mapping[str, str]
+) -> tuple[dict[str, dict[str, Any]], list[str]]:
     """The lines of cameras that are done, by name; others are taken out of the file, and what was not written whole.
 
     Args:
         path: the file, which need not exist.
         asked: the options, which have to be those of its lines.
+        states: of the photographs of each camera now, by name, see `state_of`.
+
+    Returns:
+        The lines, and the names of cameras that were done with other photographs than are there now.
 
     Raises:
         ValueError: it is no file of a fleet, or one with other options.
         OSError: it cannot be read, or be written.
     """
     if not path.exists():
-        return {}
+        return {}, []
     text = path.read_text(encoding="utf-8")
     remedy = "choose another file, or remove it"
     try:
@@ -47,13 +55,15 @@ def done_before(path: Path, asked: Mapping[str, Any]) -> dict[str, dict[str, Any
             f"--output: {path} holds cameras with {differ} {other.get(differ)}, not {asked.get(differ)}; {remedy}"
         )
     done = {name: line for name, line in found.items() if DONE in line}
+    changed = [name for name, line in done.items() if name in states and line.get(STATE) != states[name]]
+    done = {name: line for name, line in done.items() if name not in changed}
     if len(done) < len(lines) or not text.endswith("\n"):
         write_whole(path, "".join(json.dumps(line) + "\n" for line in done.values()))
-    return done
+    return done, changed
 
 
 def line_of(
-    name: str, asked: Mapping[str, Any], searched: Searched, found: Calibration | str, seconds: float
+    name: str, asked: Mapping[str, Any], state: str, searched: Searched, found: Calibration | str, seconds: float
 ) -> dict[str, Any]:
     """What is said of a camera; of one that failed, why.
 
@@ -63,6 +73,7 @@ def line_of(
         "name": name,
         "asked": dict(asked),
         "photographs": searched.photographs,
+        STATE: state,
         "seconds": {"search": round(searched.seconds, 4), "calibration": round(seconds, 4)},
         "notes": list(searched.notes),
     }

@@ -2,13 +2,14 @@
 
 import argparse
 import math
+import textwrap
 from typing import Any, NamedTuple
 
 import torch
 
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.cli.converting import name_in, named
-from diffproj.cli.terminal import alert, as_json, result
+from diffproj.cli.terminal import alert, as_json, in_words, result
 from diffproj.files.document import Document
 from diffproj.files.formats import CONVENTIONS, format_of, name_of
 from diffproj.files.load import content_of, found_in
@@ -74,7 +75,13 @@ def _doubts(cameras: dict[str, Any]) -> list[str]:
 
 
 def _of_calibration(calibration: Calibration) -> dict[str, Any]:
-    return {"views": len(calibration.views), "rms": calibration.rms.flatten().tolist()}
+    verdict = None if calibration.views.batch_shape else in_words(calibration.verdict, calibration.unit)
+    return {
+        "views": len(calibration.views),
+        "rms": calibration.rms.flatten().tolist(),
+        "unit": calibration.unit,
+        "verdict": verdict,
+    }
 
 
 def _described(name: str, camera: Camera) -> dict[str, Any] | None:
@@ -118,7 +125,10 @@ def _say(told: dict[str, Any]) -> None:
     if told["calibration"] is not None:
         rms = ", ".join(f"{value:.4f}" for value in told["calibration"]["rms"][:4])
         views = told["calibration"]["views"]
-        result(f"a calibration of {views} view{'s' * (views != 1)}, RMS {rms} px")
+        unit = f"; lengths in {told['calibration']['unit']}" if told["calibration"]["unit"] else ""
+        result(f"a calibration of {views} view{'s' * (views != 1)}, RMS {rms} px{unit}")
+        if told["calibration"]["verdict"] is not None:
+            result(textwrap.fill(told["calibration"]["verdict"], 79))
 
 
 def _say_camera(name: str, camera: dict[str, Any]) -> None:

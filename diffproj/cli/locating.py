@@ -28,7 +28,9 @@ from diffproj.cli.scene import check_size, loaded
 from diffproj.cli.terminal import as_json, failure, result
 from diffproj.files.save import save_camera
 from diffproj.geometry.camera import Camera
+from diffproj.targets.exif import Told
 from diffproj.targets.images import grey
+from diffproj.targets.one_camera import told_of
 from diffproj.targets.views import Views
 
 FEWEST = 4
@@ -48,16 +50,18 @@ def run(options: argparse.Namespace) -> int:
     camera, calibration = loaded(options.camera)
     check_together(options.prior, options.fixed, camera)
     surveyed = read_landmarks(options.landmarks)
-    picture, size = None, camera.size
+    picture, size, told_by_file = None, camera.size, ()
     if options.photograph is not None:
-        picture = grey(one_photograph(options.photograph, options.orientation))
+        photograph = one_photograph(options.photograph, options.orientation)
+        picture, told_by_file = grey(photograph), (told_of(photograph.exif, options.orientation == "upright"),)
         size = picture.shape[1], picture.shape[0]
         check_size(camera, size, options)
-        warn_if_shown_turned(options.photograph, options.orientation, f"the pixels in {options.landmarks}")
+        pixels = f"the pixels in {options.landmarks}"
+        warn_if_shown_turned(options.photograph, options.orientation, pixels, photograph.exif)
     if size is None and options.draw is not None:
         raise ValueError(f"--draw: want PHOTO, or the image's size in {options.camera}, got neither")
     view = options.photograph.name if options.photograph is not None else options.landmarks.stem
-    found = _located(options, camera, calibration, surveyed, view, size)
+    found = _located(options, camera, calibration, surveyed, view, size, told_by_file)
     for remark in found.findings[0]:
         if remark.kind == Kind.BELOW:
             warn_caller(f"{options.landmarks}: {remark.sentence}")
@@ -87,6 +91,7 @@ def _located(
     surveyed: Surveyed,
     view: str,
     size: tuple[int, int] | None,
+    told_by_file: tuple[Told, ...],
 ) -> Calibration:
     """The camera at its place.
 
@@ -110,6 +115,7 @@ def _located(
     target = surveyed.landmarks
     try:
         views = Views(surveyed.pixels.unsqueeze(0), visible.unsqueeze(0), [view], size)
+        views = Views.unchecked(views.pixels, views.visible, views.names, size, told_by_file)
         if of_pose and (free or count < FEWEST):
             found = _adjusted(options, camera, calibration, surveyed, views, sigma, free, tied)
         elif of_pose:

@@ -9,6 +9,9 @@ from diffproj.cli.scene import Scene
 from diffproj.cli.terminal import RESULTS, aligned, result, rounded
 from diffproj.cli.units import heading
 
+ALL = 3
+"""What deviations may hold: noise of pixels, pose and camera."""
+
 EXACT = 1e-9
 """Standard deviation, as a part of the point's largest coordinate, that is rounding error: the plane alone says what
 such a coordinate is."""
@@ -40,20 +43,31 @@ def say(document: dict[str, Any], scene: Scene) -> None:
         known = f"{value} ± {deviation}{unit}, 95 % interval {interval}"
         text = "not known, for not all points are on the plane" if area["value"] is None else known
         result(f"\nArea of the outline {area['name']}: {text}")
-    if document["remarks"]:
+    doubts = doubtful(document)
+    if document["remarks"] or doubts:
         result("")
-    for remark in document["remarks"]:
+    for remark in [*document["remarks"], *doubts]:
         RESULTS.print(remark, markup=False)
     result("")
+    RESULTS.print(about_deviations(document), markup=False)
+
+
+def doubtful(document: dict[str, Any]) -> list[str]:
+    """A sentence on why no number is to be trusted, for results that are handed on without their warnings."""
+    return [f"DOUBTFUL: {document['doubts']}"] if document["doubts"] else []
+
+
+def about_deviations(document: dict[str, Any]) -> str:
+    """What the deviations hold, and what they do not, in a sentence."""
     noise = NOISE[document["pixel_sigma_from"]].format(f"{document['pixel_sigma']:.2g}")
     sentence = {
-        3: f"The deviations hold {noise}, and how surely the pose and the camera are known.",
+        ALL: f"The deviations hold {noise}, and how surely the pose and the camera are known.",
         2: f"The deviations hold {noise} and how surely the pose is known, but NOT how surely the camera is, for its "
         "file does not tell: the truth may lie further off. A .json from 'diffproj calibrate' tells it.",
         1: f"The deviations hold {noise} ONLY, and not how surely the pose and the camera are known, for the file does "
         "not tell: the truth may lie further off. A .json from 'diffproj calibrate' tells it.",
     }
-    RESULTS.print(sentence[len(document["deviations_include"])], markup=False)
+    return sentence[len(document["deviations_include"])]
 
 
 def _points_table(document: dict[str, Any], unit: str) -> Table:
@@ -64,7 +78,7 @@ def _points_table(document: dict[str, Any], unit: str) -> Table:
     found = [row for row in document["points"] if row["valid"]]
     columns = []
     for axis, name in enumerate("xyz"):
-        table.add_column(f"{name} ± deviation", overflow="fold")
+        table.add_column(f"{name} ± deviation", no_wrap=True)
         pairs = [coordinate(row["world"], row["deviation"], axis) for row in found]
         starts = aligned([value for value, _ in pairs]) if pairs else []
         columns.append([start + rest for start, (_, rest) in zip(starts, pairs, strict=True)])
@@ -89,8 +103,9 @@ def coordinate(world: list[float], deviations: list[float | None], axis: int) ->
 
 def _lengths_table(lengths: list[dict[str, Any]], unit: str | None) -> Table:
     table = Table(title="Lengths" + (f" in {unit}" if unit else ""), title_justify="left")
-    for name in ("from, to", "length", "standard deviation", "95 % interval"):
-        table.add_column(name, overflow="fold")
+    table.add_column("from, to", overflow="fold")
+    for name in ("length", "standard deviation", "95 % interval"):
+        table.add_column(name, no_wrap=True)
     rows = [shown(length) for length in lengths]
     values, deviations = (aligned(column) for column in zip(*((row[0], row[1]) for row in rows), strict=True))
     for length, value, deviation, (_, _, interval) in zip(lengths, values, deviations, rows, strict=True):

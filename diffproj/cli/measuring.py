@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import textwrap
 import warnings
 from pathlib import Path
 from typing import Any
@@ -14,14 +15,17 @@ from diffproj.cli.measure_csv import as_csv
 from diffproj.cli.measure_document import PixelNoise, document
 from diffproj.cli.measure_page import check_page, write_page
 from diffproj.cli.measure_plane import plane_of
-from diffproj.cli.measure_tables import say, shown
+from diffproj.cli.measure_tables import ALL, about_deviations, doubtful, say, shown
 from diffproj.cli.photographs import warn_if_shown_turned
 from diffproj.cli.points_file import Pixel, read_points
 from diffproj.cli.scene import Scene, scene_of
-from diffproj.cli.terminal import as_json, result
+from diffproj.cli.terminal import alert, as_json, result
 from diffproj.measurement.choices import detector_noise
 from diffproj.measurement.measure import measure
 from diffproj.targets.images import grey
+
+WIDE = 90
+"""Characters in a line over a drawing."""
 
 
 def run(options: argparse.Namespace) -> int:
@@ -34,7 +38,8 @@ def run(options: argparse.Namespace) -> int:
     scene = scene_of(options)
     if given and options.photograph is not None:
         option = "--points" if options.points_file is None else "--points-file"
-        warn_if_shown_turned(options.photograph, options.orientation, option)
+        exif = None if scene.photograph is None else scene.photograph.exif
+        warn_if_shown_turned(options.photograph, options.orientation, option, exif)
     noise = _noise(options, scene)
     plane = plane_of(scene, options)
     sigma = DETECTOR if noise.source == DETECTOR else noise.sigma
@@ -59,6 +64,8 @@ def run(options: argparse.Namespace) -> int:
         as_json(found)
     elif options.csv:
         result(as_csv(found).rstrip())
+        if len(found["deviations_include"]) < ALL:  # what a table has no place for
+            alert(about_deviations(found))
     else:
         say(found, scene)
         if options.draw is not None:
@@ -100,7 +107,9 @@ def _draw(path: Path, scene: Scene, found: dict[str, Any]) -> None:
         [row["name"] if row["valid"] else f"{row['name']} (not on the plane)" for row in found["points"]],
         [length_in_words(length, scene.square.unit) for length in found["lengths"]],
         photograph=None if scene.photograph is None else grey(scene.photograph),
-        title=f"{found['view']}: {found['plane_in_words']}",
+        title="\n".join(
+            [f"{found['view']}: {found['plane_in_words']}", *textwrap.wrap(" ".join(doubtful(found)), WIDE)]
+        ),
     )
     write_drawing(path, figure)
 

@@ -17,7 +17,7 @@ from diffproj.cli.terminal import counted, detail, note, working
 from diffproj.targets import videos
 from diffproj.targets.boards import Board
 from diffproj.targets.detection import Searched, searched
-from diffproj.targets.exif import MIRRORED, as_recorded, exif_of
+from diffproj.targets.exif import MIRRORED, Exif, as_recorded, exif_of
 from diffproj.targets.images import SUFFIXES, NotAnImageError, Orientation, Photograph, decoded, listed
 from diffproj.targets.one_camera import doubts
 
@@ -74,20 +74,22 @@ def one_photograph(path: Path, orientation: Orientation, colour: bool = False) -
     content = files[0].read_bytes()
     with _silent_opencv():
         pixels = decoded(files[0], orientation, colour, content)
-    for doubt in doubts([str(files[0])], [exif_of(content)], orientation == "upright"):
+    exif = exif_of(content)
+    for doubt in doubts([str(files[0])], [exif], orientation == "upright"):
         warn_caller(doubt)
-    return Photograph(files[0].name, str(files[0]), pixels)
+    return Photograph(files[0].name, str(files[0]), pixels, exif)
 
 
-def warn_if_shown_turned(path: Path, orientation: Orientation, pixels: str) -> None:
+def warn_if_shown_turned(path: Path, orientation: Orientation, pixels: str, exif: Exif | None = None) -> None:
     """Warn where programs that follow a photograph's EXIF data show its pixels elsewhere than they are counted.
 
     Args:
         path: the photograph, or a pattern that is its alone.
         orientation: how its pixels are counted.
         pixels: what holds pixels that somebody read off it, for the message.
+        exif: what its file tells, where it was read already: one that is not to be turned is not read again.
     """
-    if orientation == "upright":
+    if orientation == "upright" or (exif is not None and exif.orientation == 1):
         return
     file = _named(path)[0]
     content = file.read_bytes()

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import textwrap
 from typing import Any, NamedTuple
 
 import cv2
@@ -15,7 +16,7 @@ from diffproj.cli.inputs import check_not_the_same, check_writable, writing
 from diffproj.cli.measure_plane import described, height_above_face, plane_of
 from diffproj.cli.photographs import one_photograph
 from diffproj.cli.scene import Scene, check_size, new_photograph, stored_view
-from diffproj.cli.terminal import as_json, progress_bars, result
+from diffproj.cli.terminal import as_json, in_words, progress_bars, result
 from diffproj.cli.units import Length, in_unit, is_extent
 from diffproj.geometry.back_projection import back_project, ground_resolution
 from diffproj.geometry.plane import Plane
@@ -115,6 +116,7 @@ def run(options: argparse.Namespace) -> int:
         "size": [view.columns, view.rows],
         "north_up": view.north_up,
         "shown": shown,
+        "doubts": _doubts(scene),
         "warnings": options.warned,
     }
     if options.json:
@@ -241,7 +243,15 @@ def _say(told: dict[str, Any], scene: Scene, plane: Plane) -> None:
     result(f"{_in_words(told['extent'], plane, unit)}: {columns} x {rows} px of {told['resolution']:g}{unit}")
     if told["shown"] < 1:
         result(f"The photograph shows {100 * told['shown']:.0f} % of it; the rest is transparent")
+    if told["doubts"]:
+        result(textwrap.fill(f"DOUBTFUL: {told['doubts']}", 79))
     result(f"Written to {' and '.join(str(told[key]) for key in ('output', 'world_file') if told[key])}")
+
+
+def _doubts(scene: Scene) -> str | None:
+    """What makes the pose doubtful, where it is that of one photograph, and what is told is of no other."""
+    alone = len(scene.calibration.views) == 1
+    return (in_words(scene.calibration.doubts, scene.square.unit) or None) if alone else None
 
 
 def _is_level(plane: Plane) -> bool:

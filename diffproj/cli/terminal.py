@@ -9,24 +9,47 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Column, Table
 
 from diffproj._core import shown
 from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.results.calibration import CalibrationError
 from diffproj.cli.command_line import leave_output
 
+LEAST = 16
+"""Characters that a column of words has at most in a table that is wider than the terminal."""
+
 
 class _Results(Console):
     """Standard output: what it does not take is a failure of the command."""
 
     def print(self, *arguments: Any, **options: Any) -> None:
+        for table in (one for one in arguments if isinstance(one, Table)):
+            _keep_whole(table, self.width)
+            options["crop"] = False
         try:
             super().print(*arguments, **options)
         except OSError as error:
             leave_output()
             raise OSError(f"standard output: {error.strerror}; send it elsewhere") from error
+
+
+def _keep_whole(table: Table, width: int) -> None:
+    """Let a table be wider than the terminal where columns that are not to be wrapped, as of numbers, take more."""
+
+    def room(column: Column) -> int:
+        cells = [str(cell) for cell in (column.header, *column.cells)]
+        if column.no_wrap:
+            return max(map(cell_len, cells))
+        words = [cell_len(word) for cell in cells for word in cell.split()]
+        return min(max(words, default=1), LEAST)
+
+    needed = 1 + sum(3 + room(column) for column in table.columns)
+    if needed > width:
+        table.width = needed
 
 
 RESULTS = _Results(highlight=False, emoji=False)

@@ -86,10 +86,11 @@ def _measuring(facts: Facts, found: Pictures, orientation: Orientation) -> list[
 def _lead(facts: Facts) -> str:
     """The line below the title."""
     width, height = facts.size
+    points = int(facts.used.sum())
     return render(
         "lead.html",
         views=len(facts.seen_views),
-        corners=int(facts.used.sum()),
+        points=f"{points} {facts.thing}{'s' * (points != 1)}",
         width=width,
         height=height,
         lens=lens_title(facts),

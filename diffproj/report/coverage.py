@@ -18,7 +18,9 @@ def coverage_part(facts: Facts) -> Part:
     """Where the corners lie."""
     share = covered_share(facts)
     figures = [_corners(facts, share), _density(facts), _distances(facts)]
-    html = render("coverage.html", share=None if share is None else f"{100 * share:.0f}", figures=figures)
+    html = render(
+        "coverage.html", share=None if share is None else f"{100 * share:.0f}", figures=figures, thing=facts.thing
+    )
     return Part("Coverage", "coverage", html, svg.STYLE)
 
 
@@ -50,13 +52,13 @@ def _corners(facts: Facts, share: float | None) -> Markup:
         svg.dots(axes.at(facts.pixels[facts.rejected]), "bad"),
         axes.drawn("u, px", "v, px", grid=False),
     ]
-    label = f"{len(places)} corners of {len(facts.seen_views)} views over the image"
-    keys = [("dot", "corner"), ("line-faint", "region that they cover")]
+    label = f"{len(places)} {facts.thing}s of {len(facts.seen_views)} views over the image"
+    keys = [("dot", facts.thing), ("line-faint", "region that they cover")]
     if facts.rejected.any():
         keys.append(("dot-bad", "rejected"))
-    caption = "All corners. Beyond the dashed line the lens is what its model makes of it."
+    caption = f"All {facts.thing}s. Beyond the dashed line the lens is what its model makes of it."
     if share is not None:
-        caption = f"All corners. The dashed line surrounds {100 * share:.0f} % of the image; beyond it " + (
+        caption = f"All {facts.thing}s. The dashed line surrounds {100 * share:.0f} % of the image; beyond it " + (
             "the lens is what its model makes of it."
         )
     return svg.figure(svg.picture(axes.width, axes.height, label, *drawn) + svg.key(*keys), caption)
@@ -77,12 +79,13 @@ def _density(facts: Facts) -> Markup:
             x, y = left + wide * column / columns, top + high * row / rows
             opacity = 0.06 + 0.5 * (count / most) ** 0.5 if count else 1.0
             kind = "cell" if count else "missing"
-            parts.append(svg.rectangle(x, y, wide / columns - 1, high / rows - 1, kind, f"{count} corners", opacity))
+            words = f"{count} {facts.thing}s"
+            parts.append(svg.rectangle(x, y, wide / columns - 1, high / rows - 1, kind, words, opacity))
             parts.append(svg.text(x + wide / columns / 2, y + high / rows / 2 + 3.5, str(count), "middle", "on-cell"))
     empty = float((counts == 0).mean())
-    label = f"Corners in {columns} x {rows} cells of the image; {100 * empty:.0f} % of them have none"
+    label = f"{facts.thing.title()}s in {columns} x {rows} cells of the image; {100 * empty:.0f} % of them have none"
     parts.append(axes.drawn("u, px", "v, px", grid=False))
-    caption = f"How many corners lie in each cell of the image. {100 * empty:.0f} % of the cells have none."
+    caption = f"How many {facts.thing}s lie in each cell of the image. {100 * empty:.0f} % of the cells have none."
     return svg.figure(svg.picture(axes.width, axes.height, label, *parts), caption)
 
 

@@ -114,6 +114,11 @@ class Facts:
         """Whether the target is a board, whose tilt and outline mean something."""
         return self.calibration.landmarks is None
 
+    @property
+    def thing(self) -> str:
+        """What one point of the target is called."""
+        return "corner" if self.planar else "landmark"
+
     @cached_property
     def plane_z(self) -> float:
         """The height of the plane that the maps are of: the target's mean z, to a millionth of its extent or better.

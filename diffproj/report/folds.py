@@ -48,6 +48,7 @@ def folds_part(facts: Facts, folds: CrossValidation | int | None, target: Target
         rows=rows,
         figure=figure,
         unit=facts.unit,
+        thing=facts.thing,
         count=len(rows) - 1,
         held_out_px=svg.plain(means.get("held_out_px", math.nan), 3),
         held_out_world=svg.plain(means.get("held_out_world", math.nan)),
@@ -66,7 +67,7 @@ def _validated(
     if isinstance(folds, CrossValidation):
         return folds, ""
     if folds is None:
-        return None, "It was not asked for: folds=5 refits without each fifth of the views in turn."
+        return None, "It was not asked for: folds=5 (--folds 5) refits without each fifth of the views in turn."
     if not facts.converged:
         return None, "The camera was not found, so there is nothing to test."
     if len(facts.seen_views) < FEWEST:

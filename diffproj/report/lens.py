@@ -58,7 +58,13 @@ def lens_part(facts: Facts) -> Part:
     rows = [] if comparison is None else list(_rows(facts))
     held_out = "" if comparison is None else comparison.held_out
     html = render(
-        "lens.html", title=lens_title(facts), figures=figures, rows=rows, held_out=held_out, ends=_ends(facts)
+        "lens.html",
+        title=lens_title(facts),
+        figures=figures,
+        rows=rows,
+        held_out=held_out,
+        ends=_ends(facts),
+        thing=facts.thing,
     )
     return Part("Lens", "lens", html, svg.STYLE)
 
@@ -157,21 +163,20 @@ def _curve_figure(facts: Facts, found: Curve) -> Markup:
     if MODELS[facts.calibration.parameters.lens].perspective:
         x, y, low, high = found.radius, *_displacement(found)
         x_label, y_label = "distance from the principal point, px", "moved outward by the lens, px"
-        marks, other = [(outermost, "outermost corner"), (farthest, "corner of the image")], []
+        marks, other = [(outermost, f"outermost {facts.thing}"), (farthest, "corner of the image")], []
     else:
         x, y = found.angle, found.radius
         low, high = y - found.deviation, y + found.deviation
         x_label, y_label = "angle from the axis, degrees", "distance from the principal point, px"
-        marks = [(float(np.interp(outermost, found.radius, found.angle)), "outermost corner")]
+        marks = [(float(np.interp(outermost, found.radius, found.angle)), f"outermost {facts.thing}")]
         flat = found.pinhole <= 1.02 * farthest
         other = list(zip(found.angle[flat], found.pinhole[flat], strict=True))
     told = np.isfinite(found.deviation)
     bottom = min(0.0, float(y.min()), float(low[told].min(initial=0)))
     top = max(0.0, float(y.max()), float(high[told].max(initial=0)))
     room = 0.06 * (top - bottom) or 1.0
-    axes = svg.Axes(
-        (0, max(float(x.max()), *(place for place, _ in marks)) * 1.03), (bottom - room, top + room), top=38
-    )
+    x_range, y_range = (0, max(float(x.max()), *(place for place, _ in marks)) * 1.03), (bottom - room, top + room)
+    axes = svg.Axes(x_range, y_range, left=svg.room_beside(y_range), top=38)
     band = np.stack([np.append(x[told], x[told][::-1]), np.append(low[told], high[told][::-1])], axis=-1)
     parts = [
         axes.drawn(x_label, y_label),
@@ -189,7 +194,9 @@ def _curve_figure(facts: Facts, found: Curve) -> Markup:
     keys = [("line-accent", lens_title(facts).partition(",")[0]), ("box-band", "± one deviation")]
     if other:
         keys.append(("line-faint", "pinhole"))
-    caption = "What the lens does, in the mean around its axis. Beyond the outermost corner the curve is extrapolated"
+    caption = (
+        f"What the lens does, in the mean around its axis. Beyond the outermost {facts.thing} the curve is extrapolated"
+    )
     caption += "." if told.all() else "; beyond the band it may end at any place."
     return svg.figure(svg.picture(axes.width, axes.height, label, *parts) + svg.key(*keys), caption)
 

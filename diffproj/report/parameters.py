@@ -12,6 +12,8 @@ from diffproj.report.facts import Facts
 
 STRONG = 0.9
 """Correlation from which on a pair is named."""
+TIED = 1 - 1e-9
+"""Correlation from which on two parameters are one, as focal lengths that were tied."""
 NAMED = 4
 NUMBERS = 10
 """Parameters up to which correlations are written into their cells."""
@@ -83,7 +85,12 @@ def _correlations(facts: Facts) -> tuple[Markup, list[str]]:
                 told = f"{value:+.2f}".replace("-", "\N{MINUS SIGN}").replace("0.", ".")
                 parts.append(svg.text(x + cell / 2 - 0.5, y + cell / 2 + 3, told, "middle", "on-cell"))
     pairs = sorted(
-        ((abs(values[i][j]), values[i][j], names[j], one) for i, one in enumerate(names) for j in range(i)),
+        (
+            (abs(values[i][j]), values[i][j], names[j], one)
+            for i, one in enumerate(names)
+            for j in range(i)
+            if abs(values[i][j]) < TIED
+        ),
         reverse=True,
     )
     strong = [f"{a} and {b} ({value:+.2f})".replace("-", "\N{MINUS SIGN}") for r, value, a, b in pairs if r >= STRONG]

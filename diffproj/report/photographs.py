@@ -37,7 +37,7 @@ def photographs_part(facts: Facts, pictures: Pictures) -> Part:
                 "name": facts.names[view],
                 "picture": _card(facts, view, addresses.get(view), magnification),
                 "loupe": _loupe(facts, view, pictures),
-                "corners": f"{int(facts.used[view].sum())} of {seen} corners",
+                "corners": f"{int(facts.used[view].sum())} of {seen} {facts.thing}s",
                 "rms": f"RMS {svg.plain(float(rms), 3)} px" if math.isfinite(rms) else "left out",
                 "odd": bool(rms > ODD * usual > 0),
                 "where": _where(facts, view),
@@ -54,6 +54,7 @@ def photographs_part(facts: Facts, pictures: Pictures) -> Part:
         magnification=f"{magnification:g}",
         shown=bool(addresses),
         rejected=bool(facts.rejected.any()),
+        thing=facts.thing,
     )
     return Part("Photographs", "photographs", html, svg.STYLE)
 
@@ -80,7 +81,7 @@ def _card(facts: Facts, view: int, address: str | None, magnification: float) ->
         svg.segments(*ends, "off"),
     ]
     parts.append(svg.crosses(pixels[facts.rejected[view]], 0.01 * max(width, height), "off"))
-    label = f"{facts.names[view]}: {int(used.sum())} corners"
+    label = f"{facts.names[view]}: {int(used.sum())} {facts.thing}s"
     if used.any():
         label += f", RMS {svg.plain(float(facts.view_rms[view]), 3)} px"
     return Markup('<svg class="picture" viewBox="-0.5 -0.5 {} {}" role="img" aria-label="{}">{}</svg>').format(
@@ -105,7 +106,8 @@ def _loupe(facts: Facts, view: int, pictures: Pictures) -> Markup:
         svg.rings([(u, v)], 2.0, "seen"),
         svg.crosses([(u + du, v + dv)], 1.6, "off", 2),
     ]
-    label = f"The corner of {facts.names[view]} that fits worst, enlarged: {svg.plain(float(lengths[corner]))} px off"
+    off = svg.plain(float(lengths[corner]))
+    label = f"The {facts.thing} of {facts.names[view]} that fits worst, enlarged: {off} px off"
     box = f"{left - 0.5} {top - 0.5} {SIDE} {SIDE}"
     return Markup('<svg class="picture loupe" viewBox="{}" role="img" aria-label="{}">{}</svg>').format(
         box, label, Markup("").join(parts)

@@ -28,7 +28,8 @@ def residuals_part(facts: Facts) -> Part:
     """The pictures of residuals."""
     places, residuals = facts.pixels[facts.known], facts.residuals[facts.known]
     if not len(places):
-        return Part("Residuals", "residuals", render("nothing.html", why="No corner has a residual."), svg.STYLE)
+        why = f"No {facts.thing} has a residual."
+        return Part("Residuals", "residuals", render("nothing.html", why=why), svg.STYLE)
     coordinates = residuals.reshape(-1)
     sigma = float(np.sqrt((coordinates**2).mean()))
     beyond = float((np.abs(coordinates) > 3 * sigma).mean()) if sigma > 0 else 0.0
@@ -38,10 +39,11 @@ def residuals_part(facts: Facts) -> Part:
             _over_image(facts, places, residuals),
             _by_distance(facts, places, residuals),
             _by_view(facts),
-            _histogram(coordinates, sigma, beyond),
+            _histogram(coordinates, sigma, beyond, facts.thing),
         ],
         rms=svg.plain(facts.rms, 3),
         sigma=svg.plain(facts.sigma, 3),
+        thing=facts.thing,
         rows=[
             (name, int(used), f"{rms:.4f}" if used else "left out")
             for name, used, rms in zip(facts.names, facts.used.sum(-1), facts.view_rms, strict=True)
@@ -69,11 +71,11 @@ def _over_image(facts: Facts, places: np.ndarray, residuals: np.ndarray) -> Mark
         ),
         axes.drawn("u, px", "v, px", grid=False),
     ]
-    label = f"Residuals of {len(places)} corners over the image, {magnification:g} times as long"
-    note = "" if chosen.step == 1 else f" Every {chosen.step}th corner is shown."
+    label = f"Residuals of {len(places)} {facts.thing}s over the image, {magnification:g} times as long"
+    note = "" if chosen.step == 1 else f" Every {chosen.step}th {facts.thing} is shown."
     caption = (
-        f"Over the image: from each corner to where the camera puts it, {magnification:g} times as long. Neighbours "
-        f"should point this way and that; arrows that flow together are the sign of another lens.{note}"
+        f"Over the image: from each {facts.thing} to where the camera puts it, {magnification:g} times as long. "
+        f"Neighbours should point this way and that; arrows that flow together are the sign of another lens.{note}"
     )
     return svg.figure(svg.picture(axes.width, axes.height, label, *drawn), caption)
 
@@ -84,7 +86,7 @@ def _by_distance(facts: Facts, places: np.ndarray, residuals: np.ndarray) -> Mar
     outward = (residuals * off).sum(-1) / np.maximum(distance, 1e-9)
     far = svg.reach(distance.tolist())
     high = svg.reach(np.abs(outward).tolist())
-    axes = svg.Axes((0, far), (-high, high))
+    axes = svg.Axes((0, far), (-high, high), left=svg.room_beside((-high, high)))
     means, bands = [], []
     edges = np.quantile(distance, np.linspace(0, 1, BINS + 1))
     for low, top in itertools.pairwise(edges.tolist()):
@@ -109,7 +111,7 @@ def _by_distance(facts: Facts, places: np.ndarray, residuals: np.ndarray) -> Mar
         f"Outward residuals by distance from the principal point; the mean of a ring is {svg.plain(worst)} px at most"
     )
     keys = svg.key(
-        ("dot-faint", "a corner"), ("line-accent", "mean of a ring"), ("box-band", "mean ± 2 of its deviations")
+        ("dot-faint", f"a {facts.thing}"), ("line-accent", "mean of a ring"), ("box-band", "mean ± 2 of its deviations")
     )
     caption = "By distance from the middle: the line should stay on zero within its band; a wave means another lens."
     return svg.figure(svg.picture(axes.width, axes.height, label, *drawn) + keys, caption)
@@ -146,13 +148,14 @@ def _by_view(facts: Facts) -> Markup:
     return svg.figure(svg.picture(axes.width, axes.height, label, *parts), caption)
 
 
-def _histogram(coordinates: np.ndarray, sigma: float, beyond: float) -> Markup:
+def _histogram(coordinates: np.ndarray, sigma: float, beyond: float, thing: str) -> Markup:
     scale = sigma if sigma > 0 else 1.0
     end = 4.0
     counts, edges = np.histogram(np.clip(coordinates / scale, -end, end), 4 * BINS, (-end, end))
     density = counts / (len(coordinates) * (edges[1] - edges[0]))
     curve = [(x, math.exp(-x * x / 2) / math.sqrt(2 * math.pi)) for x in np.linspace(-end, end, 81).tolist()]
-    axes = svg.Axes((-end * scale, end * scale), (0, svg.reach([*density.tolist(), 0.4]) / scale))
+    y_range = 0.0, svg.reach([*density.tolist(), 0.4]) / scale
+    axes = svg.Axes((-end * scale, end * scale), y_range, left=svg.room_beside(y_range))
     parts = [axes.drawn("residual along u and v, px", "part of all, per px")]
     for low, high, value in zip(edges[:-1] * scale, edges[1:] * scale, density / scale, strict=True):
         top = axes.y(value)
@@ -161,6 +164,6 @@ def _histogram(coordinates: np.ndarray, sigma: float, beyond: float) -> Markup:
     label = f"Histogram of {len(coordinates)} residuals against a normal curve of deviation {svg.plain(sigma, 3)} px"
     caption = (
         f"Against a normal curve of the same deviation, {svg.plain(sigma, 3)} px. Beyond three deviations lie "
-        f"{100 * beyond:.1f} % of the residuals, of a normal curve 0.3 %; many more are the sign of wrong corners."
+        f"{100 * beyond:.1f} % of the residuals, of a normal curve 0.3 %; many more are the sign of wrong {thing}s."
     )
     return svg.figure(svg.picture(axes.width, axes.height, label, *parts), caption)

@@ -15,6 +15,8 @@ from diffproj.report.facts import Facts
 
 TILT = 35.0
 """Degrees by which a suggested board is tilted, the middle of the 20 to 50 that are wanted."""
+STEEPEST = 65.0
+"""Degrees between the ray to a suggested board's middle and its normal up to which its corners are found surely."""
 DIRECTIONS = 8
 MOST = 6
 """Suggested views in a sketch, more than which nobody can take in."""
@@ -73,11 +75,13 @@ def suggestions(facts: Facts) -> list[Suggestion]:
     taken = [tuple(tilt) for tilt in facts.tilts[facts.seen_views].tolist() if math.hypot(*tilt) > 10]
     found = []
     for place in (places * MOST)[:count]:
-        tilt = max(_directions(), key=lambda way: min((_apart(way, other) for other in taken), default=0.0))
-        outline = _outline(facts, place, tilt)
-        if outline is not None:
-            taken.append(tilt)
-            found.append(Suggestion(place, tilt, outline))
+        ways = sorted(_directions(), key=lambda way: -min((_apart(way, other) for other in taken), default=0.0))
+        for share, tilt in itertools.product(INWARD, ways):  # rather tilted otherwise than farther inward
+            outline = _outline(facts, place, tilt, share)
+            if outline is not None:
+                taken.append(tilt)
+                found.append(Suggestion(place, tilt, outline))
+                break
     return found
 
 
@@ -117,7 +121,8 @@ def tilt_sketch(facts: Facts, wanted: list[Suggestion]) -> Markup:
     ]
     for degrees in (20, 40, 60):
         parts.append(Markup('<path class="rule" d="{}"/>').format(_circle(middle, degrees * scale)))
-        parts.append(svg.text(middle + 3, middle - degrees * scale + 11, f"{degrees}°", kind="tick"))
+        right, up = (degrees * scale * part for part in (math.sin(math.pi / 8), math.cos(math.pi / 8)))
+        parts.append(svg.text(middle + right, middle - up + 11, f"{degrees}°", kind="tick"))  # suggestions lie beside
     parts += [svg.line(middle - radius, middle, middle + radius, middle, "rule")]
     parts += [svg.line(middle, middle - radius, middle, middle + radius, "rule")]
     parts.append(svg.text(middle, 40, "upper side nearer", "middle"))
@@ -166,8 +171,11 @@ def _corners(facts: Facts, place: str) -> int:
     return int(((3 * u // width == column) & (3 * v // height == row)).sum())
 
 
-def _outline(facts: Facts, place: str, tilt: tuple[float, float]) -> np.ndarray | None:
-    """The board's corners in the image, its middle in a ninth of it, wholly in view; `None` if it never is."""
+def _outline(facts: Facts, place: str, tilt: tuple[float, float], share: float) -> np.ndarray | None:
+    """The board's corners in the image, wholly in view, its middle so far from the principal point to a ninth's middle.
+
+    `None` if it never is, or is seen too much from the side, as a tilted board at the border of a wide view may be.
+    """
     camera = facts.calibration.camera.detach().to("cpu", torch.float64).without_pose()
     row, column = divmod(NINTHS.index(place), 3)
     width, height = facts.size
@@ -175,13 +183,17 @@ def _outline(facts: Facts, place: str, tilt: tuple[float, float]) -> np.ndarray 
     nominal = facts.calibration.nominal.detach().to(ninth)
     low, high = nominal[:, :2].amin(0), nominal[:, :2].amax(0)
     (x, y), (x2, y2) = ((low - high) / 2).tolist(), ((high - low) / 2).tolist()
-    turned = ninth.new_tensor([[x, y, 0], [x2, y, 0], [x2, y2, 0], [x, y2, 0]]) @ _tilted(tilt).to(ninth).mT
+    R = _tilted(tilt).to(ninth)
+    turned = ninth.new_tensor([[x, y, 0], [x2, y, 0], [x2, y2, 0], [x, y2, 0]]) @ R.mT
     near = float(camera.K[0, 0]) * (float((high - low).norm()) or 1.0) / (SIZE * min(width, height))
-    for share, farther in itertools.product(INWARD, FARTHER):  # a lens may see nothing in a ninth's middle
-        ray, valid = camera.directions(torch.lerp(camera.K[:2, 2], ninth, share)[None])
-        outline, seen = camera.project(turned + farther * near * ray[0] / ray[0].norm().clamp(min=1e-9))
+    ray, valid = camera.directions(torch.lerp(camera.K[:2, 2], ninth, share)[None])  # none where the lens sees nothing
+    ray = ray[0] / ray[0].norm().clamp(min=1e-9)
+    if not bool(valid.all()) or float(R[:, 2] @ ray) < math.cos(math.radians(STEEPEST)):
+        return None
+    for farther in FARTHER:
+        outline, seen = camera.project(turned + farther * near * ray)
         inside = ((outline > -0.5) & (outline < outline.new_tensor([width, height]) - 0.5)).all()
-        if bool(valid.all() & seen.all() & inside):
+        if bool(seen.all() & inside):
             return outline.numpy()
     return None
 

@@ -53,7 +53,7 @@ def verdict_part(facts: Facts) -> Part:
         judgement=judgement,
         failed=kind == "bad",
         reasons=[sentence(facts.in_words(reason)) for reason in judgement.reasons],
-        remedies=[sentence(remedy) for remedy in judgement.remedies],
+        remedies=[sentence(facts.in_words(remedy)) for remedy in judgement.remedies],
         note=facts.in_words(judgement.note),
         figures=_figures(facts),
         uses=_uses(facts),
@@ -63,6 +63,7 @@ def verdict_part(facts: Facts) -> Part:
         doubts=doubts(facts),
         wanted=[sentence(one.words) for one in wanted],
         sketches=sketches,
+        thing=facts.thing,
     )
     return Part("Is it good enough?", "verdict", html, svg.STYLE)
 
@@ -86,11 +87,11 @@ def doubts(facts: Facts) -> list[str]:
         found.append(described(same, calibration.views.names))
     out = int(facts.rejected.sum())
     if out:
-        found.append(f"{out} corner{'s' * (out > 1)} lay more than 5 standard deviations off and did not count")
+        found.append(f"{out} {facts.thing}{'s' * (out > 1)} lay more than 5 standard deviations off and did not count")
     idle = [name for view, name in enumerate(facts.names) if view not in facts.seen_views]
     if idle:
         found.append(
-            f"{len(idle)} view{'s' * (len(idle) > 1)} did not count, with too few corners: {', '.join(idle[:4])}"
+            f"{len(idle)} view{'s' * (len(idle) > 1)} did not count, with too few {facts.thing}s: {', '.join(idle[:4])}"
         )
     if not calibration.has_covariance:
         found.append(
@@ -103,7 +104,7 @@ def _figures(facts: Facts) -> list[tuple[str, str]]:
     """The few numbers that everybody asks for."""
     counts = facts.used.sum(-1)
     found = [
-        ("views, corners", f"{int((counts > 0).sum())}, {int(counts.sum())}"),
+        (f"views, {facts.thing}s", f"{int((counts > 0).sum())}, {int(counts.sum())}"),
         ("RMS reprojection error", f"{svg.plain(facts.rms, 3)} px"),
     ]
     if facts.converged:

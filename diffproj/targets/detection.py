@@ -22,7 +22,7 @@ from diffproj.targets.exif import exif_of
 from diffproj.targets.finders import Found, find
 from diffproj.targets.images import NotAnImageError, Orientation, Photograph, Source, grey, listed
 from diffproj.targets.numbering import follow
-from diffproj.targets.one_camera import doubts, named
+from diffproj.targets.one_camera import doubts, named, told_of
 from diffproj.targets.tasks import results_of
 from diffproj.targets.videos import Frame, distinct
 from diffproj.targets.views import Views
@@ -234,6 +234,8 @@ def searched(
     pixels = torch.from_numpy(np.stack([grids[k] for k in kept])).reshape(len(kept), len(target), 2)
     names = [seen[k].name for k in kept]
     views = Views(pixels, pixels.isfinite().all(dim=-1), names=names, size=size)
+    told = tuple(told_of(pairs[k][1].exif or pairs[k][0].exif, raster == "upright") for k in kept)
+    views = Views.unchecked(views.pixels, views.visible, views.names, size, told)
     made = () if beside is None else tuple(pairs[k][1].beside for k in kept)
     return Searched(views, tuple(seen[k] for k in kept), made, tuple(without), tuple(broken))
 

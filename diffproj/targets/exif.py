@@ -4,6 +4,8 @@ import struct
 from contextlib import suppress
 from typing import NamedTuple
 
+from diffproj.targets.animated import frames_of
+
 MIRRORED = frozenset({2, 4, 5, 7})
 """Orientations in which the picture as recorded and the picture as shown are mirror images of each other."""
 
@@ -28,6 +30,9 @@ WHOLE = {1: "B", SHORT: "H", 4: "I", 16: "Q"}
 ORIENTATION, KIND, MAKER, MODEL, EXIF_PART = 0x0112, 0x00FE, 0x010F, 0x0110, 0x8769
 FOCAL, ZOOM, FOCAL_35, SERIAL, LENS = 0x920A, 0xA404, 0xA405, 0xA431, 0xA434
 
+Told = tuple[tuple[str, str | float], ...]
+"""What a file tells of its photograph: a name and a value each."""
+
 
 class Exif(NamedTuple):
     """What a file tells of a photograph; what it does not tell is empty, or `None`.
@@ -40,7 +45,7 @@ class Exif(NamedTuple):
         focal: focal length in mm.
         zoom: ratio of the digital zoom.
         focal_35: focal length in mm of a 35 mm film camera that sees as much.
-        pictures: how many pictures a TIFF holds, smaller copies left out.
+        pictures: how many pictures a TIFF holds, smaller copies left out, or an animation.
         turned_at: where in a TIFF the entry of its orientation begins.
     """
 
@@ -56,12 +61,13 @@ class Exif(NamedTuple):
 
 
 def exif_of(content: bytes) -> Exif:
-    """What a JPEG, PNG, WebP or TIFF tells; of other files nothing, and of damaged ones what is whole."""
+    """What a JPEG, PNG, WebP or TIFF tells, and how many pictures it or a GIF holds; of damaged ones what is whole."""
+    found = Exif()
     with suppress(*DAMAGE):
         start = _start(content)
         if start is not None:
-            return _Reader(content, start).read()
-    return Exif()
+            found = _Reader(content, start).read()
+    return found._replace(pictures=max(found.pictures, frames_of(content)))
 
 
 def as_recorded(content: bytes) -> bytes:

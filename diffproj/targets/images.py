@@ -14,7 +14,7 @@ from torch import Tensor
 from diffproj._core.arguments import listing
 from diffproj._core.dense import dense
 from diffproj.targets import videos
-from diffproj.targets.exif import as_recorded
+from diffproj.targets.exif import Exif, as_recorded
 from diffproj.targets.videos import Frame
 
 SUFFIXES = frozenset({".bmp", ".jfif", ".jpeg", ".jpg", ".jp2", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"})
@@ -33,11 +33,13 @@ class Photograph(NamedTuple):
         name: the name of its view: the file's name, or `image 3` for the third of several arrays.
         label: its name in messages: the file with its folder, or the same as `name`.
         source: the file, the pixels, or a frame of a video.
+        exif: what the file tells beside the pixels, where these were read already.
     """
 
     name: str
     label: str
     source: Path | np.ndarray | Tensor | Frame
+    exif: Exif | None = None
 
 
 Source = str | os.PathLike[str] | np.ndarray | Tensor | Photograph

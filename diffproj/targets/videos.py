@@ -1,13 +1,14 @@
 """Photographs from videos: sharp frames, and of those in which a board hardly moved only one."""
 
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+
+from diffproj._core.warn import warn_caller
 
 SUFFIXES = frozenset(
     {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".webm", ".wmv"}
@@ -19,6 +20,9 @@ MOST = 60
 
 MOVED = 0.02
 """Mean motion of the corners, relative to the frame's diagonal, from which two frames count as two views."""
+
+WHOLE = 0.9
+"""Part of the frames that a video tells of below which it is not whole: from its rate and length they are estimated."""
 
 QUARTERS = frozenset({90, 180, 270})
 """Turns that a video may ask for; what reads other videos than FFmpeg's answers with -1 where it knows none."""
@@ -66,12 +70,20 @@ def frames_of(video: Path, every: int | None) -> list[Frame]:
 
 
 def _each(video: Path, every: int) -> list[Frame]:
-    return [_kept(video, n, *one, None) for n, one in islice(enumerate(_decoded(video)), 0, None, every)]
+    frames, count = [], 0
+    for number, one in enumerate(_decoded(video)):
+        count = number + 1
+        if number % every == 0:
+            frames.append(_kept(video, number, *one, None))
+    _warn_if_short(video, count)
+    return frames
 
 
 def _sharpest(video: Path) -> list[Frame]:
     """Of each of at most 60 equal parts."""
-    length = -(-sum(1 for _ in _decoded(video)) // MOST)
+    count = sum(1 for _ in _decoded(video))
+    _warn_if_short(video, count)
+    length = -(-count // MOST)
     frames: list[Frame] = []
     best = -1.0
     for number, (image, turn) in enumerate(_decoded(video)):
@@ -84,6 +96,18 @@ def _sharpest(video: Path) -> list[Frame]:
             best = sharpness
             frames.append(_kept(video, number, image, turn, sharpness))
     return frames
+
+
+def _warn_if_short(video: Path, count: int) -> None:
+    """Warn where much fewer frames could be read than the file tells of."""
+    capture = cv2.VideoCapture(str(video))
+    told = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))  # negative, or a rough number, where the file does not tell
+    capture.release()
+    if 0 < count < WHOLE * told:
+        warn_caller(
+            f"{video}: OpenCV reads {count} of the {told} frames that the file tells of; it may be cut short or "
+            "damaged: copy it once more, or go on with these"
+        )
 
 
 def distinct(

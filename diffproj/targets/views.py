@@ -13,12 +13,13 @@ from diffproj._core.batched import Batched, check_index
 from diffproj._core.numerics import broadcast_batches, check_tensor, has_values
 from diffproj._core.shown import counted, in_pixels
 from diffproj.geometry.grid import checked_size
+from diffproj.targets.exif import Told
 
 ArrayLike = Tensor | Array
 """What tensors are made of here."""
 
 
-class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "size")):
+class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "size", "told")):
     """The pixels of a board's corners in V photographs, with a mask that says which corners were seen.
 
     Immutable in spirit: every method returns new views, and the caller's tensors are never written. Gradients flow
@@ -30,6 +31,8 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
         visible: `(*B, V, N)`, false where a corner was not seen.
         names: the names of the V photographs.
         size: `(width, height)` of the photographs in px, or `None`.
+        told: what the file of each photograph tells of its camera, zoom and turn, as `detect` reads it: V tuples of
+            names and values; empty where nothing is known. `calibrate` doubts photographs that contradict each other.
 
     Example:
         >>> views = Views(torch.rand(5, 54, 2), size=(640, 480))
@@ -39,12 +42,13 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
         (5, ('view 2', 'view 3'))
     """
 
-    __slots__ = ("names", "pixels", "size", "visible")
+    __slots__ = ("names", "pixels", "size", "told", "visible")
 
     pixels: Float[Tensor, "*batch v n 2"]
     visible: Bool[Tensor, "*batch v n"]
     names: tuple[str, ...]
     size: tuple[int, int] | None
+    told: tuple[Told, ...]
 
     def __init__(
         self,
@@ -74,6 +78,7 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
         mask = _check_visible(visible, points)
         self.names = _check_names(names, points.shape[-3])
         self.size = checked_size(size)
+        self.told = ()
         batch = broadcast_batches(pixels=points.shape[:-3], visible=mask.shape[:-2])
         points, mask = points.expand(*batch, *points.shape[-3:]), mask.expand(*batch, *mask.shape[-2:])
         _check_finite(points, mask, self.names)
@@ -81,12 +86,22 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
 
     @classmethod
     def unchecked(
-        cls, pixels: Any, visible: Any, names: tuple[str, ...] = (), size: tuple[int, int] | None = None
+        cls,
+        pixels: Any,
+        visible: Any,
+        names: tuple[str, ...] = (),
+        size: tuple[int, int] | None = None,
+        told: tuple[Told, ...] = (),
     ) -> "Views":
         """Build without looking at anything: for parts that come from views, or from inside a transformation."""
         views = cls.__new__(cls)
-        views.pixels, views.visible, views.names, views.size = pixels, visible, names, size
+        views.pixels, views.visible, views.names, views.size, views.told = pixels, visible, names, size, told
         return views
+
+    @classmethod
+    def _agreed(cls, name: str, items: Sequence[Any]) -> Any:
+        """The constant that all have; what files tell is another thing for each camera, and none of all of them."""
+        return super()._agreed(name, items) if name != "told" else ()
 
     def _facts(self) -> list[str]:
         views = f"{len(self)} view{'' if len(self) == 1 else 's'} of {self.pixels.shape[-2]} corners"
@@ -130,7 +145,8 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
         chosen = _positions(index, len(self))
         where = torch.tensor(chosen, dtype=torch.long, device=self.device)
         pixels, visible = self.pixels.index_select(-3, where), self.visible.index_select(-2, where)
-        return self.unchecked(pixels, visible, tuple(self.names[i] for i in chosen), self.size)
+        told = tuple(self.told[i] for i in chosen) if self.told else ()
+        return self.unchecked(pixels, visible, tuple(self.names[i] for i in chosen), self.size, told)
 
     def hiding(self, mask: ArrayLike) -> "Views":
         """Hide corners as if they had not been seen; their pixels become 0.
@@ -158,7 +174,7 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
         except RuntimeError:
             want = tuple(self.visible.shape)
             raise ValueError(f"mask: want shape ({want[-1]},) or {want}, got {tuple(hidden.shape)}") from None
-        return self.unchecked(_masked(self.pixels, visible), visible, self.names, self.size)
+        return self.unchecked(_masked(self.pixels, visible), visible, self.names, self.size, self.told)
 
 
 # ------------------------------------------------------------------------------------------------------ the checks

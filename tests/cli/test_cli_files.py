@@ -1,6 +1,7 @@
 """`diffproj convert` and `diffproj info`."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -49,6 +50,20 @@ def test_convert_names_lenses_as_the_other_documents_do(folder: Path, capsys: py
             told.append(json.loads(capsys.readouterr().out))
         assert told[0]["lens"] == next(iter(told[1]["cameras"].values()))["lens"] == lens
         assert (told[0]["rig"], told[0]["cameras"]) == (None, None)
+
+
+def test_what_a_format_has_no_place_for_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = str(folder / "whole.json")
+    dp.save_camera(source, dp.calibrate(dp.example_views("left")[:4], dp.Chessboard()))
+    for options in (["e.yml"], ["e.txt"], ["e.npz"], ["e.json", "--without-pose"]):
+        out, *more = options
+        assert main(["convert", source, str(folder / out), *more]) == 0
+        assert (
+            f"{folder / out} holds the camera alone: error bars, views and unit of {source}" in capsys.readouterr().err
+        )
+    for inside, out in ((source, "f.json"), (str(folder / "e.yml"), "g.json"), (str(folder / "e.yml"), "g.xml")):
+        assert main(["convert", inside, str(folder / out)]) == 0
+        assert capsys.readouterr().err == ""
 
 
 def test_a_whole_calibration_stays_whole(folder: Path) -> None:
@@ -129,9 +144,20 @@ def test_info_refuses_height_and_width(folder: Path, capsys: pytest.CaptureFixtu
 
 
 def test_info_of_a_calibration_and_of_damage(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    dp.save_camera(folder / "c.json", dp.calibrate(dp.example_views("left")[:4], dp.Chessboard()))
+    found = replace(dp.calibrate(dp.example_views("left")[:4], dp.Chessboard()), unit="mm")
+    dp.save_camera(folder / "c.json", found)
     assert main(["info", str(folder / "c.json")]) == 0
-    assert "a calibration of 4 views, RMS" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "a calibration of 4 views, RMS" in out
+    assert "px; lengths in mm\nWeak: only 4 views differ" in out
+    assert main(["info", str(folder / "c.json"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["calibration"]
+    assert told["verdict"].startswith("Weak: only 4 views differ")
+    assert told["unit"] == "mm"
+    both = torch.stack([dp.example_views(side).pixels[:5] for side in ("left", "right")])
+    dp.save_camera(folder / "c.json", dp.calibrate(dp.Views(both, size=(640, 480)), dp.Chessboard()))
+    assert main(["info", str(folder / "c.json"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["calibration"]["verdict"] is None
     (folder / "d.npz").write_bytes(npz(mtx=K, dist=K))
     assert main(["info", str(folder / "d.npz")]) == 1
     assert "d.npz: dist: want one row or column of coefficients, got 3 x 3" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -116,6 +117,31 @@ def test_what_is_done_is_not_done_again(fleet, tmp_path, capsys, monkeypatch):
     assert (code, seen) == (0, ["cam3", "empty", "wall"])
     assert "camera" in lines_of(file)["cam3"]
     assert len(file.read_text().splitlines()) == 5
+
+
+def test_photographs_that_came_or_changed_are_noticed(fleet, tmp_path, capsys):
+    file = tmp_path / "out.jsonl"
+    run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    before = lines_of(file)
+    photograph = fleet / "cam2" / "0.png"
+    (fleet / "cam2" / "9.png").write_bytes(photograph.read_bytes()[:-1] + b"\0")
+    _, _, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    assert "1 camera of 5 done before" in err
+    assert f"cam2: photographs were added, removed or changed since {file} was written; done anew" in err
+    after = lines_of(file)
+    assert after["cam2"]["photographs"] == before["cam2"]["photographs"] + 1
+    assert after["cam10"] == before["cam10"]
+    assert len(file.read_text().splitlines()) == 5
+    (fleet / "cam2" / "9.png").unlink()
+    about = photograph.stat()
+    os.utime(photograph, ns=(about.st_atime_ns, about.st_mtime_ns + 10**9))  # one of the same size, taken again
+    (fleet / "cam10" / "notes.txt").write_text("no photograph")
+    _, _, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    assert "cam2: photographs were added" in err
+    assert "cam10" not in err
+    _, _, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    assert "2 cameras of 5 done before" in err
+    assert "photographs were added" not in err
 
 
 def test_the_document_speaks_of_options_and_tells_notes(fleet, tmp_path, capsys, monkeypatch):

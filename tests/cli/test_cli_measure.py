@@ -14,10 +14,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
 import diffproj as dp
-from diffproj import synthetic
+from diffproj import figures, synthetic
 from diffproj.cli import shielded
 from diffproj.cli.inputs import HAND
 from diffproj.cli.measure_csv import as_csv
@@ -475,6 +476,16 @@ def test_tables_for_spreadsheets(capsys: pytest.CaptureFixture[str]) -> None:
     assert (first["name"], first["unit"], rows[-1]["unit"], rows[-1]["value"]) == ("1, 2", "mm", "mm^2", "")
 
 
+def test_with_a_table_it_is_told_what_its_deviations_lack(capsys: pytest.CaptureFixture[str]) -> None:
+    """A table has no place for it, so that those of a camera without deviations looked like all others."""
+    options = ("photo.png", *BOARD, "--points", *CORNERS, "--csv", "--quiet")
+    code, out, err = run(capsys, *options, "--camera", "camera.yaml")
+    assert code == 0
+    assert err.startswith("diffproj: The deviations hold 0.5 px for each pixel, as for points picked by hand")
+    assert "but NOT how surely the camera is, for its file does not tell" in err
+    assert out.startswith("what,name,u,v")
+
+
 def test_the_table_says_what_is_doubtful(capsys: pytest.CaptureFixture[str]) -> None:
     """What is measured by another camera stood there like everything else: doubts were on standard error alone."""
     options = ("photo.png", "--camera", "camera.json", *BOARD, "--points", *CORNERS, "-9000,100", "--json")
@@ -638,3 +649,22 @@ def test_a_photograph_that_is_turned_is_not_called_resized(tmp_path: Path, capsy
     code, _, err = run(capsys, tmp_path / "turned.png", "--camera", "camera.json", *BOARD, "--points", CORNERS[0])
     assert code == 1
     assert "it is turned against those that the camera was calibrated on" in " ".join(err.split())
+
+
+def test_a_doubt_is_told_with_the_numbers_and_in_the_drawing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was on standard error alone, so that a file with the output, and a drawing, looked like any other."""
+    photograph = cv2.imread("photo.png", cv2.IMREAD_GRAYSCALE)
+    assert photograph is not None
+    part = cv2.resize(photograph[:, 40:600], (640, 480), interpolation=cv2.INTER_CUBIC)
+    cv2.imwrite(str(tmp_path / "stretched.png"), part)
+    drawn = []
+    monkeypatch.setattr(figures, "measured", lambda *_, title, **__: drawn.append(title) or Figure())
+    options = ("--camera", "camera.json", *BOARD, "--points", *CORNERS, "--draw", str(tmp_path / "a.png"))
+    _, out, err = run(capsys, str(tmp_path / "stretched.png"), *options)
+    assert "another camera, zoom or focus" in err
+    assert "DOUBTFUL: the residuals of stretched.png are" in out
+    assert "\nDOUBTFUL: the residuals of stretched.png are" in drawn[0]
+    _, out, err = run(capsys, "photo.png", *options)
+    assert "DOUBTFUL" not in out + err + drawn[1]

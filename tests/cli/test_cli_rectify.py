@@ -193,3 +193,15 @@ def test_a_plane_behind_the_camera_is_named_and_not_its_extent(
     assert code == 1
     assert said in err
     assert not Path("never.png").exists()
+
+
+def test_a_doubt_is_told_with_the_result(capsys: pytest.CaptureFixture[str]) -> None:
+    """It was on standard error alone."""
+    photograph = cv2.imread("photo.png")
+    assert photograph is not None
+    cv2.imwrite("stretched.png", cv2.resize(photograph[:, 40:600], (640, 480), interpolation=cv2.INTER_CUBIC))
+    _, out, _ = run(capsys, "stretched.png", *GIVEN[1:], "-o", "top.png")
+    assert "DOUBTFUL: the residuals of stretched.png are" in out
+    _, out, _ = run(capsys, "stretched.png", *GIVEN[1:], "-o", "top.png", "--json")
+    assert json.loads(out)["doubts"].startswith("the residuals of stretched.png are")
+    assert parsed(capsys, *GIVEN, "-o", "top.png")["doubts"] is None

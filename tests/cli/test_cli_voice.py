@@ -290,6 +290,18 @@ def test_files_are_read_once(
     assert read == expected
 
 
+@pytest.mark.parametrize("command", ["measure", "locate"])
+def test_a_photograph_s_file_is_read_once(
+    command: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether it is shown turned was read off the file anew."""
+    read, whole = [], Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path.name) or whole(path))
+    given = COMMANDS["measure"] if command == "measure" else ("locate", "photo.png", *COMMANDS["locate"][1:])
+    assert run(capsys, *given)[0] == 0
+    assert read.count("photo.png") == 1
+
+
 def test_interrupted_while_it_loads(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def interrupted() -> int:
         raise KeyboardInterrupt
@@ -313,3 +325,19 @@ def test_frames_of_videos_are_decoded_once(read: Counter[str], capsys: pytest.Ca
     assert read == {"grey": 5}
     assert run(capsys, "calibrate", *arguments, "--report", "a.html")[0] == 0
     assert read == {"grey": 5 + 5 + 1}  # grey as they are kept, that to measure in, too
+
+
+@pytest.mark.parametrize("columns", [20, 40, 80])
+def test_numbers_in_tables_stay_whole_in_any_terminal(
+    folder: Path, columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, told, _ = run(capsys, *COMMANDS["measure"], "--json")
+    point = json.loads(told)["points"][0]
+    monkeypatch.setenv("COLUMNS", str(columns))
+    _, out, _ = run(capsys, *COMMANDS["measure"])
+    x = re.search(r"210, 133\s*│\s*(-?[\d.]+) ± [\d.]+ │\s*(-?[\d.]+) ± [\d.]+ │", out)
+    assert x is not None
+    assert [float(one) for one in x.groups()] == pytest.approx(point["world"][:2], abs=0.06)
+    assert re.search(r"│ 1, 2 +│ [\d.]+ │ [\d.]+ +│ [\d.]+ to [\d.]+ │", out)
+    _, out, _ = run(capsys, *COMMANDS["calibrate"])
+    assert re.search(r"│\s+\d+\.\d+ │ \d+\.\d+ +│", out)

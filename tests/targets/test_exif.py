@@ -176,6 +176,16 @@ def test_only_the_first_picture_of_a_tiff_counts_and_copies_of_it_do_not(tmp_pat
     assert exif_of(file.getvalue()).pictures == 3
     (tmp_path / "three.tif").write_bytes(file.getvalue())
     np.testing.assert_array_equal(decoded(tmp_path / "three.tif", "sensor"), PICTURE)
+    for kind in ("GIF", "PNG", "WEBP"):
+        file = io.BytesIO()
+        pictures[0].save(file, kind, save_all=True, append_images=pictures[1:])
+        whole = file.getvalue()
+        assert exif_of(whole).pictures == 3
+        for end in range(0, len(whole), 7):
+            assert 1 <= exif_of(whole[:end]).pictures <= 3
+        file = io.BytesIO()
+        pictures[0].save(file, kind)
+        assert exif_of(file.getvalue()).pictures == 1
     small = pictures[1].resize((16, 12))
     small.encoderinfo = {"tiffinfo": {0x00FE: 1}}
     file = io.BytesIO()

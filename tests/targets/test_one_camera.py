@@ -1,19 +1,23 @@
 """Photographs that their files say are not of one camera, one zoom or one turn, or that are mirror images."""
 
+import hashlib
 import itertools
+import json
 import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 import diffproj as dp
+from diffproj.cli import main
 from diffproj.cli.photographs import one_photograph
 from diffproj.targets.exif import Exif
-from diffproj.targets.one_camera import doubts
+from diffproj.targets.one_camera import doubts, of_another_camera, told_of
 
 BOARD = dp.Chessboard(5, 4)
 
@@ -125,3 +129,128 @@ def test_a_file_is_read_once_for_its_pixels_and_what_it_tells(tmp_path: Path, mo
     read.clear()
     one_photograph(tmp_path / "a.png", "sensor")
     assert read == ["a.png"]
+
+
+def zoomed(folder: Path, focal: dict[int, float], orientation: dict[int, int]) -> Path:
+    """Rendered photographs of one camera, with EXIF data."""
+    camera = dp.Camera([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]], size=(320, 240))
+    turns = ((0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0, -0.5, 0), (0.3, 0.3, 0.2), (0.4, -0.4, 0.1))
+    for n, turn in enumerate(turns):
+        R = dp.rotation_from_euler(*torch.tensor(turn, dtype=torch.float64))
+        t = torch.tensor([0.0, 0, 200 + 10 * n], dtype=torch.float64) - R @ BOARD.points.double().mean(0)
+        pixels = np.asarray(dp.synthetic.photograph(camera.at(R, t), BOARD, seed=n))
+        exif = Image.Exif()
+        exif[0x0112] = orientation.get(n, 1)
+        exif.get_ifd(0x8769)[0x920A] = IFDRational(round(100 * focal.get(n, 24.0)), 100)
+        Image.fromarray(pixels).save(folder / f"{n}.png", exif=exif)
+    return folder
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_what_files_tell_of_two_zooms_is_in_the_verdict_and_in_the_file(tmp_path: Path) -> None:
+    views = dp.detect(zoomed(tmp_path, {1: 28.0}, {}), BOARD)
+    found = dp.calibrate(views, BOARD, "none")
+    assert found.verdict.startswith("Weak")
+    assert "EXIF data tell of different focal lengths" in found.verdict
+    assert "24 mm in 0.png, 2.png, 3.png and 2 more and 28 mm in 1.png: calibrate them by" in found.remarks[0]
+    dp.save_camera(tmp_path / "camera.json", found)
+    again = dp.load_calibration(tmp_path / "camera.json")
+    assert again.verdict == found.verdict
+    assert "EXIF" in dp.refine(again.views, BOARD, again.camera).verdict
+    several = dp.calibrate([views, views[[0, 2, 3, 4, 5]]], BOARD, "none")
+    assert [isinstance(one, dp.Calibration) and "EXIF" in one.verdict for one in several] == [True, False]
+    for alone in (views[[0, 2, 3, 4, 5]], views[2:]):
+        assert "EXIF" not in dp.calibrate(alone, BOARD, "none").verdict
+    hidden = torch.zeros_like(views.visible)
+    hidden[1] = True  # the one that is zoomed does not count
+    assert "EXIF" not in dp.calibrate(views.hiding(hidden), BOARD, "none").verdict
+    one = dp.Views.stack([views, views])
+    assert "EXIF" not in dp.calibrate(one, BOARD, "none").remarks[0]
+    assert not dp.locate(views, BOARD, found.camera).doubts
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_views_turned_apart_are_in_the_verdict(tmp_path: Path) -> None:
+    folder = zoomed(tmp_path, {}, {2: 3, 4: 2})
+    upright = dp.calibrate(dp.detect(folder, BOARD, orientation="upright"), BOARD, "none")
+    assert "EXIF data tell of photographs that were turned apart" in upright.verdict
+    as_recorded = dp.calibrate(dp.detect(folder, BOARD), BOARD, "none")
+    assert "EXIF data tell of mirror images among the others, 4.png, which" in as_recorded.remarks[0]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_rig_is_told_of_a_camera_that_changed(tmp_path: Path) -> None:
+    folder = zoomed(tmp_path, {1: 28.0}, {})
+    views = dp.detect(folder, BOARD)
+    other = dp.Views(views.pixels, views.visible, views.names, views.size)
+    rig = dp.calibrate_rig({"a": views, "b": other}, BOARD, "none")
+    told = [one for one in rig.remarks if "EXIF" in one]
+    assert len(told) == 1
+    assert told[0].startswith("a: EXIF data tell of different focal lengths, 24 mm in 0.png")
+
+
+@pytest.mark.filterwarnings("ignore:photographs:UserWarning")
+def test_a_photograph_of_another_zoom_than_the_calibration_s_is_doubtful(tmp_path: Path) -> None:
+    """Of four corners or of a lens that moved little residuals do not tell; the file does, also from the saved camera."""
+    views = dp.detect(zoomed(tmp_path, {1: 28.0, 3: 24.05}, {}), BOARD)
+    dp.save_camera(tmp_path / "camera.json", dp.calibrate(views[[0, 2, 4, 5]], BOARD, "none"))
+    known = dp.load_calibration(tmp_path / "camera.json")
+    said = (
+        "1.png: EXIF data tell of another focal length than those of the photographs that the camera was calibrated on"
+    )
+    with pytest.warns(dp.CameraMismatchWarning, match=f"locate: {said}: 28 mm, not 24 mm"):
+        located = dp.locate(views[[1, 3]], BOARD, known)
+    assert located.doubts == f"{said}: 28 mm, not 24 mm"
+    assert dp.measure([[100.0, 100.0]], located, dp.Plane.z(0.0), 0, 0.5).doubts == located.doubts
+    assert not dp.locate(views[[0, 3]], BOARD, known).doubts
+    assert not dp.locate(views[[1]], BOARD, known.camera).doubts
+    with pytest.warns(dp.CameraMismatchWarning, match=said):
+        fixed = dp.locate(views[[1]], BOARD, known, priors={"height": (200.0, 100.0)}, pixel_sigma=0.1)
+    assert said in fixed.doubts
+
+
+def test_other_cameras_are_told_by_what_differs_first() -> None:
+    own = [told_of(Exif(1, "Canon", "12", "50mm", 50.0), False)] * 2
+    assert [value for name, value in own[0] if name == "serial"] == [
+        "#" + hashlib.blake2b(b"12", digest_size=4).hexdigest()
+    ]
+    assert of_another_camera(own, ["a"], [told_of(Exif(1, "Canon", "12", "50mm", 50.1), False)]) == ""
+    assert of_another_camera(own, ["a"], [told_of(Exif(), False)]) == ""
+    assert of_another_camera([()], ["a"], [told_of(Exif(2, "Nikon"), True)]) == ""
+    assert of_another_camera(own, ["a"], []) == ""
+    for exif, words in (
+        (
+            Exif(1, "Nikon", "13"),
+            "another camera than those of the photographs that the camera was calibrated on: Nikon,",
+        ),
+        (Exif(1, "Canon", "13"), "another camera, by its serial number, than"),
+        (Exif(1, "Canon", "12", "35mm"), "another lens than"),
+        (Exif(2, "Canon"), "another way of counting pixels, mirrored, than"),
+    ):
+        assert words in of_another_camera(own, ["a"], [told_of(exif, False)])
+    turned = [told_of(Exif(6), True)]
+    assert "another turn than" in of_another_camera(turned, ["a"], [told_of(Exif(1), True)])
+
+
+def test_commands_tell_a_photograph_of_another_zoom_than_the_camera_s(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They read a photograph's pixels before it is searched, and what its file tells has to go along."""
+    folder = zoomed(tmp_path, {1: 28.0}, {})
+    views = dp.detect([folder / f"{n}.png" for n in (0, 2, 3, 4, 5)], BOARD)
+    dp.save_camera(tmp_path / "camera.json", dp.calibrate(views, BOARD, "none"))
+    corners = dp.detect(folder / "1.png", BOARD).pixels[0]
+    rows = [",".join(map(str, (*p, *x))) for p, x in zip(corners.tolist(), BOARD.points.tolist(), strict=True)]
+    (tmp_path / "points.csv").write_text("\n".join(["u,v,x,y,z", *rows]))
+    camera, on = ("--camera", str(tmp_path / "camera.json")), ("--board", "5x4", "--square", "25", "--points", "99,99")
+    for command in (
+        ["measure", str(folder / "1.png"), *camera, *on],
+        ["locate", str(folder / "1.png"), *camera, "--landmarks", str(tmp_path / "points.csv")],
+    ):
+        assert main([*command, "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        said = "1.png: EXIF data tell of another focal length than those of the photographs"
+        assert [text for text in told["warnings"] if said in text]
+        assert said in told.get("doubts", told.get("verdict"))
+    assert main([*["measure", str(folder / "2.png"), *camera, *on], "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["warnings"] == []

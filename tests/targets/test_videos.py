@@ -81,3 +81,20 @@ def test_videos_of_the_web_and_of_camcorders_are_videos(tmp_path: Path) -> None:
         other = (tmp_path / "film.mp4").rename(tmp_path / f"film{suffix}")
         assert listed(other, 1)[2].name == f"film{suffix} frame 2"
         other.rename(tmp_path / "film.mp4")
+
+
+@pytest.mark.parametrize("every", [None, 3])
+def test_a_video_that_was_cut_short_is_told(tmp_path: Path, every: int | None) -> None:
+    path = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no video")
+    for n in range(30):
+        writer.write(np.full((48, 64, 3), 5 * n, np.uint8))
+    writer.release()
+    assert len(listed(path, every)) == (30 if every is None else 10)  # a warning would fail here
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.warns(UserWarning, match=r"reads \d+ of the 30 frames that the file tells of; it may be cut short"):
+        frames = listed(path, every)
+    assert 1 <= len(frames) < 16

@@ -152,7 +152,10 @@ class Account(Shown):
 
     @property
     def contradiction(self) -> str:
-        """Where poses alone were found, what residuals say against the `pixel_sigma`, in words; empty where nothing."""
+        """Where poses alone were found, what speaks against them, in words; empty where nothing does.
+
+        It is what residuals say against the `pixel_sigma`, and files against the camera that was given.
+        """
         if not (self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics)):
             return ""
         said = [

@@ -147,6 +147,8 @@ def judged(seen: Evidence) -> Judgement:
             0,
             "first another look at the views that the remark names, for one camera with one zoom must have taken all",
         )
+    if Kind.TOLD_APART in seen.kinds:
+        remedies.insert(0, "no other photograph yet, but those alone that one camera took with one zoom, turned alike")
     if Kind.TURNED in seen.kinds:
         remedies.insert(0, "no other photograph yet, but those that the remark names turned as the others are")
     if Kind.UNEVEN_PRINT in seen.kinds:
@@ -221,6 +223,7 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
         *faults,
         *_reasons(
             seen.remarks,
+            Kind.TOLD_APART,
             Kind.TURNED,
             Kind.TWO_CAMERAS,
             Kind.UNEVEN_PRINT,

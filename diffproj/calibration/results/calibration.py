@@ -218,7 +218,7 @@ class Calibration(Account, Copied, Recorded, Indexed):
 
         Views that are `ambiguous`; views of which too many corners are `left_out` as outliers; of what `locate` found,
         views that the calibration or the camera does not fit: see `mismatch`; and where poses alone were found,
-        residuals that the `pixel_sigma` that was said does not explain.
+        residuals that the `pixel_sigma` that was said does not explain, and files that tell of another camera or zoom.
         """
         misfit = mismatches.described(self.mismatch, self.views.names, self.lens_region is not None)
         points = "corners" if self.landmarks is None else "landmarks"

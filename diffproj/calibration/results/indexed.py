@@ -67,7 +67,11 @@ class Indexed:
             camera=many.camera.expand(*shape)[index],
             cameras=many.cameras[_before_views(index)],
             views=Views.unchecked(
-                index_batch(views.pixels, index, 3), index_batch(views.visible, index, 2), views.names, views.size
+                index_batch(views.pixels, index, 3),
+                index_batch(views.visible, index, 2),
+                views.names,
+                views.size,
+                views.told,
             ),
             causes=tuple(causes),
             **some,

@@ -14,6 +14,7 @@ from diffproj.calibration.results.fields import codes, mask, present, tensor
 from diffproj.calibration.results.mismatch import Mismatch
 from diffproj.calibration.results.remark import Kind, Remark, Remarks
 from diffproj.geometry.camera import Camera
+from diffproj.targets.exif import Told
 from diffproj.targets.views import Views
 
 T = TypeVar("T")
@@ -71,6 +72,7 @@ class Recorded:
             ],
             "names": list(self.views.names),
             "size": self.views.size,
+            "told": [dict(one) for one in self.views.told] or None,
             **{name: None if found is None else found.tolist() for name, found in lists.items()},
             "covariance": self.covariance_of_kept_poses.to_fields() if self.has_covariance else None,
             "other_poses": others
@@ -99,9 +101,9 @@ class Recorded:
         if visible.ndim != len(batch) + 2 or tuple(visible.shape[:-2]) != batch:
             raise ValueError(f"visible: want shape (*{batch}, V, N) as the camera says, got {tuple(visible.shape)}")
         V, N = visible.shape[-2:]
-        views = Views(
-            tensor(fields, "pixels", (*batch, V, N, 2)), visible, _names(fields["names"], V), _size(fields["size"])
-        )
+        names, size = _names(fields["names"], V), _size(fields["size"])
+        views = Views(tensor(fields, "pixels", (*batch, V, N, 2)), visible, names, size)
+        views = Views.unchecked(views.pixels, views.visible, names, size, _told(fields.get("told"), V))
         if None not in (views.size, camera.size) and views.size != camera.size:
             raise ValueError(f"size: want that of the camera, {camera.size}, got {views.size}")
         used, rejected = (mask(fields, name, (*batch, V, N)) for name in ("used", "rejected"))
@@ -236,6 +238,20 @@ def _names(names: Any, count: int) -> tuple[str, ...]:
     if len(found) != count:
         raise ValueError(f"names: want {count}, one for each view, got {len(found)}")
     return found
+
+
+def _told(told: Any, count: int) -> tuple[Told, ...]:
+    """What the views' photographs told of their camera; files of earlier releases lack it."""
+    if told is None:
+        return ()
+    if not isinstance(told, list | tuple) or len(told) != count or not all(map(_is_told, told)):
+        raise ValueError(f"told: want {count} objects of texts and numbers, one for each view, got something else")
+    return tuple(tuple(one.items()) for one in told)
+
+
+def _is_told(one: Any) -> bool:
+    """Whether it is a name and a text or a number each."""
+    return isinstance(one, dict) and all(isinstance(k, str) and type(v) in (str, int, float) for k, v in one.items())
 
 
 def _landmarks(names: Any, count: int) -> tuple[str, ...] | None:

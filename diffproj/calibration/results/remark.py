@@ -17,6 +17,8 @@ class Kind(StrEnum):
     """The residuals are those of a K with skew, which was held."""
     TWO_CAMERAS = "two cameras"
     """The views fall into two groups that want different cameras."""
+    TOLD_APART = "told apart"
+    """The files of photographs tell of several cameras, zooms or turns."""
     TURNED = "turned photographs"
     """Photographs of some views are turned by 180 degrees against the others'."""
     UNEVEN_PRINT = "uneven print"

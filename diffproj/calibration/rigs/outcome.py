@@ -30,6 +30,7 @@ from diffproj.calibration.rigs.uncertainty import (
 )
 from diffproj.calibration.trust.verdict import FEWEST_FOR_A_SHAPE, MAX_RELATIVE_STD
 from diffproj.geometry.camera import Camera
+from diffproj.targets.one_camera import against_one_camera
 
 FAR_WORSE, FAR_OFF = 10.0, 0.002
 """RMS of a camera over that on its own, and over the image's extent, beyond both of which there is no rig."""
@@ -239,7 +240,11 @@ def _remarks(
         squares, count = residuals[name].square().sum((-2, -1)), used.sum(-1)
         flat = found.restraint is None and not found.parameters.bow
         # On its own it had a flat target; what that says of the tags' distance holds for a free one.
-        told = text_of(one for one in alone[name].findings() if flat or one.kind == Kind.SPACING)
+        own = views.data[name].views
+        said += [f"{name}: {sentence}" for sentence, _ in against_one_camera(own.names, own.told)]
+        told = text_of(
+            one for one in alone[name].findings() if one.kind != Kind.TOLD_APART and (flat or one.kind == Kind.SPACING)
+        )
         if told:
             said.append(f"{name}, on its own: {told}")
         rms = float((squares.sum() / count.sum().clamp(min=1)).sqrt())
