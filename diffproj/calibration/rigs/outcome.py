@@ -19,6 +19,7 @@ from diffproj.calibration.rigs.common_errors import CLEAR, CommonErrors, common_
 from diffproj.calibration.rigs.connection import set_apart, single_moments
 from diffproj.calibration.rigs.discounted import discounted
 from diffproj.calibration.rigs.fit import RigFit
+from diffproj.calibration.rigs.moment_contradiction import contradicting_moment
 from diffproj.calibration.rigs.parameters import POSE_NAMES
 from diffproj.calibration.rigs.prior_contradiction import contradicted_priors
 from diffproj.calibration.rigs.result import RigCalibration
@@ -241,6 +242,8 @@ def _remarks(
     if joint.common is not None and joint.common.beyond > CLEAR:
         places = [i for one in found.parameters.poses[1:] for i in one]
         said += filter(None, [joint.common.remark(names, places, joint().shared)])
+    if (other := contradicting_moment(found, noise)) is not None:
+        said += filter(None, [other.remark(found, joint().shared)])
     found.problem.forget()  # what common errors are found from
     residuals = found.by_camera
     for name in names:
