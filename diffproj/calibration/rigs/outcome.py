@@ -19,6 +19,7 @@ from diffproj.calibration.rigs.common_errors import CLEAR, CommonErrors, common_
 from diffproj.calibration.rigs.connection import set_apart, single_moments
 from diffproj.calibration.rigs.discounted import discounted
 from diffproj.calibration.rigs.fit import RigFit
+from diffproj.calibration.rigs.held_contradiction import contradicted_held
 from diffproj.calibration.rigs.moment_contradiction import contradicting_moment
 from diffproj.calibration.rigs.parameters import POSE_NAMES
 from diffproj.calibration.rigs.prior_contradiction import contradicted_priors
@@ -236,13 +237,18 @@ def _remarks(
     for name in found.restrained:
         said.append(f"k4, k5 and k6 of {name} are held as on its own, for without that its lens folds inside the image")
     said += _same_views(found)
+    beforehand = []
     if found.problem.known is not None:  # else the covariance is not asked for here
-        said += contradicted_priors(found, noise, float(joint().dispersion))
+        beforehand += contradicted_priors(found, noise, float(joint().dispersion))
+    if (held := contradicted_held(found, noise)) is not None:
+        beforehand += filter(None, [held.remark(found, float(joint().dispersion))])
+    said += beforehand
     said += _unlike(found, noise)
     if joint.common is not None and joint.common.beyond > CLEAR:
         places = [i for one in found.parameters.poses[1:] for i in one]
         said += filter(None, [joint.common.remark(names, places, joint().shared)])
-    if (other := contradicting_moment(found, noise)) is not None:
+    # What is wrongly known beforehand makes moments contradict each other.
+    if not beforehand and (other := contradicting_moment(found, noise)) is not None:
         said += filter(None, [other.remark(found, joint().shared)])
     found.problem.forget()  # what common errors are found from
     residuals = found.by_camera
