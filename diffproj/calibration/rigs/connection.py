@@ -43,7 +43,7 @@ def set_apart(found: RigFit) -> str:
         if at:
             more = f" and {len(at) - MOST_NAMED} more" * (len(at) > MOST_NAMED)
             said.append(f"{name} at {', '.join(at[:MOST_NAMED])}{more}")
-    return "; ".join(said)
+    return ", ".join(said)
 
 
 def _only_ones(seen: Mapping[int, set[int]]) -> list[int]:
