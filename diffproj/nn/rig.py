@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from diffproj._core.arguments import Array, called, choice
 from diffproj._core.numerics import check_tensor, dot, has_values
+from diffproj.calibration.rigs.options import owner_among
 from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.geometry.cayley import turned
@@ -203,8 +204,7 @@ def _chosen(learn: Learn | None, cameras: Mapping[str, Camera], moving: bool) ->
             if not moving:
                 raise ValueError("learn: want 'moments' for a rig that is given moments=(R, t), got none")
             continue
-        owner = next((name for name in names if entry.startswith(f"{name}.")), None)
-        part = entry if owner is None else entry[len(owner) + 1 :]
+        owner, part = owner_among(names, entry)
         if part not in (*PARTS, *OF_POSE):
             offered = ", ".join((*PARTS, *OF_POSE, *([MOMENTS] if moving else [])))
             raise ValueError(

@@ -68,6 +68,9 @@ def test_what_is_learned() -> None:
     assert learnt(("pose",)) == [f"members.{i}.{part}" for i in (1, 2) for part in ("rotation", "translation")]
     assert learnt(("front.pose",)) == ["members.0.rotation", "members.0.translation"]
     assert learnt(("distortion",)) == ["members.1.distortion", "members.2.distortion"]
+    alike = dict(zip(("side", "side.1"), cameras().values(), strict=False))  # of which one name begins as the other
+    rig = dp.LearnableRig(alike, ("side.1.focal", "side.principal_point"))
+    assert [name for name, _ in rig.named_parameters()] == ["members.0.principal_point", "members.1.log_focal"]
     assert learnt(("side.1.principal_point", "moments")) == [
         "members.1.principal_point",
         "moments.rotation",

@@ -37,6 +37,8 @@ class Kind(StrEnum):
     """Landmarks on a level plane are seen from below, by a camera that is upside down if z is up."""
     LEFT_OUT = "left out"
     """Too many corners of some views were left out as outliers, or hardly counted."""
+    PRIOR_WEIGHT = "prior weight"
+    """The priors weigh against another noise of the corners than these have."""
     WRONG_PRIOR = "wrong prior"
     """The views contradict what was said beforehand of a parameter."""
 

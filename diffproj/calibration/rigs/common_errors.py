@@ -19,7 +19,7 @@ covariance of the scores:
     M = sum over v of s_c^2 J_v^T W J_v + sum over k of t_k(c)^2 T_vk^T T_vk
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -100,12 +100,12 @@ class CommonErrors(NamedTuple):
 
 
 class Moves(NamedTuple):
-    """What moves of all corners of a view do to the scores, by moment and camera; 0 where there is no view.
+    """What b moves of all corners of a view do to the scores, by moment and camera; 0 where there is no view.
 
     Attributes:
-        shared, local: `B^T W J` by the shared unknowns `(M, C, 5, s)` and by the moment's pose `(M, C, 5, 6)`.
-        pull: `B^T W r` `(M, C, 5)`.
-        weight: `B^T W B` `(M, C, 5, 5)`.
+        shared, local: `B^T W J` by the shared unknowns `(M, C, b, s)` and by the moment's pose `(M, C, b, 6)`.
+        pull: `B^T W r` `(M, C, b)`.
+        weight: `B^T W B` `(M, C, b, b)`.
     """
 
     shared: Tensor
@@ -125,7 +125,8 @@ def common_errors(found: RigFit, variance: Tensor, freedom: Tensor, bend: Tensor
         freedom: the degrees of freedom that it is from `(C,)`.
         bend: the mean slope of a robust loss's score `(C,)`, 1 without a loss.
     """
-    moves, H, basis = _moves(found, bend), found.curvature(bend), found.basis
+    C, H, basis = len(found.views.names), found.curvature(bend), found.basis
+    moves = moves_of(found, bend, len(OF_KIND), lambda group, panel: _moved(group, panel, C))
     S, F, inverse_W, _ = reduced(H, basis, None)
     free, size = moves.shared, H.U.diagonal(dim1=-2, dim2=-1)
     if basis is not None:
@@ -185,11 +186,18 @@ def _not_negative(A: Tensor, b: Tensor) -> Tensor:
     return x
 
 
-def _moves(found: RigFit, bend: Tensor) -> Moves:
-    """What moves do, of the views of all cameras."""
-    M, C, s, n = found.problem.moments, len(found.views.names), found.parameters.size, len(OF_KIND)
+def moves_of(found: RigFit, bend: Tensor, count: int, moved: Callable[[Group, Tensor], Tensor]) -> Moves:
+    """What moves do, of the views of all cameras.
+
+    Args:
+        found: the fit.
+        bend: the mean slope of a robust loss's score `(C,)`, 1 without a loss.
+        count: how many moves there are.
+        moved: how they move the corners of a group's views on the image `(n, count, 2, N)`, from its panel.
+    """
+    M, C, s = found.problem.moments, len(found.views.names), found.parameters.size
     new = found.shared.new_zeros
-    moves = Moves(new(M, C, n, s), new(M, C, n, POSE), new(M, C, n), new(M, C, n, n))
+    moves = Moves(new(M, C, count, s), new(M, C, count, POSE), new(M, C, count), new(M, C, count, count))
     for group in found.problem.groups:
         panel = found.problem.panel(group, found.shared, found.local)
         weight = group.used.to(panel)
@@ -198,7 +206,7 @@ def _moves(found: RigFit, bend: Tensor) -> Moves:
         if found.loss is not None:
             pull = weight * slope_and_bend(found.loss, panel[:, -1].square().sum(1))[0]
             weight = weight * bend[group.camera].unsqueeze(-1)
-        where, B = (group.moment, group.camera), _moved(group, panel, C)
+        where, B = (group.moment, group.camera), moved(group, panel)
         moves.shared[where], moves.local[where] = _derivatives(found, group, panel, B * weight[:, None, None])
         moves.pull[where] = torch.einsum("nbap,nap,np->nb", B, panel[:, -1], pull)
         moves.weight[where] = torch.einsum("nbap,ncap,np->nbc", B, B, weight)
@@ -219,7 +227,7 @@ def _moved(group: Group, panel: Tensor, cameras: int) -> Tensor:
 
 
 def _derivatives(found: RigFit, group: Group, panel: Tensor, B: Tensor) -> tuple[Tensor, Tensor]:
-    """The sums over the corners of each view `(n, 5, s)` and `(n, 5, 6)`, with weighted moves."""
+    """The sums over the corners of each view `(n, b, s)` and `(n, b, 6)`, with weighted moves."""
     problem, parameters, k = found.problem, found.parameters, group.size
     sums = torch.einsum("nkap,nbap->nbk", panel[:, :-1], B)
     by_pose = sums[..., k:] @ problem.composition(group, found.shared, found.local)  # the camera's, the moment's

@@ -152,7 +152,12 @@ def free_directions(parameters: RigParameters, positions: Sequence[int], like: T
 
 def owner_of(parameters: RigParameters, entry: str) -> tuple[str | None, str]:
     """The camera that a name is of, `None` for all, and what it names of it: `left.k3` is `k3` of `left`."""
-    owner = next((c for c in parameters.cameras if entry.startswith(f"{c}.")), None)
+    return owner_among(parameters.cameras, entry)
+
+
+def owner_among(cameras: Sequence[str], entry: str) -> tuple[str | None, str]:
+    """The same of cameras by their names, of which one may begin as another does: `left` and `left.wide`."""
+    owner = max((c for c in cameras if entry.startswith(f"{c}.")), key=len, default=None)
     return owner, entry if owner is None else entry[len(owner) + 1 :]
 
 

@@ -16,8 +16,12 @@ from diffproj.calibration.results.distinct import ALIKE_PX
 from diffproj.calibration.results.remark import Kind, text_of
 from diffproj.calibration.rigs.alone import Alone
 from diffproj.calibration.rigs.common_errors import CLEAR, CommonErrors, common_errors
+from diffproj.calibration.rigs.connection import set_apart, single_moments
 from diffproj.calibration.rigs.discounted import discounted
 from diffproj.calibration.rigs.fit import RigFit
+from diffproj.calibration.rigs.held_contradiction import contradicted_held
+from diffproj.calibration.rigs.moment_contradiction import contradicting_moment
+from diffproj.calibration.rigs.parameters import POSE_NAMES
 from diffproj.calibration.rigs.prior_contradiction import contradicted_priors
 from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.calibration.rigs.uncertainty import (
@@ -203,9 +207,17 @@ def _verdict(found: RigFit, noise: CameraNoise, alone: Mapping[str, Alone]) -> t
         unknown[own.start : own.start + 4] |= ~(deviation[own.start : own.start + 4] <= MAX_RELATIVE_STD * f)
     if bool(unknown.any()):
         lacking = [name for name, lost in zip(found.parameters.names, unknown.tolist(), strict=False) if lost]
+        listed = f"{', '.join(lacking[:6])}{', ...' * (len(lacking) > 6)}"
+        placeless = any(name.rpartition(".")[2] in POSE_NAMES for name in lacking)
+        if placeless and (apart := set_apart(found)):
+            return Status.DEGENERATE, (
+                f"views contradict the other cameras at their moments ({apart}), and those that are left do not "
+                f"determine {listed}: do the moments fit together (moments=), did the cameras stand still, and are the "
+                "corners numbered from the same end?"
+            )
         return Status.DEGENERATE, (
-            f"the views do not determine {', '.join(lacking[:6])}{', ...' * (len(lacking) > 6)}: add moments that "
-            "these cameras share with others, and views with the target tilted by 20 to 50 degrees about both axes"
+            f"the views do not determine {listed}: add moments that these cameras share with others, and views with "
+            "the target tilted by 20 to 50 degrees about both axes"
         )
     return status, ""
 
@@ -227,24 +239,31 @@ def _remarks(
     for name in found.restrained:
         said.append(f"k4, k5 and k6 of {name} are held as on its own, for without that its lens folds inside the image")
     said += _same_views(found)
+    beforehand = []
     if found.problem.known is not None:  # else the covariance is not asked for here
-        said += contradicted_priors(found, noise, float(joint().dispersion))
+        beforehand += contradicted_priors(found, noise, float(joint().dispersion))
+    if (held := contradicted_held(found, noise)) is not None:
+        beforehand += filter(None, [held.remark(found, float(joint().dispersion))])
+    said += beforehand
     said += _unlike(found, noise)
     if joint.common is not None and joint.common.beyond > CLEAR:
         places = [i for one in found.parameters.poses[1:] for i in one]
         said += filter(None, [joint.common.remark(names, places, joint().shared)])
+    # What is wrongly known beforehand makes moments contradict each other.
+    if not beforehand and (other := contradicting_moment(found, noise)) is not None:
+        said += filter(None, [other.remark(found, joint().shared)])
     found.problem.forget()  # what common errors are found from
     residuals = found.by_camera
     for name in names:
         used = found.used[name]
         squares, count = residuals[name].square().sum((-2, -1)), used.sum(-1)
         flat = found.restraint is None and not found.parameters.bow
-        # On its own it had a flat target; what that says of the tags' distance holds for a free one.
-        own = views.data[name].views
-        said += [f"{name}: {sentence}" for sentence, _ in against_one_camera(own.names, own.told)]
-        told = text_of(
-            one for one in alone[name].findings() if one.kind != Kind.TOLD_APART and (flat or one.kind == Kind.SPACING)
-        )
+        # On its own it had a flat target; what that says of the tags' distance holds for a free one. And priors weighed
+        # against corners of 1 px there, which in the rig do so against the noise that these have.
+        views_seen = views.data[name].views
+        said += [f"{name}: {sentence}" for sentence, _ in against_one_camera(views_seen.names, views_seen.told)]
+        own = (one for one in alone[name].findings() if one.kind not in (Kind.PRIOR_WEIGHT, Kind.TOLD_APART))
+        told = text_of(one for one in own if flat or one.kind == Kind.SPACING)
         if told:
             said.append(f"{name}, on its own: {told}")
         rms = float((squares.sum() / count.sum().clamp(min=1)).sqrt())
@@ -265,11 +284,7 @@ def _remarks(
                 f"{name} fits badly at {', '.join(moments)} ({float(each.max()):.2f} px): leave that out, or give "
                 "reject_outliers=True"
             )
-    seen = {name: set(views.where[name][found.used[name].any(-1)].tolist()) for name in names}
-    for name in names:
-        common = seen[name] & set().union(*(seen[other] for other in names if other != name))
-        if len(common) == 1:
-            said.append(f"one moment alone connects {name} with the other cameras: nothing checks its place")
+    said += single_moments(found)
     return tuple(said)
 
 

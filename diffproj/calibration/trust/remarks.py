@@ -98,7 +98,7 @@ def remarks(
         said[p].append(Remark(_not_told(other)))
     for p, elsewhere in weighed_anew(found).items():
         if bool(converged[p]):
-            said[p].append(Remark(_weighed_anew(elsewhere)))
+            said[p].append(Remark(_weighed_anew(elsewhere), Kind.PRIOR_WEIGHT))
     for p in (converged & _unsure_focal(found)).nonzero().flatten().tolist():
         said[p].append(Remark(_unsure(found, p)))
     for p in (converged & _contradicts_noise(found)).nonzero().flatten().tolist():

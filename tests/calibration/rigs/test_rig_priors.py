@@ -218,3 +218,24 @@ def test_errors_are_what_the_covariance_says(weights: float | None) -> None:
 def test_what_cannot_be_is_refused(pair: Scene, priors: dict[str, Any], options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         dp.calibrate_rig(pair.views, pair.board, priors=priors, **options)
+
+
+def test_a_camera_whose_name_begins_as_anothers_has_its_own_priors_and_fixed_parameters(pair: Scene) -> None:
+    """As `front` and `front.wide`: a dot in a name is no end of it."""
+    names = dict(zip(pair.views, ("front", "front.wide"), strict=True))
+    views = {names[name]: one for name, one in pair.views.items()}
+    cameras = {names[name]: one for name, one in pair.cameras.items()}
+    mean = float(pair.cameras["cam1"].center.norm()) + 1.0
+    rig = dp.calibrate_rig(views, pair.board, priors={"front.wide.baseline": (mean, 1e-3)})
+    assert rig.baseline("front", "front.wide").length == pytest.approx(mean, abs=0.01)
+    held = dp.calibrate_rig(views, pair.board, cameras=cameras, fixed=("front.wide.k3",))
+    parts = [held.cameras[name].distortion.coefficients for name in cameras]  # type: ignore[union-attr]
+    true = [one.distortion.coefficients for one in cameras.values()]  # type: ignore[union-attr]
+    assert [float(one[4]) == float(other[4]) for one, other in zip(parts, true, strict=True)] == [False, True]
+
+
+def test_how_a_prior_weighs_against_a_camera_alone_is_not_said_of_the_rig() -> None:
+    """There it weighs against the noise that the corners have, as it should; and there is no `pixel_sigma`."""
+    true = scene(3, 16, missing=0.2, seed=5)
+    rig = dp.calibrate_rig(true.views, true.board, priors={"focal": (1000.0, 20.0)})
+    assert not any("weigh against" in remark or "pixel_sigma" in remark for remark in rig.remarks)
