@@ -11,7 +11,7 @@ from torch import Tensor
 
 from diffproj._core import arguments
 from diffproj._core.copying import Copied
-from diffproj._core.shown import Shown, counted, rounded
+from diffproj._core.shown import Shown, counted, decimals, rounded
 from diffproj.calibration.results.covariance import zero_where_infinite
 from diffproj.calibration.results.region import in_region
 from diffproj.geometry.back_projection import Reason, explain
@@ -242,9 +242,10 @@ class Measurement(Copied, Shown):
             raise ValueError(f"summary: want one camera, got batch shape {tuple(self.points.shape[:-2])}; see to_dict")
         valid, bent = self.valid.tolist(), self.nonlinear.tolist()
         beyond = [False] * len(valid) if self.extrapolated is None else self.extrapolated.tolist()
-        lines = []
-        for n, (point, deviation) in enumerate(zip(self.points.tolist(), self.deviations.tolist(), strict=True)):
-            texts = (f"{x:10.3f} ± {s:.3f}" for x, s in zip(point, deviation, strict=True))
+        spread, lines = self.deviations.tolist(), []
+        digits = decimals(map(max, spread), 3)  # what no error moves, as a height on the ground, is known to rounding
+        for n, (point, deviation) in enumerate(zip(self.points.tolist(), spread, strict=True)):
+            texts = (f"{x:z10.{digits}f} ± {s:.{digits}f}" for x, s in zip(point, deviation, strict=True))
             notes = "  nonlinear" * bent[n] + "  extrapolated" * beyond[n]
             lines.append(f"point {n:<3} {'  '.join(texts) + notes if valid[n] else f'not {self._lie}'}")
         if len(lines) > 1:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from diffproj._core.shown import counted, number
+from diffproj._core.shown import counted, decimals, number
 from diffproj.calibration.evidence.observation import Observation
 from diffproj.calibration.evidence.pose_parameters import MOUNTING
 from diffproj.calibration.evidence.problem import jacobian
@@ -205,8 +205,9 @@ class Adjustment(Calibration):
             spread = spread if spread > NOTHING * max(1.0, abs(value)) + (name in MOUNTING) * rounding else 0.0
             if name in MOUNTING or spread:
                 kind = " degrees" if name in MOUNTING[:3] else unit if name in MOUNTING else ""
-                known = " (not known)" if spread == torch.inf else f" ± {spread:.4f}" if spread else " (fixed)"
-                lines.append(f"{name:<16}{value:z12.4f}{known}{kind}")
+                digits = decimals([spread], 4)
+                known = " (not known)" if spread == torch.inf else f" ± {spread:.{digits}f}" if spread else " (fixed)"
+                lines.append(f"{name:<16}{value:z12.{digits}f}{known}{kind}")
         if 90 - abs(values["tilt"]) < VERTICAL * spreads["tilt"] < torch.inf:
             lines.append(VERTICAL_WORDS)
         for one, part in zip(self.observations, self.parts, strict=True):

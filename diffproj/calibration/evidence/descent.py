@@ -22,6 +22,8 @@ from diffproj.geometry.mounting import mounting_from_rotation
 
 NEGLIGIBLE = 1e-18
 """Cost, in squared deviations, that counts as zero: of evidence without noise."""
+FAR_OFF = 1e3
+"""Distance from the origin, in that of what was seen, from which on places round enough to be felt."""
 TOLERANCE, ROUNDING = 1e-13, 1e-12
 """Part of the cost that another step may still bring, and that rounding may."""
 ROBUST_STEPS, NEWTON = 40, 20
@@ -258,10 +260,21 @@ def descended(task: Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[in
         basis=basis,
         max_iterations=steps if loss is None else min(steps, ROBUST_STEPS),
         tolerance=TOLERANCE,
-        negligible=NEGLIGIBLE,
+        negligible=_negligible(evidence, begin, reach(task, begin)),
     )
     ended = Found(parameters, basis, prior, found.shared, found.status, found.iterations, found.cost)
     return ended if loss is None or steps <= FEW else _polished(task, ended, more)
+
+
+def _negligible(evidence: Evidence, values: Tensor, distance: Tensor) -> Tensor:
+    """The cost `(P,)` that counts as zero: far from the origin, that of the rounding of places."""
+    place = values[:, -3:].abs()
+    least = torch.full_like(distance, NEGLIGIBLE)
+    if not bool((place.amax(-1) > FAR_OFF * distance).any()):
+        return least
+    slopes = evidence.along(values)[1][[at >= values.shape[-1] - 3 for at in evidence.columns]]
+    off = torch.finfo(values.dtype).eps * place.amax(-1) * slopes.square().sum((0, 2, 3)).sqrt()
+    return least.maximum(off.square().nan_to_num(0.0, 0.0))
 
 
 def _restrained(task: Task, begin: Tensor, prior: Prior) -> Prior:
