@@ -168,8 +168,8 @@ class Adjustment(Calibration):
         return (
             f"another pose explains the evidence nearly as well, {float(1 / other.ratio):.2g} times as likely: height "
             f"{float(other.height):.4g}{unit}, tilt {float(other.tilt):.1f}, roll {float(other.roll):.1f}, heading "
-            f"{float(other.heading):.1f} degrees; a prior on one of these, or landmarks off the plane of the others, "
-            "tell them apart"
+            f"{float(other.heading):.1f} degrees; a prior on one of these, or more evidence, as of landmarks off the "
+            "plane of the others, tells them apart"
         )
 
     @property

@@ -1,6 +1,5 @@
 """From the camera that `adjust` is given to the minimum: which start, the solver, and derivatives of where it ended."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -11,14 +10,11 @@ from torch import Tensor
 from diffproj.calibration.evidence.knowledge import Knowledge
 from diffproj.calibration.evidence.observation import Observation
 from diffproj.calibration.evidence.observations import Seen
-from diffproj.calibration.evidence.pose_parameters import ANGLES, PLACE, PoseParameters
+from diffproj.calibration.evidence.pose_parameters import PoseParameters
 from diffproj.calibration.evidence.problem import Evidence, Losses
-from diffproj.calibration.evidence.search import starts
 from diffproj.calibration.evidence.undetermined import natural
 from diffproj.calibration.least_squares.solver import Prior, Status, solve
-from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.geometry.camera import Camera
-from diffproj.geometry.mounting import mounting_from_rotation
 
 NEGLIGIBLE = 1e-18
 """Cost, in squared deviations, that counts as zero: of evidence without noise."""
@@ -28,24 +24,10 @@ TOLERANCE, ROUNDING = 1e-13, 1e-12
 """Part of the cost that another step may still bring, and that rounding may."""
 ROBUST_STEPS, NEWTON = 40, 20
 """Steps of reweighting, which shrink slowly under a robust loss, before at most so many of Newton's."""
-UNDETERMINED_STEPS = 30
-"""Steps where there are fewer residuals than unknowns: many places explain them, and the solver would go on long."""
-POOR = 9.0
-"""Cost per spare residual from which on other starts are tried."""
-SURELY = 3.0
-"""Cost by which the other pose must be lower to be taken in the place of that which the camera's own led to: it is 20
-times as likely then."""
-RIVAL, RIVAL_STEPS = 50.0, 4
-"""Cost by which the other pose may lie higher after so many steps to be followed to its minimum."""
-ANOTHER = 2.0
-"""Turn in degrees from which on a pose is another one."""
+FEW = 8
+"""Steps of a first look, before the best of several starts is followed to its minimum."""
 RESTRAINT = 1e-8
 """Weight of the start on each parameter in its natural unit: so small that it decides only what nothing else does."""
-HAIR = 1e-4
-"""Cost of half a turn away from the camera's own direction, over 4."""
-TRIED, FEW = 8, 8
-"""How many of them are followed, for how many steps before the best is followed to its minimum."""
-_STATE = ("values", "status", "iterations", "cost")
 
 
 @dataclass(frozen=True)
@@ -115,126 +97,6 @@ class Found:
     iterations: Tensor
     cost: Tensor
     rival: Rival | None = None
-
-
-def best(task: Task, steps: int) -> Found:
-    """The minimum from the camera's own pose; where it explains little, the best from other poses too.
-
-    Where the evidence tells the whole pose, that from its mirror image comes with it, or in its place if it is much
-    lower.
-    """
-    found = _nearest(task, steps)
-    if sum(len(piece) for piece in task.pieces if isinstance(piece, Seen)) < 3 or steps == 0:
-        return found
-    return _with_rival(task, found, steps)
-
-
-def _nearest(task: Task, steps: int) -> Found:
-    """The minimum from the camera's own pose; where it explains little, the best from other poses too."""
-    own, R = task.own(), task.camera.R.reshape(-1, 3, 3)
-    prior = task.known.prior(own, task.batch)
-    begin = task.known.begin(own, prior)
-    basis, none = task.known.basis(begin), torch.zeros(len(begin), dtype=torch.long, device=begin.device)
-    few = spare(task, Found(task.known.parameters(R), basis, prior, begin, none, none, begin[:, 0])) < 0
-    steps = min(steps, UNDETERMINED_STEPS) if bool(few.all()) else steps
-    found = descended(task, R, begin, prior, (), steps)
-    if not task.pieces or steps == 0:
-        return found
-    left = spare(task, found)
-    # Where there are fewer residuals than unknowns, another start tells no more.
-    poor = (found.status == Status.DIVERGED) | (~(2 * found.cost <= POOR * left.clamp(min=1)) & (left >= 0))
-    if not bool(poor.any()):
-        return found
-    camera = task.known.parameters(R).unpack(begin, (len(begin),), task.camera.size)
-    rotations, values = starts(task.pieces, task.known, camera, begin, task.batch)
-    K, P = values.shape[:2]
-    flat = rotations.flatten(0, 1)
-    blocks = task.evidence(task.known.parameters(flat), (K,), ()).residuals(values.flatten(0, 1))
-    cost = blocks.square().sum(-1).log1p().sum(-1).reshape(K, P).nan_to_num(torch.inf, torch.inf)  # mild on outliers
-    first = task.known.parameters(R).rotation(begin)
-    rows = (cost + _away(rotations, first)).topk(min(TRIED, K), dim=0, largest=False).indices
-    k, each = len(rows), torch.arange(P, device=rows.device)
-    many = Prior(*(part.expand(k, *part.shape).flatten(0, 1) for part in prior[:2]))
-    near = descended(task, rotations[rows, each].flatten(0, 1), values[rows, each].flatten(0, 1), many, (k,), FEW)
-    away = _away(near.parameters.rotation(near.values), first.repeat(k, 1, 1))
-    chosen = (near.cost + away).nan_to_num(torch.inf).reshape(k, P).argmin(0) * P + each
-    R = R if near.parameters.start is None else near.parameters.start[chosen]
-    other = descended(task, R, near.values[chosen], prior, (), steps)
-    return _exchanged(found, other, poor & (_ended(other) < _ended(found)))
-
-
-def _ended(found: Found) -> Tensor:
-    """The cost `(P,)`, infinite where the solver came to no end."""
-    return torch.where(found.status == Status.CONVERGED, found.cost, torch.inf).nan_to_num(torch.inf)
-
-
-def _exchanged(found: Found, other: Found, where: Tensor) -> Found:
-    """The minima with others in the place of some `(P,)`."""
-    start = None
-    if found.parameters.start is not None and other.parameters.start is not None:
-        start = torch.where(where[:, None, None], other.parameters.start, found.parameters.start)
-    parts = {
-        name: torch.where(where.reshape(-1, *(1,) * (old.ndim - 1)), getattr(other, name), old)
-        for name, old in ((name, getattr(found, name)) for name in _STATE)
-    }
-    return replace(found, parameters=replace(found.parameters, start=start), **parts)
-
-
-def _with_rival(task: Task, found: Found, steps: int) -> Found:
-    """The minimum, or that at the mirrored pose if it is much lower; and the other of the two as its rival.
-
-    Seen from afar, points on a plane look alike from both sides of the line of sight.
-    """
-    told = (spare(task, found) >= 0) & (found.status == Status.CONVERGED)
-    nothing = torch.full_like(found.cost, torch.inf)
-    R, place = found.parameters.rotation(found.values), found.values[:, -3:]
-    none = Rival(nothing, R, place)
-    if not bool(told.any()):
-        return replace(found, rival=none)
-    begin, turn = _mirrored(task, found)
-    near = descended(task, turn, begin, found.prior, (), min(steps, RIVAL_STEPS))
-    told &= near.cost < found.cost + RIVAL  # of each by itself, whatever others of the batch there are
-    if not bool(told.any()):
-        return replace(found, rival=none)
-    turn = turn if near.parameters.start is None else near.parameters.start
-    other = descended(task, turn, near.values, found.prior, (), steps)
-    there, away = other.parameters.rotation(other.values), other.values[:, -3:]
-    # The trace of a rotation by an angle a is 1 + 2 cos a.
-    apart = (there * R).sum((-2, -1)) < 1 + 2 * math.cos(math.radians(ANOTHER))
-    cost = torch.where(told & apart, _ended(other), torch.inf)
-    better = cost < found.cost - SURELY
-    above = torch.where(better, found.cost - cost, cost - found.cost).nan_to_num(torch.inf, torch.inf)
-    rival = Rival(above, torch.where(better[:, None, None], R, there), torch.where(better[:, None], place, away))
-    return replace(_exchanged(found, other, better), rival=rival)
-
-
-def _mirrored(task: Task, found: Found) -> tuple[Tensor, Tensor]:
-    """Values `(P, q)` and rotations `(P, 3, 3)` of the pose that mirrors the plane of the points at the line of sight.
-
-    With n the normal of the plane, m the middle of the points and s the direction to it, `R' = (I - 2 s s^T) R
-    (I - 2 n n^T)`: what lies across s stays.
-    """
-    R, place = found.parameters.rotation(found.values), found.values[:, -3:]
-    points = torch.cat([piece.points.detach().to(R) for piece in task.pieces if isinstance(piece, Seen)])
-    middle = points.mean(0)
-    normal = torch.linalg.svd(points - middle, full_matrices=False).Vh[-1]
-    toward = (R @ (middle - place).unsqueeze(-1)).squeeze(-1)
-    sight = toward / toward.norm(dim=-1, keepdim=True).clamp(min=1e-300)
-    across = R - 2 * sight.unsqueeze(-1) * (sight.unsqueeze(-2) @ R)
-    turn = across - 2 * (across @ normal).unsqueeze(-1) * normal
-    mirrored_place = middle - (turn.mT @ toward.unsqueeze(-1)).squeeze(-1)
-    moving = torch.tensor([task.known.moves(name) for name in PLACE], device=R.device)
-    angles = torch.zeros_like(place)
-    if task.known.angles:
-        given = torch.tensor([task.known.given(name) for name in ANGLES], device=R.device)
-        angles = torch.where(given, found.values[:, -POSE:-3], torch.stack(mounting_from_rotation(turn), dim=-1))
-    values = [found.values[:, :-POSE], angles, torch.where(moving, mirrored_place, place)]
-    return torch.cat(values, dim=-1), turn
-
-
-def _away(R: Tensor, first: Tensor) -> Tensor:
-    """A hair of cost for turns from the camera's own direction: of poses that explain as much, the nearer one."""
-    return HAIR * (3 - (R * first).sum((-2, -1)))
 
 
 def descended(task: Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[int, ...], steps: int) -> Found:
