@@ -53,7 +53,7 @@ def best(task: Task, steps: int) -> Found:
     if steps == 0 or not task.pieces:
         return found
     if landmarks < ENOUGH and bool(((left := spare(task, found)) >= 0).logical_and(left < SPARSE).any()):
-        return _with_other(task, found, steps)
+        return _with_other(task, found, steps, anywhere=landmarks >= 3)
     return found if landmarks < 3 else _with_rival(task, found, steps)
 
 
@@ -137,18 +137,24 @@ def _with_rival(task: Task, found: Found, steps: int) -> Found:
     return _rivalled(found, other, told)
 
 
-def _with_other(task: Task, found: Found, steps: int) -> Found:
+def _with_other(task: Task, found: Found, steps: int, *, anywhere: bool) -> Found:
     """The same with the lowest other minimum that starts all around lead to.
 
-    As many residuals as unknowns are explained by several poses, and a few more hardly tell them apart.
+    As many residuals as unknowns are explained by several poses, and a few more hardly tell them apart. Unless
+    `anywhere`, one that is turned by more than a right angle does not count: lines and heights look alike from behind,
+    and which side it is the camera's own pose says.
     """
-    P = len(found.values)
-    told = (spare(task, found) >= 0) & (found.status == Status.CONVERGED)
+    P, left = len(found.values), spare(task, found)
+    told = (left >= 0) & (left < SPARSE) & (found.status == Status.CONVERGED)
     near, _ = _elsewhere(task, found, SPARSE_TRIED)
     k = len(near.values) // P
     turn = near.parameters.rotation(near.values) if near.parameters.start is None else near.parameters.start
     ends = descended(task, turn, near.values, near.prior, (k,), min(steps, SPARSE_STEPS))
-    cost = torch.where(_apart(found, ends), _ended(ends), torch.inf).reshape(k, P)
+    apart = _apart(found, ends)
+    if not anywhere:
+        R = found.parameters.rotation(found.values).repeat(k, 1, 1)
+        apart &= (ends.parameters.rotation(ends.values) * R).sum((-2, -1)) > 1
+    cost = torch.where(apart, _ended(ends), torch.inf).reshape(k, P)
     chosen = cost.argmin(0) * P + torch.arange(P, device=cost.device)
     start = None if ends.parameters.start is None else ends.parameters.start[chosen]
     state = {name: getattr(ends, name)[chosen] for name in _STATE}

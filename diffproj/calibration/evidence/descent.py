@@ -24,6 +24,8 @@ TOLERANCE, ROUNDING = 1e-13, 1e-12
 """Part of the cost that another step may still bring, and that rounding may."""
 ROBUST_STEPS, NEWTON = 40, 20
 """Steps of reweighting, which shrink slowly under a robust loss, before at most so many of Newton's."""
+PROFILE_STEPS = 20
+"""Steps to the least cost with one direction held."""
 FEW = 8
 """Steps of a first look, before the best of several starts is followed to its minimum."""
 RESTRAINT = 1e-8
@@ -107,11 +109,7 @@ def descended(task: Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[in
     parameters = task.known.parameters(R)
     evidence = task.evidence(parameters, more)
     basis = task.known.basis(begin)
-    losses = [getattr(piece, "loss", None) for piece in task.pieces]
-    loss = None
-    if any(one is not None for one in losses):
-        counts = [block.shape[1] for block in evidence.blocks(begin)]
-        loss = Losses(tuple(zip(counts, losses, strict=True)))
+    loss = _losses(task, evidence, begin)
     found = solve(
         evidence,
         begin,
@@ -126,6 +124,37 @@ def descended(task: Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[in
     )
     ended = Found(parameters, basis, prior, found.shared, found.status, found.iterations, found.cost)
     return ended if loss is None or steps <= FEW else _polished(task, ended, more)
+
+
+def profile(task: Task, found: Found, starts: Tensor, basis: Tensor) -> Tensor:
+    """The least cost `(K, P)` from K starts each `(K, P, q)` where only what a basis `(P, q, r)` spans moves."""
+    K, P = starts.shape[:2]
+    R = found.parameters.start
+    parameters = found.parameters if R is None else replace(found.parameters, start=R.repeat(K, 1, 1))
+    evidence = task.evidence(parameters, (K,))
+    prior = Prior(*(part.repeat(K, *(1,) * (part.ndim - 1)) for part in found.prior[:2]))
+    ended = solve(
+        evidence,
+        starts.flatten(0, 1),
+        (),
+        local_size=0,
+        loss=_losses(task, evidence, starts.flatten(0, 1)),
+        prior=prior,
+        basis=basis.repeat(K, 1, 1),
+        max_iterations=PROFILE_STEPS,
+        negligible=1e-3,
+        tolerance=1e-3,
+    )
+    return torch.where(ended.cost.isfinite(), ended.cost, torch.inf).reshape(K, P)
+
+
+def _losses(task: Task, evidence: Evidence, values: Tensor) -> Losses | None:
+    """The robust losses of all pieces as one; `None` where none has one."""
+    losses = [getattr(piece, "loss", None) for piece in task.pieces]
+    if all(one is None for one in losses):
+        return None
+    counts = [block.shape[1] for block in evidence.blocks(values)]
+    return Losses(tuple(zip(counts, losses, strict=True)))
 
 
 def _negligible(evidence: Evidence, values: Tensor, distance: Tensor) -> Tensor:
