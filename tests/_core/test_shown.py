@@ -151,6 +151,14 @@ def test_no_error_bar_is_shown_as_none() -> None:
     far = dp.Camera.mounted(0.006, 20.0, focal=1200.0, size=(1280, 960))
     known = dp.adjust(far, priors={"height": 2e-5, "tilt": 0.5}, fixed=("roll", "heading", "position"))
     assert "height               0.00600 ± 0.00002" in known.summary()
+    high = dp.Camera.mounted(6e6, 20.0, focal=1200.0, size=(1280, 960))  # in millimetres, known to 20 m and 2 mdeg
+    aerial = dp.adjust(high, priors={"height": 2e4, "tilt": 0.002}, fixed=("roll", "heading", "position")).summary()
+    assert "tilt                 20.0000 ± 0.0020 degrees" in aerial
+    assert "roll                  0.0000 (fixed) degrees" in aerial
+    level = dp.Camera.mounted(1e-9, 5.0, focal=1200.0, size=(1280, 960))  # at the height of the origin, before a facade
+    facade = torch.tensor([[-3.0, 20, 1], [3, 20, 2], [0, 20, -2], [4, 20, -1], [-4, 20, 3]], dtype=D)
+    beside = dp.adjust(level, dp.Seen(facade, level.project(facade)[0])).summary()
+    assert beside.count("±") == 6
 
 
 def test_what_is_not_known_keeps_its_place() -> None:
