@@ -16,6 +16,8 @@ from diffproj._core.numerics import has_values
 
 ROWS = 20
 """Rows of a table that are shown."""
+LARGE, HUGE = 1e4, 1e12
+"""Between which six digits are too few for coordinates on a map, and three behind the point not more than there are."""
 
 
 class Shown:
@@ -64,8 +66,21 @@ def _cell(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return "" if math.isnan(value) else f"{value:.6g}"
+        return "" if math.isnan(value) else plain(value)
     return str(value)
+
+
+def plain(value: float) -> str:
+    """A number of which nothing else is known: to six digits, but to thousandths where it is large, as on a map."""
+    if LARGE <= abs(value) < math.inf:
+        return f"{value:.3f}".rstrip("0").rstrip(".") if abs(value) < HUGE else f"{value:.12g}"
+    return f"{value:z.6g}"
+
+
+def decimals(deviations: Iterable[float], least: int) -> int:
+    """So many that the least of these deviations does not show as 0."""
+    known = [deviation for deviation in deviations if 0 < deviation < math.inf]
+    return max(least, -math.floor(math.log10(min(known)))) if known else least
 
 
 def number(values: Tensor, form: str = ".1f") -> str:
@@ -91,5 +106,5 @@ def rounded(value: float, deviation: float) -> tuple[str, str]:
     """A value and its standard deviation, both to the second digit of the latter or its whole ones; 0 is not told."""
     if not (0 < deviation < math.inf):
         return _cell(value), "" if deviation == 0 else _cell(deviation)
-    decimals = max(0, 1 - math.floor(math.log10(deviation)))
-    return f"{value:.{decimals}f}", f"{deviation:.{decimals}f}"
+    digits = max(0, 1 - math.floor(math.log10(deviation)))
+    return f"{value:z.{digits}f}", f"{deviation:.{digits}f}"

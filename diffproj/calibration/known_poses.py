@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.evidence.adjusted_covariance import pose_errors
-from diffproj.calibration.evidence.descent import Found, Task, best, descended, spare
+from diffproj.calibration.evidence.best import best
+from diffproj.calibration.evidence.descent import Found, Task, descended, spare
 from diffproj.calibration.evidence.knowledge import Knowledge, knowledge, prior_shapes
 from diffproj.calibration.evidence.observations import Seen
 from diffproj.calibration.evidence.pose_parameters import TURNS

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from diffproj._core.shown import plain
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.cli.converting import name_in, named
 from diffproj.cli.terminal import alert, as_json, in_words, result
@@ -141,7 +142,7 @@ def _say_camera(name: str, camera: dict[str, Any]) -> None:
     numbers = " ".join(f"{key} {x:.5g}" for key, x in camera["coefficients"].items())
     result(f"  lens             {camera['lens']}: {numbers}" if numbers else "  lens             none in the file")
     if camera["centre"] is not None:
-        result(f"  centre           {', '.join(f'{x:.6g}' for x in camera['centre'])} in the world")
+        result(f"  centre           {', '.join(plain(x) for x in camera['centre'])} in the world")
     if camera["size"] is None:
         return
     angles = camera["field_of_view"]

@@ -8,6 +8,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from diffproj._core.shown import plain
 from diffproj.calibration.evidence.adjustment import mounting_covariance
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.cli.landmarks_file import Surveyed
@@ -152,7 +153,7 @@ def _camera_table(told: dict[str, Any]) -> Table:
 
 
 def _shown(value: float, deviation: float | None) -> tuple[str, str]:
-    return (f"{value:.6g}", "fixed") if deviation == 0 else rounded(value, math.inf if deviation is None else deviation)
+    return (plain(value), "fixed") if deviation == 0 else rounded(value, math.inf if deviation is None else deviation)
 
 
 def _title(name: str) -> str:

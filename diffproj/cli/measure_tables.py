@@ -5,6 +5,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from diffproj._core.shown import plain
 from diffproj.cli.scene import Scene
 from diffproj.cli.terminal import RESULTS, aligned, result, rounded
 from diffproj.cli.units import heading
@@ -94,9 +95,9 @@ def coordinate(world: list[float], deviations: list[float | None], axis: int) ->
     value, deviation = world[axis], deviations[axis]
     scale = max(map(abs, world))
     if deviation is None:
-        return f"{value:.6g}", " ± unknown"
+        return plain(value), " ± unknown"
     if deviation <= EXACT * max(scale, 1e-300):
-        return ("0" if abs(value) <= EXACT * scale else f"{value:.6g}"), ""
+        return ("0" if abs(value) <= EXACT * scale else plain(value)), ""
     text, spread = rounded(value, deviation)
     return text, f" ± {spread}"
 
@@ -119,8 +120,8 @@ def shown(quantity: dict[str, Any]) -> tuple[str, str, str]:
     if value is None:
         return "none", "", ""
     if deviation is None or interval is None:
-        return f"{value:.6g}", "unknown", "unknown"
+        return plain(value), "unknown", "unknown"
     if deviation == 0:
-        return f"{value:.6g}", "0", ""
+        return plain(value), "0", ""
     low, high = ("" if bound is None else rounded(bound, deviation)[0] for bound in interval)
     return (*rounded(value, deviation), f"{low} to {high}" if high else f"from {low}")

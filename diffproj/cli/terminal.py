@@ -211,7 +211,7 @@ def working(title: str) -> Iterator[None]:
 def rounded(value: float, deviation: float) -> tuple[str, str]:
     """A value and its standard deviation, both to the second digit of the standard deviation."""
     if not (math.isfinite(deviation) and deviation > 0):
-        return f"{value:.6g}", "unknown"
+        return shown.plain(value), "unknown"
     if deviation >= HUGE:
         return f"{value:.2e}", f"{deviation:.1e}"
     return shown.rounded(value, deviation)

@@ -23,6 +23,8 @@ much less it has to turn for that to end: its error counts in square."""
 
 Function = Callable[[Tensor], Tensor]
 """Of M sets of points `(*B, M, k, 3)` to M numbers."""
+Interval = Callable[..., tuple[Tensor, Tensor]]
+"""As `curved_interval`."""
 
 
 @torch.no_grad()
@@ -44,7 +46,7 @@ def curved_interval(
         return torch.func.vmap(function)(points.flatten(0, -3)).reshape(points.shape[:-2])
 
     slopes = spread.rows().squeeze(-2)
-    low, high = (_extreme(spread, every, value, slopes, side, reach)[0] for side in (-1, 1))
+    low, high = (extreme(spread, every, value, slopes, side, reach)[0] for side in (-1, 1))
     return torch.where(lost, -torch.inf, low - reach * kink), torch.where(lost, torch.inf, high + reach * kink)
 
 
@@ -88,8 +90,8 @@ def norm_interval(
         return along_u * torch.where(turned, beyond, 1.0)
 
     slopes = (u.unsqueeze(-1) * spread.rows()).sum(-2)
-    smallest, down = _extreme(spread, signed, r, slopes, -1, reach)
-    greatest, _ = _extreme(spread, signed, r, slopes, 1, reach)
+    smallest, down = extreme(spread, signed, r, slopes, -1, reach)
+    greatest, _ = extreme(spread, signed, r, slopes, 1, reach)
     to_zero = _steps_to_zero(spread, signed, r, down, reach / z)
     inner = folded.lower_bound(to_zero, torch.ones_like(r), across, cross, largest / unit.square(), level, z)
     fold = (to_zero < folded.FAR) & noisy
@@ -112,7 +114,7 @@ def angle_interval(arms: Sequence[Quantity], angle: Quantity, level: float, _rea
     return torch.where(unclear, 0.0, low), torch.where(unclear, torch.pi, high)
 
 
-def _extreme(
+def extreme(
     spread: Propagated, function: Function, value: Tensor, slopes: Tensor, side: int, reach: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The largest value (side 1) or the smallest (-1) within reach, and the direction in which it lies `(*B, M, E)`.

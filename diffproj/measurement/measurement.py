@@ -11,16 +11,17 @@ from torch import Tensor
 
 from diffproj._core import arguments
 from diffproj._core.copying import Copied
-from diffproj._core.shown import Shown, counted, rounded
+from diffproj._core.shown import Shown, counted, decimals, rounded
 from diffproj.calibration.results.covariance import zero_where_infinite
 from diffproj.calibration.results.region import in_region
 from diffproj.geometry.back_projection import Reason, explain
 from diffproj.measurement.ellipses import Ellipses, plane_ellipses
 from diffproj.measurement.folded import longest_first, norm_variance
-from diffproj.measurement.intervals import angle_interval, curved_interval, norm_interval
+from diffproj.measurement.intervals import Function, Interval, angle_interval, curved_interval, norm_interval
+from diffproj.measurement.kinked import kinked_interval
 from diffproj.measurement.propagation import Noise, Propagated, kink_variance, without_unknown
 from diffproj.measurement.quantity import Bounds, Quantity, described
-from diffproj.measurement.shapes import area_vector, difference, length, turn, warn_of_crossings
+from diffproj.measurement.shapes import area_vector, coordinate, difference, length, turn, warn_of_crossings
 from diffproj.measurement.sight import Sight
 from diffproj.measurement.student import check_level
 
@@ -195,7 +196,7 @@ class Measurement(Copied, Shown):
         with torch.no_grad():
             first = spread.covariance.squeeze(-1).squeeze(-1)
             kink = kink_variance(function, spread.steps(), chosen, first)
-        return self._number(spread, function, value, kink)
+        return self._number(spread, function, value, kink, kinked_interval)
 
     def lengths(self, pairs: Sequence[Sequence[int]] | Tensor | None = None) -> Quantity:
         """Distances between points in world units: of successive points, or of `pairs (M, 2)`."""
@@ -241,9 +242,10 @@ class Measurement(Copied, Shown):
             raise ValueError(f"summary: want one camera, got batch shape {tuple(self.points.shape[:-2])}; see to_dict")
         valid, bent = self.valid.tolist(), self.nonlinear.tolist()
         beyond = [False] * len(valid) if self.extrapolated is None else self.extrapolated.tolist()
-        lines = []
-        for n, (point, deviation) in enumerate(zip(self.points.tolist(), self.deviations.tolist(), strict=True)):
-            texts = (f"{x:10.3f} ± {s:.3f}" for x, s in zip(point, deviation, strict=True))
+        spread, lines = self.deviations.tolist(), []
+        digits = decimals(map(max, spread), 3)  # what no error moves, as a height on the ground, is known to rounding
+        for n, (point, deviation) in enumerate(zip(self.points.tolist(), spread, strict=True)):
+            texts = (f"{x:z10.{digits}f} ± {s:.{digits}f}" for x, s in zip(point, deviation, strict=True))
             notes = "  nonlinear" * bent[n] + "  extrapolated" * beyond[n]
             lines.append(f"point {n:<3} {'  '.join(texts) + notes if valid[n] else f'not {self._lie}'}")
         if len(lines) > 1:
@@ -342,14 +344,14 @@ class Measurement(Copied, Shown):
         return self._quantity(index, value, norm_variance(r, along, across), lost, freedom, bounds)
 
     def _number(
-        self, spread: Propagated, function: Callable[[Tensor], Tensor], value: Tensor, kink: Tensor
+        self, spread: Propagated, function: Function, value: Tensor, kink: Tensor, interval: Interval
     ) -> Quantity:
         """A number with what its slopes make uncertain and, at a kink, what they do not tell."""
         variance = spread.covariance.squeeze(-1).squeeze(-1) + kink
         lacking = variance.detach().clamp(min=0).sqrt() - (variance.detach() - kink).clamp(min=0).sqrt()
         lost = self._noise.unknown(spread.common).squeeze(-1).squeeze(-1)
         freedom = spread.degrees_of_freedom(torch.ones_like(value).unsqueeze(-1))
-        bounds = partial(curved_interval, spread, function, value.detach(), lost, lacking)
+        bounds = partial(interval, spread, function, value.detach(), lost, lacking)
         return self._quantity(spread.index, value, variance, lost, freedom, bounds)
 
     def _quantity(
@@ -372,7 +374,9 @@ class Measurement(Copied, Shown):
             slope[..., axis] = 1.0
             spread = Propagated.of(self._noise, index, slope[..., None, None, :])
             value = self.points[..., axis]
-            found.append(self._number(spread, partial(_coordinate, axis), value, torch.zeros_like(value)))
+            found.append(
+                self._number(spread, partial(coordinate, axis), value, torch.zeros_like(value), curved_interval)
+            )
         return found
 
     def _numbers(self, name: str, which: Sequence[Sequence[int]] | Tensor, k: int | None = None) -> Tensor:
@@ -392,7 +396,3 @@ class Measurement(Copied, Shown):
             raise ValueError(f"points: want at least {k}, got {N}")
         first, following = (torch.arange(count, device=self.points.device) for count in (N - k + 1, k))
         return first.unsqueeze(-1) + following
-
-
-def _coordinate(axis: int, points: Tensor) -> Tensor:
-    return points[0, axis]

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffproj._core.copying import Copied
-from diffproj._core.shown import Shown, rounded
+from diffproj._core.shown import Shown, decimals, rounded
 from diffproj.measurement.student import check_level, normal_reach, student_reach
 
 SIGNIFICANT = 0.9973
@@ -49,7 +49,9 @@ class Quantity(Copied, Shown):
         They reach further where the deviation was estimated from few residuals (Student's t). They follow the curve
         from the pixels to the plane: near the horizon the upper bound of a length lies further off than the lower one,
         and is infinite where the noise reaches the horizon. No length or area has a negative bound, no angle one beyond
-        180 degrees; a length that noise may have made has the lower bound 0. Bounds carry no gradients.
+        180 degrees; a length that noise may have made has the lower bound 0. Those of a function of your own that has a
+        kink within the noise, as the longer of two lengths and the difference of two sides without its sign, hold all
+        that it may be there. Bounds carry no gradients.
 
         Raises:
             ValueError: the level is not between 0 and 1.
@@ -95,7 +97,7 @@ class Quantity(Copied, Shown):
 
     def _facts(self) -> list[str]:
         values = zip(self.value.detach().flatten().tolist(), self.deviation.detach().flatten().tolist(), strict=True)
-        texts = [" ± ".join(filter(None, rounded(*pair))) for pair in values]
+        texts = [" ± ".join(filter(None, rounded(*pair))) or "NaN" for pair in values]
         return [*texts[:FEW], f"{len(texts) - FEW} more" if len(texts) > FEW else ""]
 
     def _columns(self) -> dict[str, list[float]]:
@@ -114,12 +116,13 @@ def described(found: Quantity, lie: str) -> list[str]:
     `lie` is what the points of one that is NaN do not do both, as "on the plane".
     """
     columns = (found.value, found.deviation, *found.interval(), found.nonlinear, found.significant)
+    digits = decimals(found.deviation.flatten().tolist(), 3)
     lines = []
     for value, deviation, low, high, bent, significant in zip(*(column.tolist() for column in columns), strict=True):
         if math.isnan(value):
             lines.append(f"not both points are {lie}")
             continue
-        note = f"  nonlinear, 95 %: {low:.3f} to {high:.3f}" * bent
+        note = f"  nonlinear, 95 %: {low:.{digits}f} to {high:.{digits}f}" * bent
         note += "" if significant else "  less than three deviations from 0"
-        lines.append(f"{value:10.3f} ± {deviation:.3f}{note}")
+        lines.append(f"{value:10.{digits}f} ± {deviation:.{digits}f}{note}")
     return lines

@@ -16,6 +16,11 @@ SURE = 3.0
 """Deviations by which a corner must lie off a side."""
 
 
+def coordinate(axis: int, points: Tensor) -> Tensor:
+    """One coordinate of the only point `(1, 3)`."""
+    return points[0, axis]
+
+
 def difference(points: Tensor) -> tuple[Tensor, Tensor]:
     """From the first of two points `(2, 3)` to the second; and false."""
     return points[1] - points[0], torch.zeros_like(points[0, 0], dtype=torch.bool)

@@ -42,6 +42,24 @@ def normal_reach(level: float) -> float:
     return float(torch.special.ndtri(torch.tensor((1 + check_level(level)) / 2, dtype=torch.float64, device="cpu")))
 
 
+def joint_reach(level: float, count: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """The number of standard deviations within which so many normal errors lie together with that probability.
+
+    The root of the quantile of chi squared, by bisection. `count` is from 1 on, and need not be whole.
+
+    Example:
+        >>> joint_reach(0.95, torch.tensor([1.0, 2.0], dtype=torch.float64))
+        tensor([1.9600, 2.4477], dtype=torch.float64)
+    """
+    half = count.detach().to(torch.float64) / 2
+    low, high = torch.zeros_like(half), 4 * half.sqrt() + 2 * normal_reach(level)
+    for _ in range(60):
+        middle = (low + high) / 2
+        inside = torch.special.gammainc(half, middle.square() / 2) < level
+        low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
+    return (low + high) / 2
+
+
 def student_reach(level: float, degrees: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """The number of estimated standard deviations within which an error lies with that probability.
 

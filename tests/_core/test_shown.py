@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import diffproj as dp
-from diffproj._core.shown import number, rounded
+from diffproj._core.shown import decimals, number, plain, rounded
 
 D = torch.float64
 
@@ -112,6 +112,55 @@ def test_numbers_for_people() -> None:
     assert rounded(123.456, 234.0) == ("123", "234")
     assert rounded(123.456, 0.0) == ("123.456", "")
     assert rounded(123.456, float("inf")) == ("123.456", "inf")
+    assert rounded(-0.00001, 0.0234) == ("0.000", "0.023")
+    assert [plain(x) for x in (8304290.12345, -642700.0, 8304290.0, 1200.0, 0.0001234, -0.0, 1e15)] == [
+        "8304290.123",
+        "-642700",
+        "8304290",
+        "1200",
+        "0.0001234",
+        "0",
+        "1e+15",
+    ]
+    assert [plain(x) for x in (float("inf"), -float("inf"))] == ["inf", "-inf"]
+    assert decimals([5.0, 0.00052, 0.0, float("inf"), float("nan")], 3) == 4
+    assert decimals([0.002], 3) == decimals([], 3) == 3
     assert number(torch.tensor([1.0, 1.0])) == "1.0"
     assert number(torch.tensor([1.0, 2.0])) == "1.0 to 2.0"
     assert number(torch.zeros(0)) == "?"
+
+
+def test_coordinates_on_a_map_are_not_cut_off() -> None:
+    landmarks = dp.Landmarks([[642700.0, 8304290.5, 2.0], [642710.25, 8304295.0, 2.0], [642705.0, 8304299.0, 3.0]])
+    assert "8304290.5" in landmarks._repr_html_()
+    mast = dp.Camera.mounted(6.0, 20.0, position=(642700.0, 8304290.5), focal=1200.0, size=(1280, 960))
+    measured = dp.measure([[640.0, 700.0]], mast, dp.Plane.z(0.0), pixel_sigma=0.5)
+    assert "8304300.722" in measured.ellipses()._repr_html_()
+    known = dp.adjust(mast, priors={"height": 0.02}, fixed=("tilt", "roll", "heading", "position"))
+    assert "8304290.5" in known._repr_html_()
+
+
+def test_no_error_bar_is_shown_as_none() -> None:
+    """A scene in metres of some millimetres: deviations of micrometres; and one in kilometres."""
+    close = dp.Camera.mounted(0.006, 20.0, focal=1200.0, size=(1280, 960))
+    measured = dp.measure([[640.0, 700.0], [800.0, 600.0]], close, dp.Plane.z(0.0), pixel_sigma=0.5)
+    first, second, length = measured.summary().splitlines()[:3]
+    assert first == "point 0     0.000005 ± 0.000005    0.010222 ± 0.000009    0.000000 ± 0.000000"
+    assert second.startswith("point 1     0.001839 ± 0.000006")
+    assert length == "0 to 1       0.00288 ± 0.00001"
+    far = dp.Camera.mounted(0.006, 20.0, focal=1200.0, size=(1280, 960))
+    known = dp.adjust(far, priors={"height": 2e-5, "tilt": 0.5}, fixed=("roll", "heading", "position"))
+    assert "height               0.00600 ± 0.00002" in known.summary()
+    high = dp.Camera.mounted(6e6, 20.0, focal=1200.0, size=(1280, 960))  # in millimetres, known to 20 m and 2 mdeg
+    aerial = dp.adjust(high, priors={"height": 2e4, "tilt": 0.002}, fixed=("roll", "heading", "position")).summary()
+    assert "tilt                 20.0000 ± 0.0020 degrees" in aerial
+    assert "roll                  0.0000 (fixed) degrees" in aerial
+    level = dp.Camera.mounted(1e-9, 5.0, focal=1200.0, size=(1280, 960))  # at the height of the origin, before a facade
+    facade = torch.tensor([[-3.0, 20, 1], [3, 20, 2], [0, 20, -2], [4, 20, -1], [-4, 20, 3]], dtype=D)
+    beside = dp.adjust(level, dp.Seen(facade, level.project(facade)[0])).summary()
+    assert beside.count("±") == 6
+
+
+def test_what_is_not_known_keeps_its_place() -> None:
+    found = dp.Quantity(torch.tensor([1.5, torch.nan, 2.5]), torch.tensor([0.1, torch.nan, 0.1]))
+    assert repr(found) == "Quantity(1.50 ± 0.10, NaN, 2.50 ± 0.10)"

@@ -11,7 +11,8 @@ from torch import Tensor
 from diffproj._core.arguments import called, flag, listing, whole_number, words
 from diffproj.calibration.evidence.adjusted_covariance import covariance_of
 from diffproj.calibration.evidence.adjustment import Adjustment
-from diffproj.calibration.evidence.descent import Found, Task, best, differentiated, spare
+from diffproj.calibration.evidence.best import best
+from diffproj.calibration.evidence.descent import Found, Task, differentiated, spare
 from diffproj.calibration.evidence.knowledge import Knowledge, knowledge, prior_shapes
 from diffproj.calibration.evidence.observation import Observation
 from diffproj.calibration.evidence.observations import Seen

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.evidence.adjustment import pose_covariance
+from diffproj.calibration.evidence.curved import further
 from diffproj.calibration.evidence.descent import Found, Task, reach
 from diffproj.calibration.evidence.problem import jacobian
 from diffproj.calibration.evidence.undetermined import Lacking, inverse, natural, undetermined, units
@@ -36,7 +37,13 @@ class PoseErrors(NamedTuple):
 
 
 def pose_errors(
-    task: Task, found: Found, middle: Tensor, *, follows: bool = True, level: Tensor | None = None
+    task: Task,
+    found: Found,
+    middle: Tensor,
+    *,
+    follows: bool = True,
+    curved: bool = False,
+    level: Tensor | None = None,
 ) -> PoseErrors:
     """How what was found errs.
 
@@ -45,6 +52,7 @@ def pose_errors(
         found: where it ended.
         middle: what poses turn about `(3,)`.
         follows: whether `follow` is asked for; not what it should be if not.
+        curved: whether the direction that is known worst is followed on the curve: see `further`.
         level: the variance of a residual of the evidence `(P,)`; 1 if left out.
     """
     parameters, values, T = found.parameters, found.values, found.basis
@@ -54,7 +62,11 @@ def pose_errors(
     precision = found.prior.precision.detach()
     scale = natural(values, reach(task, values))
     Hr, lost, vectors = inverse(T.mT @ (H + precision) @ T, units(T, scale))
-    C = T @ Hr @ (T.mT @ (M + precision) @ T) @ Hr @ T.mT
+    reduced = Hr @ (T.mT @ (M + precision) @ T) @ Hr
+    C = T @ reduced @ T.mT
+    if curved:
+        more = further(task, found, reduced, units(T, scale)).unsqueeze(-1)
+        C = C + more @ more.mT
     held = torch.tensor([at not in task.known.columns for at in range(s)], device=values.device).to(values)
     follow = torch.nn.functional.pad(torch.diag(held), (0, 0, 0, POSE)) - T @ Hr @ (T.mT @ H[..., :s] * held)
     unknown, names = undetermined(parameters, values, T, scale, lost, vectors)
@@ -85,7 +97,7 @@ def covariance_of(task: Task, found: Found, calibration: Calibration | None) -> 
     s, P = found.parameters.camera.size, len(found.values)
     middle = found.parameters.unpack(found.values, (P,), None).center.mean(0)
     known = calibration is not None and calibration.has_covariance
-    C, follow, arm, lacking, names = pose_errors(task, found, middle, follows=known)
+    C, follow, arm, lacking, names = pose_errors(task, found, middle, follows=known, curved=True)
     if calibration is not None and known:
         # Intrinsics that are held err as the calibration says, and what is found follows them.
         own = calibration.covariance_of_kept_poses.shared[..., :s, :s]

@@ -1,5 +1,6 @@
 """`Adjustment`: a camera at its pose, found from evidence other than views of a target, and how sure it is."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -8,9 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from diffproj._core.shown import counted, number
+from diffproj._core.shown import counted, decimals, number
 from diffproj.calibration.evidence.observation import Observation
-from diffproj.calibration.evidence.pose_parameters import MOUNTING
+from diffproj.calibration.evidence.pose_parameters import MOUNTING, PLACE
 from diffproj.calibration.evidence.problem import jacobian
 from diffproj.calibration.evidence.rivals import Rivals
 from diffproj.calibration.least_squares.solver import Status
@@ -168,8 +169,8 @@ class Adjustment(Calibration):
         return (
             f"another pose explains the evidence nearly as well, {float(1 / other.ratio):.2g} times as likely: height "
             f"{float(other.height):.4g}{unit}, tilt {float(other.tilt):.1f}, roll {float(other.roll):.1f}, heading "
-            f"{float(other.heading):.1f} degrees; a prior on one of these, or landmarks off the plane of the others, "
-            "tell them apart"
+            f"{float(other.heading):.1f} degrees; a prior on one of these, or more evidence, as of landmarks off the "
+            "plane of the others, tells them apart"
         )
 
     @property
@@ -197,16 +198,22 @@ class Adjustment(Calibration):
             raise ValueError(f"summary: want one camera, got batch shape {tuple(self.views.batch_shape)}; see message")
         values = {**dict(zip(self.parameters.names, self.shared.tolist(), strict=True)), **self._mounting_values()}
         spreads = self._spreads()
-        rounding = ROUNDED * max((spreads[name] for name in MOUNTING if spreads[name] < torch.inf), default=0.0)
+        far = max([abs(values["height"]), 1e-300, *(spreads[x] for x in PLACE if spreads[x] < torch.inf)])
+        degree = far * math.radians(1)  # what a degree is at the camera's height
+        unit_of = {name: degree if name in PLACE else 1.0 for name in MOUNTING}
+        known = [spreads[name] / unit_of[name] for name in MOUNTING if spreads[name] < torch.inf]
+        rounding = {name: ROUNDED * max(known, default=0.0) * size for name, size in unit_of.items()}
         unit = f" {self.unit}" if self.unit else ""
         lines = []
         for name, value in values.items():
             spread = spreads.get(name, 0.0)
-            spread = spread if spread > NOTHING * max(1.0, abs(value)) + (name in MOUNTING) * rounding else 0.0
+            least = NOTHING * abs(value) if name in PLACE else NOTHING * max(1.0, abs(value))
+            spread = spread if spread > least + rounding.get(name, 0.0) else 0.0
             if name in MOUNTING or spread:
                 kind = " degrees" if name in MOUNTING[:3] else unit if name in MOUNTING else ""
-                known = " (not known)" if spread == torch.inf else f" ± {spread:.4f}" if spread else " (fixed)"
-                lines.append(f"{name:<16}{value:z12.4f}{known}{kind}")
+                digits = decimals([spread], 4)
+                shown = " (not known)" if spread == torch.inf else f" ± {spread:.{digits}f}" if spread else " (fixed)"
+                lines.append(f"{name:<16}{value:z12.{digits}f}{shown}{kind}")
         if 90 - abs(values["tilt"]) < VERTICAL * spreads["tilt"] < torch.inf:
             lines.append(VERTICAL_WORDS)
         for one, part in zip(self.observations, self.parts, strict=True):

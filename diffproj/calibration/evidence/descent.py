@@ -1,6 +1,5 @@
 """From the camera that `adjust` is given to the minimum: which start, the solver, and derivatives of where it ended."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -11,39 +10,26 @@ from torch import Tensor
 from diffproj.calibration.evidence.knowledge import Knowledge
 from diffproj.calibration.evidence.observation import Observation
 from diffproj.calibration.evidence.observations import Seen
-from diffproj.calibration.evidence.pose_parameters import ANGLES, PLACE, PoseParameters
+from diffproj.calibration.evidence.pose_parameters import PoseParameters
 from diffproj.calibration.evidence.problem import Evidence, Losses
-from diffproj.calibration.evidence.search import starts
 from diffproj.calibration.evidence.undetermined import natural
 from diffproj.calibration.least_squares.solver import Prior, Status, solve
-from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.geometry.camera import Camera
-from diffproj.geometry.mounting import mounting_from_rotation
 
 NEGLIGIBLE = 1e-18
 """Cost, in squared deviations, that counts as zero: of evidence without noise."""
+FAR_OFF = 1e3
+"""Distance from the origin, in that of what was seen, from which on places round enough to be felt."""
 TOLERANCE, ROUNDING = 1e-13, 1e-12
 """Part of the cost that another step may still bring, and that rounding may."""
 ROBUST_STEPS, NEWTON = 40, 20
 """Steps of reweighting, which shrink slowly under a robust loss, before at most so many of Newton's."""
-UNDETERMINED_STEPS = 30
-"""Steps where there are fewer residuals than unknowns: many places explain them, and the solver would go on long."""
-POOR = 9.0
-"""Cost per spare residual from which on other starts are tried."""
-SURELY = 3.0
-"""Cost by which the other pose must be lower to be taken in the place of that which the camera's own led to: it is 20
-times as likely then."""
-RIVAL, RIVAL_STEPS = 50.0, 4
-"""Cost by which the other pose may lie higher after so many steps to be followed to its minimum."""
-ANOTHER = 2.0
-"""Turn in degrees from which on a pose is another one."""
+PROFILE_STEPS = 20
+"""Steps to the least cost with one direction held."""
+FEW = 8
+"""Steps of a first look, before the best of several starts is followed to its minimum."""
 RESTRAINT = 1e-8
 """Weight of the start on each parameter in its natural unit: so small that it decides only what nothing else does."""
-HAIR = 1e-4
-"""Cost of half a turn away from the camera's own direction, over 4."""
-TRIED, FEW = 8, 8
-"""How many of them are followed, for how many steps before the best is followed to its minimum."""
-_STATE = ("values", "status", "iterations", "cost")
 
 
 @dataclass(frozen=True)
@@ -115,126 +101,6 @@ class Found:
     rival: Rival | None = None
 
 
-def best(task: Task, steps: int) -> Found:
-    """The minimum from the camera's own pose; where it explains little, the best from other poses too.
-
-    Where the evidence tells the whole pose, that from its mirror image comes with it, or in its place if it is much
-    lower.
-    """
-    found = _nearest(task, steps)
-    if sum(len(piece) for piece in task.pieces if isinstance(piece, Seen)) < 3 or steps == 0:
-        return found
-    return _with_rival(task, found, steps)
-
-
-def _nearest(task: Task, steps: int) -> Found:
-    """The minimum from the camera's own pose; where it explains little, the best from other poses too."""
-    own, R = task.own(), task.camera.R.reshape(-1, 3, 3)
-    prior = task.known.prior(own, task.batch)
-    begin = task.known.begin(own, prior)
-    basis, none = task.known.basis(begin), torch.zeros(len(begin), dtype=torch.long, device=begin.device)
-    few = spare(task, Found(task.known.parameters(R), basis, prior, begin, none, none, begin[:, 0])) < 0
-    steps = min(steps, UNDETERMINED_STEPS) if bool(few.all()) else steps
-    found = descended(task, R, begin, prior, (), steps)
-    if not task.pieces or steps == 0:
-        return found
-    left = spare(task, found)
-    # Where there are fewer residuals than unknowns, another start tells no more.
-    poor = (found.status == Status.DIVERGED) | (~(2 * found.cost <= POOR * left.clamp(min=1)) & (left >= 0))
-    if not bool(poor.any()):
-        return found
-    camera = task.known.parameters(R).unpack(begin, (len(begin),), task.camera.size)
-    rotations, values = starts(task.pieces, task.known, camera, begin, task.batch)
-    K, P = values.shape[:2]
-    flat = rotations.flatten(0, 1)
-    blocks = task.evidence(task.known.parameters(flat), (K,), ()).residuals(values.flatten(0, 1))
-    cost = blocks.square().sum(-1).log1p().sum(-1).reshape(K, P).nan_to_num(torch.inf, torch.inf)  # mild on outliers
-    first = task.known.parameters(R).rotation(begin)
-    rows = (cost + _away(rotations, first)).topk(min(TRIED, K), dim=0, largest=False).indices
-    k, each = len(rows), torch.arange(P, device=rows.device)
-    many = Prior(*(part.expand(k, *part.shape).flatten(0, 1) for part in prior[:2]))
-    near = descended(task, rotations[rows, each].flatten(0, 1), values[rows, each].flatten(0, 1), many, (k,), FEW)
-    away = _away(near.parameters.rotation(near.values), first.repeat(k, 1, 1))
-    chosen = (near.cost + away).nan_to_num(torch.inf).reshape(k, P).argmin(0) * P + each
-    R = R if near.parameters.start is None else near.parameters.start[chosen]
-    other = descended(task, R, near.values[chosen], prior, (), steps)
-    return _exchanged(found, other, poor & (_ended(other) < _ended(found)))
-
-
-def _ended(found: Found) -> Tensor:
-    """The cost `(P,)`, infinite where the solver came to no end."""
-    return torch.where(found.status == Status.CONVERGED, found.cost, torch.inf).nan_to_num(torch.inf)
-
-
-def _exchanged(found: Found, other: Found, where: Tensor) -> Found:
-    """The minima with others in the place of some `(P,)`."""
-    start = None
-    if found.parameters.start is not None and other.parameters.start is not None:
-        start = torch.where(where[:, None, None], other.parameters.start, found.parameters.start)
-    parts = {
-        name: torch.where(where.reshape(-1, *(1,) * (old.ndim - 1)), getattr(other, name), old)
-        for name, old in ((name, getattr(found, name)) for name in _STATE)
-    }
-    return replace(found, parameters=replace(found.parameters, start=start), **parts)
-
-
-def _with_rival(task: Task, found: Found, steps: int) -> Found:
-    """The minimum, or that at the mirrored pose if it is much lower; and the other of the two as its rival.
-
-    Seen from afar, points on a plane look alike from both sides of the line of sight.
-    """
-    told = (spare(task, found) >= 0) & (found.status == Status.CONVERGED)
-    nothing = torch.full_like(found.cost, torch.inf)
-    R, place = found.parameters.rotation(found.values), found.values[:, -3:]
-    none = Rival(nothing, R, place)
-    if not bool(told.any()):
-        return replace(found, rival=none)
-    begin, turn = _mirrored(task, found)
-    near = descended(task, turn, begin, found.prior, (), min(steps, RIVAL_STEPS))
-    told &= near.cost < found.cost + RIVAL  # of each by itself, whatever others of the batch there are
-    if not bool(told.any()):
-        return replace(found, rival=none)
-    turn = turn if near.parameters.start is None else near.parameters.start
-    other = descended(task, turn, near.values, found.prior, (), steps)
-    there, away = other.parameters.rotation(other.values), other.values[:, -3:]
-    # The trace of a rotation by an angle a is 1 + 2 cos a.
-    apart = (there * R).sum((-2, -1)) < 1 + 2 * math.cos(math.radians(ANOTHER))
-    cost = torch.where(told & apart, _ended(other), torch.inf)
-    better = cost < found.cost - SURELY
-    above = torch.where(better, found.cost - cost, cost - found.cost).nan_to_num(torch.inf, torch.inf)
-    rival = Rival(above, torch.where(better[:, None, None], R, there), torch.where(better[:, None], place, away))
-    return replace(_exchanged(found, other, better), rival=rival)
-
-
-def _mirrored(task: Task, found: Found) -> tuple[Tensor, Tensor]:
-    """Values `(P, q)` and rotations `(P, 3, 3)` of the pose that mirrors the plane of the points at the line of sight.
-
-    With n the normal of the plane, m the middle of the points and s the direction to it, `R' = (I - 2 s s^T) R
-    (I - 2 n n^T)`: what lies across s stays.
-    """
-    R, place = found.parameters.rotation(found.values), found.values[:, -3:]
-    points = torch.cat([piece.points.detach().to(R) for piece in task.pieces if isinstance(piece, Seen)])
-    middle = points.mean(0)
-    normal = torch.linalg.svd(points - middle, full_matrices=False).Vh[-1]
-    toward = (R @ (middle - place).unsqueeze(-1)).squeeze(-1)
-    sight = toward / toward.norm(dim=-1, keepdim=True).clamp(min=1e-300)
-    across = R - 2 * sight.unsqueeze(-1) * (sight.unsqueeze(-2) @ R)
-    turn = across - 2 * (across @ normal).unsqueeze(-1) * normal
-    mirrored_place = middle - (turn.mT @ toward.unsqueeze(-1)).squeeze(-1)
-    moving = torch.tensor([task.known.moves(name) for name in PLACE], device=R.device)
-    angles = torch.zeros_like(place)
-    if task.known.angles:
-        given = torch.tensor([task.known.given(name) for name in ANGLES], device=R.device)
-        angles = torch.where(given, found.values[:, -POSE:-3], torch.stack(mounting_from_rotation(turn), dim=-1))
-    values = [found.values[:, :-POSE], angles, torch.where(moving, mirrored_place, place)]
-    return torch.cat(values, dim=-1), turn
-
-
-def _away(R: Tensor, first: Tensor) -> Tensor:
-    """A hair of cost for turns from the camera's own direction: of poses that explain as much, the nearer one."""
-    return HAIR * (3 - (R * first).sum((-2, -1)))
-
-
 def descended(task: Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[int, ...], steps: int) -> Found:
     """The minimum that the solver reaches from values `(P, q)`, whose turns are about rotations `(P, 3, 3)`.
 
@@ -243,11 +109,7 @@ def descended(task: Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[in
     parameters = task.known.parameters(R)
     evidence = task.evidence(parameters, more)
     basis = task.known.basis(begin)
-    losses = [getattr(piece, "loss", None) for piece in task.pieces]
-    loss = None
-    if any(one is not None for one in losses):
-        counts = [block.shape[1] for block in evidence.blocks(begin)]
-        loss = Losses(tuple(zip(counts, losses, strict=True)))
+    loss = _losses(task, evidence, begin)
     found = solve(
         evidence,
         begin,
@@ -258,10 +120,52 @@ def descended(task: Task, R: Tensor, begin: Tensor, prior: Prior, more: tuple[in
         basis=basis,
         max_iterations=steps if loss is None else min(steps, ROBUST_STEPS),
         tolerance=TOLERANCE,
-        negligible=NEGLIGIBLE,
+        negligible=_negligible(evidence, begin, reach(task, begin)),
     )
     ended = Found(parameters, basis, prior, found.shared, found.status, found.iterations, found.cost)
     return ended if loss is None or steps <= FEW else _polished(task, ended, more)
+
+
+def profile(task: Task, found: Found, starts: Tensor, basis: Tensor) -> Tensor:
+    """The least cost `(K, P)` from K starts each `(K, P, q)` where only what a basis `(P, q, r)` spans moves."""
+    K, P = starts.shape[:2]
+    R = found.parameters.start
+    parameters = found.parameters if R is None else replace(found.parameters, start=R.repeat(K, 1, 1))
+    evidence = task.evidence(parameters, (K,))
+    prior = Prior(*(part.repeat(K, *(1,) * (part.ndim - 1)) for part in found.prior[:2]))
+    ended = solve(
+        evidence,
+        starts.flatten(0, 1),
+        (),
+        local_size=0,
+        loss=_losses(task, evidence, starts.flatten(0, 1)),
+        prior=prior,
+        basis=basis.repeat(K, 1, 1),
+        max_iterations=PROFILE_STEPS,
+        negligible=1e-3,
+        tolerance=1e-3,
+    )
+    return torch.where(ended.cost.isfinite(), ended.cost, torch.inf).reshape(K, P)
+
+
+def _losses(task: Task, evidence: Evidence, values: Tensor) -> Losses | None:
+    """The robust losses of all pieces as one; `None` where none has one."""
+    losses = [getattr(piece, "loss", None) for piece in task.pieces]
+    if all(one is None for one in losses):
+        return None
+    counts = [block.shape[1] for block in evidence.blocks(values)]
+    return Losses(tuple(zip(counts, losses, strict=True)))
+
+
+def _negligible(evidence: Evidence, values: Tensor, distance: Tensor) -> Tensor:
+    """The cost `(P,)` that counts as zero: far from the origin, that of the rounding of places."""
+    place = values[:, -3:].abs()
+    least = torch.full_like(distance, NEGLIGIBLE)
+    if not bool((place.amax(-1) > FAR_OFF * distance).any()):
+        return least
+    slopes = evidence.along(values)[1][[at >= values.shape[-1] - 3 for at in evidence.columns]]
+    off = torch.finfo(values.dtype).eps * place.amax(-1) * slopes.square().sum((0, 2, 3)).sqrt()
+    return least.maximum(off.square().nan_to_num(0.0, 0.0))
 
 
 def _restrained(task: Task, begin: Tensor, prior: Prior) -> Prior:

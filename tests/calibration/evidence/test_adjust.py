@@ -679,3 +679,16 @@ def test_landmarks_with_relief_have_one_pose() -> None:
     assert bool(found.rivals.ratio.isinf())
     assert not found.doubts
     assert dp.adjust(START, dp.Horizon(torch.tensor([[100.0, 120.0], [900.0, 130.0]])), throw=False).rivals is None
+
+
+@pytest.mark.parametrize("start", [(6.0, 20.0, (642700.0, 8304290.0)), (8.0, 30.0, (642702.0, 8304287.0))])
+def test_exact_pixels_far_from_the_origin(start: tuple[float, float, tuple[float, float]]) -> None:
+    """Places round to nanometres there, which residuals of exact pixels feel: no pose is told to be the minimum."""
+    truth = dp.Camera.mounted(6.0, 20.0, position=(642700.0, 8304290.0), focal=1200.0, size=(1280, 960))
+    pixels = torch.tensor([[200.0, 500], [1100, 420], [640, 900], [300, 800], [900, 700], [500, 600]], dtype=D)
+    points, _ = dp.back_project(pixels, truth, dp.Plane.z(0.0))
+    height, tilt, position = start
+    begin = dp.Camera.mounted(height, tilt, position=position, focal=1200.0, size=(1280, 960))
+    found = dp.adjust(begin, dp.Seen(points, pixels))
+    torch.testing.assert_close(found.mounting.height, torch.tensor(6.0, dtype=D), rtol=1e-6, atol=0)
+    torch.testing.assert_close(found.mounting.position, truth.mounting().position, rtol=0, atol=1e-5)
