@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from diffproj.measurement import folded
+from diffproj.measurement.each import at_each
 from diffproj.measurement.propagation import Propagated
 from diffproj.measurement.quantity import Quantity
 from diffproj.measurement.shapes import length
@@ -43,7 +44,7 @@ def curved_interval(
     """
 
     def every(points: Tensor) -> Tensor:
-        return torch.func.vmap(function)(points.flatten(0, -3)).reshape(points.shape[:-2])
+        return at_each(function)(points).reshape(points.shape[:-2])
 
     slopes = spread.rows().squeeze(-2)
     low, high = (extreme(spread, every, value, slopes, side, reach)[0] for side in (-1, 1))
@@ -80,7 +81,7 @@ def norm_interval(
     cross = (Cu - along.unsqueeze(-1) * u).square().sum(-1) / unit.square().square()
 
     def signed(points: Tensor) -> Tensor:
-        there, turned = torch.func.vmap(function)(points.flatten(0, -3))
+        there, turned = at_each(function)(points)
         there, turned = there.reshape(w.shape), turned.reshape(r.shape) ^ supplement
         along_u = (u * there).sum(-1)
         if limit == torch.inf:  # nothing turns, and the slope of what is infinite would be NaN

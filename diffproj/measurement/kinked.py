@@ -14,6 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from diffproj.measurement.each import at_each
 from diffproj.measurement.intervals import Function, curved_interval, extreme
 from diffproj.measurement.propagation import Propagated
 from diffproj.measurement.student import joint_reach, normal_reach
@@ -67,7 +68,7 @@ def kinked_interval(
 
 def _each(function: Function) -> Function:
     def each(points: Tensor) -> Tensor:
-        return torch.func.vmap(function)(points.flatten(0, -3)).reshape(points.shape[:-2])
+        return at_each(function)(points).reshape(points.shape[:-2])
 
     return each
 

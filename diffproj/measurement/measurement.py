@@ -15,6 +15,7 @@ from diffproj._core.shown import Shown, counted, decimals, rounded
 from diffproj.calibration.results.covariance import zero_where_infinite
 from diffproj.calibration.results.region import in_region
 from diffproj.geometry.back_projection import Reason, explain
+from diffproj.measurement.each import at_each
 from diffproj.measurement.ellipses import Ellipses, plane_ellipses
 from diffproj.measurement.folded import longest_first, norm_variance
 from diffproj.measurement.intervals import Function, Interval, angle_interval, curved_interval, norm_interval
@@ -190,7 +191,7 @@ class Measurement(Copied, Shown):
                 )
             return found
 
-        gradient, value = torch.func.vmap(torch.func.grad_and_value(checked))(chosen.flatten(0, -3))
+        gradient, value = at_each(torch.func.grad_and_value(checked))(chosen)
         gradient, value = gradient.reshape(chosen.shape), value.reshape(chosen.shape[:-2])
         spread = Propagated.of(self._noise, index, gradient.nan_to_num(0.0, 0.0, 0.0).unsqueeze(-3))
         with torch.no_grad():
@@ -327,7 +328,7 @@ class Measurement(Copied, Shown):
             found = function(points)
             return found[0], found
 
-        J, (w, supplement) = torch.func.vmap(torch.func.jacrev(twice, has_aux=True))(chosen.flatten(0, -3))
+        J, (w, supplement) = at_each(torch.func.jacrev(twice, has_aux=True))(chosen)
         w, supplement = w.reshape(*chosen.shape[:-2], 3), supplement.reshape(chosen.shape[:-2])
         spread = Propagated.of(self._noise, index, J.reshape(*chosen.shape[:-2], 3, *chosen.shape[-2:]))
         C, r = spread.covariance, length(w)

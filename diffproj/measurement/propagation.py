@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.results.covariance import zero_where_infinite
+from diffproj.measurement.each import at_each
 from diffproj.measurement.sight import Sight, Straight
 
 
@@ -151,7 +152,7 @@ def kink_variance(function: Callable[[Tensor], Tensor], steps: Tensor, points: T
     M_shape, C = points.shape[:-2], steps.shape[-3]
 
     def values(at: Tensor) -> Tensor:
-        return torch.func.vmap(function)(at.flatten(0, -3)).nan_to_num(0.0, 0.0, 0.0)
+        return at_each(function)(at).nan_to_num(0.0, 0.0, 0.0)
 
     here = values(points).reshape(*M_shape, 1)
     changes = [

@@ -362,3 +362,21 @@ def test_degrees_of_freedom_of_what_is_known_in_part() -> None:
     assert both.degrees_of_freedom is not None
     torch.testing.assert_close(estimated.degrees_of_freedom, located.degrees_of_freedom.reshape(1))
     torch.testing.assert_close(both.degrees_of_freedom, located.degrees_of_freedom / share.square())
+
+
+@pytest.mark.parametrize(
+    "of",
+    [
+        lambda measured: measured.lengths(),
+        lambda measured: measured.angles(),
+        lambda measured: measured.area(),
+        lambda measured: measured.quantity(lambda p: (p[0] - p[1]).norm() - (p[2] - p[3]).norm(), [[0, 1, 2, 3]]),
+    ],
+    ids=["lengths", "angles", "area", "quantity"],
+)
+def test_of_no_cameras(of):
+    """A batch may be empty, as the detections of a photograph may be."""
+    found = of(dp.measure(torch.zeros(0, 4, 2, dtype=D), FRONTAL, Z, pixel_sigma=SIGMA))
+    for part in (found.value, found.deviation, *found.interval(0.95)):
+        assert part.shape[0] == 0
+        assert part.ndim == 2
