@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from diffproj.calibration.fitting.fit import Fit
-from diffproj.calibration.problem.parametrisation import POSE
+from diffproj.calibration.problem.parametrisation import INTRINSICS, POSE
 from diffproj.calibration.results.remark import Kind, Remark
 
 ORDER = 3
@@ -59,7 +59,7 @@ def of_a_flexing_board(found: Fit, p: int, sigma: float, repeated: float) -> Rem
         sigma: the scatter of a corner's coordinate, px.
         repeated: the part of the residuals' sum of squares that is alike in all views.
     """
-    if sigma <= LEAST_PX or found.task.objective == "plane":
+    if sigma <= LEAST_PX or found.task.objective == "plane" or _holds_a_camera(found, p):
         return None
     part = float(together(found, torch.tensor([p], device=found.task.used.device)))
     if not part > MOSTLY + repeated:
@@ -71,6 +71,12 @@ def of_a_flexing_board(found: Fit, p: int, sigma: float, repeated: float) -> Rem
         Kind.FLEXING,
         "the corners of a view err together, as on a board that bends",
     )
+
+
+def _holds_a_camera(found: Fit, p: int) -> bool:
+    """Whether focal lengths or principal point are held: of wrong ones residuals are smooth in each view, too."""
+    basis = found.task.basis
+    return basis is not None and not bool((basis[p, : len(INTRINSICS)] != 0).any(-1).all())
 
 
 def _polynomial(points: Tensor) -> Tensor:

@@ -66,6 +66,39 @@ def test_too_few_corners_for_the_question():
     assert all(WORDS not in told(seen(seed, noise=1.5, board=small), small) for seed in range(3))
 
 
+def of_zooms(zooms: torch.Tensor, seed: int) -> dp.Views:
+    """Views by a camera of 3200 px whose focal length is another one in each."""
+    K = torch.diag(torch.tensor([5.0, 5.0, 1.0], dtype=D)) @ CAMERA.K
+    large = dp.Camera(K, distortion=CAMERA.distortion, size=(3200, 2400))
+    where = synthetic.random_cameras(large, BOARD, len(zooms), seed=seed)
+    K = K.repeat(len(zooms), 1, 1)
+    K[:, 0, 0], K[:, 1, 1] = 3000 * zooms, 3000 * zooms
+    pixels = dp.Camera(K, where.R, where.t, distortion=CAMERA.distortion, size=(3200, 2400)).project(BOARD.points)[0]
+    draw = torch.Generator().manual_seed(seed)
+    pixels = pixels + 0.1 * torch.randn(pixels.shape, generator=draw, dtype=D)
+    return dp.Views(pixels, large.in_image(pixels), size=(3200, 2400))
+
+
+def test_cameras_that_differ_are_no_board_that_bends():
+    """They leave residuals that are smooth in each view, too."""
+    for seed in range(3):
+        draw = torch.Generator().manual_seed(seed)
+        focus = told(of_zooms(1 + 0.04 * torch.randn(13, generator=draw, dtype=D), seed))
+        two = told(of_zooms(torch.tensor([1.0, 1.05], dtype=D).repeat(7)[:13], seed))
+        assert "the focal length differs" in focus or "want another camera" in focus
+        assert "want another camera" in two
+        assert WORDS not in focus + two
+
+
+def test_a_focal_length_that_is_held_at_a_wrong_value_is_no_board_that_bends():
+    views = of_zooms(torch.ones(13, dtype=D), 0)
+    camera = dp.calibrate(views, BOARD).camera
+    K = camera.K.clone()
+    K[0, 0], K[1, 1] = 1.05 * K[0, 0], 1.05 * K[1, 1]
+    held = dp.refine(views, BOARD, dp.Camera(K, distortion=camera.distortion, size=camera.size), fixed=("focal",))
+    assert WORDS not in held.remarks[0]
+
+
 def test_each_camera_of_a_batch_by_itself():
     both = [seen(2, bend=12.0), seen(2, noise=1.5)]
     batch = dp.Views(torch.stack([v.pixels for v in both]), torch.stack([v.visible for v in both]), size=SIZE)
