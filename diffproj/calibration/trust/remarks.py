@@ -157,9 +157,8 @@ def remarks(
             two = p in groups and saved > BETTER * float(left.smooth.share[i])
             focus = None if two or p in wrong else _of_the_focus(own, p, found.knows_noise)
             # Cameras or focal lengths that differ leave residuals that are smooth in each view, too.
-            if not (of_landmarks or two or focus or p in wrong) and (
-                remark is None or remark.kind not in OF_THE_CAMERA
-            ):
+            told = (two and saved > CAMERAS_SAVE) or focus is not None or p in wrong
+            if not (of_landmarks or told) and (remark is None or remark.kind not in OF_THE_CAMERA):
                 flexing = of_a_flexing_board(found, p, float(sigma[p]), float(left.shape.share[i]))
                 remark = flexing or remark or _noisy(float(sigma[p]))
             if two:
