@@ -20,3 +20,8 @@ def at_each(function: Callable[[Tensor], Any]) -> Callable[[Tensor], Any]:
         return every(rows) if len(rows) else tree_map(lambda one: one[:0], every(rows.new_zeros(1, *rows.shape[1:])))
 
     return mapped
+
+
+def number_of_each(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+    """The same of a function that gives a number: `(*B,)` for points `(*B, k, 3)`."""
+    return lambda points: at_each(function)(points).reshape(points.shape[:-2])

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from diffproj.measurement import folded
-from diffproj.measurement.each import at_each
+from diffproj.measurement.each import at_each, number_of_each
 from diffproj.measurement.propagation import Propagated
 from diffproj.measurement.quantity import Quantity
 from diffproj.measurement.shapes import length
@@ -42,11 +42,7 @@ def curved_interval(
         kink: the standard deviation that its slope lacks.
         reach: how many deviations the interval's level allows `(*B, M)`.
     """
-
-    def every(points: Tensor) -> Tensor:
-        return at_each(function)(points).reshape(points.shape[:-2])
-
-    slopes = spread.rows().squeeze(-2)
+    every, slopes = number_of_each(function), spread.rows().squeeze(-2)
     low, high = (extreme(spread, every, value, slopes, side, reach)[0] for side in (-1, 1))
     return torch.where(lost, -torch.inf, low - reach * kink), torch.where(lost, torch.inf, high + reach * kink)
 

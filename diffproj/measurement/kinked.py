@@ -4,17 +4,17 @@ The difference of two sides without its sign, the longer of two lengths, a squar
 such a function takes where all errors together are as many deviations as the level allows may lie inside of that ball,
 and slopes lead past it. What the slopes at random errors have in common tells the few directions that it depends on;
 along these the ball is searched. Where it depends on more than one of them, as the longer of two lengths does where
-they are nearly equal, the ball has to be larger to hold them all as often as the level says.
+they are nearly equal, the ball has to be larger to hold them all as often as the level says. Where there are more than
+two, as in the spread of several lengths, no search is sure to find what lies in the ball: the bounds are then as far as
+the steepest slope leads at most.
 """
 
-import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from diffproj.measurement.each import at_each
+from diffproj.measurement.each import number_of_each
 from diffproj.measurement.intervals import Function, curved_interval, extreme
 from diffproj.measurement.propagation import Propagated
 from diffproj.measurement.student import joint_reach, normal_reach
@@ -29,10 +29,12 @@ HAIR = 1e-3
 """Deviations over which a function that does not change is level."""
 DIRECTIONS = 4
 """How many directions are searched."""
+SEARCHED = 2.5
+"""Up to how many directions, counted by how much a function depends on each, the search is relied on."""
 ROUNDS, SMALLER = 28, 0.7
 """Rounds of the search, each with steps shorter by this factor."""
 MOST = 2_000_000
-"""Errors that are followed to points at once."""
+"""Numbers that are held at once for errors that are followed to points."""
 
 
 @torch.no_grad()
@@ -43,10 +45,37 @@ def kinked_interval(
     low, high = curved_interval(spread, function, value, lost, kink, level, reach)
     if value.numel() == 0:
         return low, high
+    reach = reach.masked_fill(lost, torch.inf)
+    each = max(1, MOST * len(spread.index) // (2 * PAIRS * spread.rows().numel()))
+    for rows in torch.arange(len(spread.index), device=value.device).split(each):
+        found = _of_bent(_part(spread, rows), function, value[..., rows], level, reach[..., rows])
+        if found is not None:
+            which, bent, (least, most) = found
+            rows = rows[which]
+            low[..., rows] = torch.where(bent, least, low[..., rows])
+            high[..., rows] = torch.where(bent, most, high[..., rows])
+    return low, high
+
+
+def _part(spread: Propagated, rows: Tensor) -> Propagated:
+    """The errors of some of the vectors `(m,)`."""
+    common, own = spread.common.index_select(-3, rows), spread.own.index_select(-4, rows)
+    return replace(spread, index=spread.index[rows], common=common, own=own)
+
+
+def _of_bent(
+    spread: Propagated, function: Function, value: Tensor, level: float, reach: Tensor
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]] | None:
+    """Bounds where the function is bent: in which rows `(m,)` it is anywhere, where in these, and both bounds."""
     slopes = _slopes(spread, function)
     unit = slopes / slopes.norm(dim=-1, keepdim=True).clamp(min=1e-300)
     bent = 1 - unit.mean(-2).square().sum(-1) > STRAIGHT
-    bent &= (unit != 0).any(-1).any(-1) & reach.isfinite() & ~lost
+    bent &= (unit != 0).any(-1).any(-1) & reach.isfinite()
+    which = bent.reshape(-1, bent.shape[-1]).any(0).nonzero().squeeze(-1)
+    if len(which) == 0:
+        return None
+    spread, value, reach, bent = _part(spread, which), value[..., which], reach[..., which], bent[..., which]
+    slopes, unit = slopes.index_select(-3, which), unit.index_select(-3, which)
     sizes, vectors = torch.linalg.eigh(unit.mT @ unit)
     axes = vectors[..., -DIRECTIONS:].flip(-1).mT
     first = spread.rows().squeeze(-2)
@@ -54,23 +83,16 @@ def kinked_interval(
     stationary = first.abs().amax(-1) == 0
     around = _values(spread, function, HAIR * axes[..., :1, :])[0].squeeze(-1)
     bent &= ~stationary | (around == value)
-    if not bool(bent.any()):
-        return low, high
     many = sizes.sum(-1).square() / sizes.square().sum(-1).clamp(min=1e-300)
     wide = torch.where(bent, reach, 1.0) * joint_reach(level, many.clamp(min=1)) / normal_reach(level)
+    farthest = torch.where(many > SEARCHED, slopes.norm(dim=-1).amax(-1) * wide, 0.0)
     found = []
     for side in (-1, 1):
-        at_rim, where = extreme(spread, _each(function), value, first, side, wide)
+        at_rim, where = extreme(spread, number_of_each(function), value, first, side, wide)
         inside = _searched(spread, function, value, axes, wide, where, side)
+        inside = side * (side * inside).maximum(side * value + farthest)
         found.append(torch.where(at_rim.isinf(), at_rim, inside))
-    return torch.where(bent, found[0], low), torch.where(bent, found[1], high)
-
-
-def _each(function: Function) -> Function:
-    def each(points: Tensor) -> Tensor:
-        return at_each(function)(points).reshape(points.shape[:-2])
-
-    return each
+    return which, bent, (found[0], found[1])
 
 
 def _slopes(spread: Propagated, function: Function) -> Tensor:
@@ -86,13 +108,7 @@ def _slopes(spread: Propagated, function: Function) -> Tensor:
         there, valid = _values(spread, function, at)
         return torch.where(valid, there, 0.0).sum()
 
-    parts = [torch.func.grad(total)(part.expand(*shape[:-2], *part.shape)) for part in _parts(errors, shape)]
-    return torch.cat(parts, dim=-2).nan_to_num(0.0, 0.0, 0.0)
-
-
-def _parts(errors: Tensor, shape: tuple[int, ...]) -> Iterator[Tensor]:
-    each = max(1, MOST // max(1, math.prod(shape[:-2]) * shape[-1]))
-    yield from errors.split(each)
+    return torch.func.grad(total)(errors.expand(shape)).nan_to_num(0.0, 0.0, 0.0)
 
 
 def _values(spread: Propagated, function: Function, errors: Tensor) -> tuple[Tensor, Tensor]:
@@ -100,7 +116,7 @@ def _values(spread: Propagated, function: Function, errors: Tensor) -> tuple[Ten
     many = errors.shape[-2]
     repeated = replace(spread, index=spread.index.repeat_interleave(many, 0))
     points, valid = repeated.points(errors.flatten(-3, -2))
-    there = _each(function)(points)
+    there = number_of_each(function)(points)
     return tuple(z.unflatten(-1, (-1, many)) for z in (there, valid & there.isfinite()))  # type: ignore[return-value]
 
 

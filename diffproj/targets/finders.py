@@ -63,7 +63,8 @@ class Found(NamedTuple):
 def find(image: Shaped[np.ndarray, "h w"], target: Board) -> Found:
     """Find the target in a grey image from 0 to 255, uint8 or float32."""
     found = _found(image, target)
-    if isinstance(target, Chessboard) or target.rows == target.columns or found.grid is not None or found.hint:
+    known = found.grid is not None or found.hint or not isinstance(target, CharucoBoard | AprilGrid)
+    if known or target.rows == target.columns:  # the others look alike lying on their side
         return found
     exchanged = replace(target, columns=target.rows, rows=target.columns)
     other = _found(image, exchanged)

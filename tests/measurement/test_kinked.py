@@ -57,6 +57,27 @@ def test_lengths_of_ones_own_near_zero(function: Function, apart: float) -> None
     assert 93 < held([[200.0, 200], [200 + apart, 200]], function) < 98.6
 
 
+@pytest.mark.parametrize("count", [3, 4, 8])
+@pytest.mark.parametrize(
+    "of", [lambda sides: sides.amax(), lambda sides: sides.amax() - sides.amin()], ids=["longest", "spread"]
+)
+def test_many_sides_of_one_length(of: Function, count: int) -> None:
+    """Measured: 91 to 96 %; with a search in four directions alone 54 and 0 % of eight."""
+    exact = [[x, 100.0 + 30 * side] for side in range(count) for x in (200.0, 300.0)]
+    assert held(exact, lambda p: of((p[1::2] - p[::2]).norm(dim=-1))) > 89
+
+
+def test_few_kinks_among_many_numbers() -> None:
+    """Each has the bounds that it has by itself."""
+    pixels = torch.tensor([[200.0, 200], [300, 200], [200, 300], [300.2, 300], [320.0, 400], [200, 400]], dtype=D)
+    measured = dp.measure(pixels, FRONTAL, dp.Plane.z(0.0), pixel_sigma=SIGMA)
+    which = [[0, 1, 4, 5], [0, 1, 2, 3], [4, 5, 0, 1]]
+    low, high = measured.quantity(FUNCTIONS["longer"], which).interval()
+    for row, points in enumerate(which):
+        alone = measured.quantity(FUNCTIONS["longer"], [points]).interval()
+        torch.testing.assert_close(torch.stack([low[row], high[row]]), torch.stack(alone).squeeze(-1))
+
+
 def test_the_truth_at_a_kink_is_held() -> None:
     """Sides that are equal by design, and a difference that is measured as a little more than nothing."""
     pixels = torch.tensor([[200.0, 200], [300, 200], [200, 300], [300.5, 300]], dtype=D)
