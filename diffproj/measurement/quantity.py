@@ -50,8 +50,8 @@ class Quantity(Copied, Shown):
         from the pixels to the plane: near the horizon the upper bound of a length lies further off than the lower one,
         and is infinite where the noise reaches the horizon. No length or area has a negative bound, no angle one beyond
         180 degrees; a length that noise may have made has the lower bound 0. Those of a function of your own that has a
-        kink within the noise, as the longer of two lengths and the difference of two sides without its sign, reach as far
-        as it may go there. Bounds carry no gradients.
+        kink within the noise, as the longer of two lengths and the difference of two sides without its sign, reach as
+        far as it may go there. Bounds carry no gradients.
 
         Raises:
             ValueError: the level is not between 0 and 1.
