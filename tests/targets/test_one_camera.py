@@ -17,7 +17,7 @@ import diffproj as dp
 from diffproj.cli import main
 from diffproj.cli.photographs import one_photograph
 from diffproj.targets.exif import Exif
-from diffproj.targets.one_camera import doubts, of_another_camera, told_of
+from diffproj.targets.one_camera import against_one_camera, doubts, of_another_camera, told_of
 
 BOARD = dp.Chessboard(5, 4)
 
@@ -105,6 +105,18 @@ def test_upright_photographs_that_were_turned_apart_are_told(tmp_path: Path) -> 
     (told,) = warned(tmp_path, "upright")
     assert told.startswith(f"{tmp_path / 'b.jpg'}: EXIF data turn these another way than the others")
     assert warned(tmp_path) == []
+
+
+def test_a_file_that_does_not_tell_how_it_was_turned_is_not_blamed() -> None:
+    """Messengers save photographs upright, without EXIF data."""
+    assert told_of(Exif(), upright=True) == told_of(Exif(), upright=False) == ()
+    turned, saved = [told_of(Exif(6, focal=24.0), upright=True)] * 2, told_of(Exif(focal=24.0), upright=True)
+    assert of_another_camera(turned, ["a"], [saved]) == ""
+    assert against_one_camera(["a", "b", "c"], [*turned, saved]) == []
+    assert against_one_camera(["a", "b"], [told_of(Exif(2), upright=False), told_of(Exif(), upright=False)]) == []
+    assert doubts(["a", "b", "c"], [Exif(6), Exif(6), Exif()], upright=True) == []
+    (told,) = doubts(["a", "b", "c"], [Exif(6), Exif(6), Exif(1)], upright=True)
+    assert told.startswith("c: EXIF data turn these another way")
 
 
 def test_a_file_of_several_pictures_is_told() -> None:
