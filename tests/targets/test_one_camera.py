@@ -221,6 +221,25 @@ def test_a_photograph_of_another_zoom_than_the_calibration_s_is_doubtful(tmp_pat
     assert said in fixed.doubts
 
 
+@pytest.mark.filterwarnings("ignore:photographs:UserWarning")
+@pytest.mark.filterwarnings("ignore::diffproj.CameraMismatchWarning")
+@pytest.mark.parametrize("priors", [None, {"height": (200.0, 100.0)}])
+def test_a_located_photograph_is_not_taken_for_one_that_its_camera_was_calibrated_on(
+    tmp_path: Path, priors: dict[str, tuple[float, float]] | None
+) -> None:
+    views = dp.detect(zoomed(tmp_path, {1: 28.0}, {}), BOARD)
+    calibration = dp.calibrate(views[[0, 2, 3, 4, 5]], BOARD, "none")
+    once = dp.locate(views[[1]], BOARD, calibration, priors=priors, pixel_sigma=0.1)
+    dp.save_camera(tmp_path / "once.json", once)
+    for known in (once, dp.load_calibration(tmp_path / "once.json"), dp.locate(views[[1]], BOARD, once)):
+        assert "EXIF" not in dp.locate(views[[0]], BOARD, known).doubts
+        assert "another focal length" in dp.locate(views[[1]], BOARD, known).doubts
+    alone = dp.locate(views[[1]], BOARD, calibration.camera)  # nothing tells what that camera was calibrated on
+    dp.save_camera(tmp_path / "alone.json", alone)
+    for known in (alone, dp.load_calibration(tmp_path / "alone.json")):
+        assert "EXIF" not in dp.locate(views[[0]], BOARD, known).doubts
+
+
 def test_other_cameras_are_told_by_what_differs_first() -> None:
     own = [told_of(Exif(1, "Canon", "12", "50mm", 50.0), False)] * 2
     assert [value for name, value in own[0] if name == "serial"] == [
