@@ -240,6 +240,20 @@ def test_a_located_photograph_is_not_taken_for_one_that_its_camera_was_calibrate
         assert "EXIF" not in dp.locate(views[[0]], BOARD, known).doubts
 
 
+@pytest.mark.filterwarnings("ignore:photographs:UserWarning")
+@pytest.mark.filterwarnings("ignore::diffproj.CameraMismatchWarning")
+def test_of_many_cameras_residuals_are_not_blamed_for_what_files_tell(tmp_path: Path) -> None:
+    views = dp.detect(zoomed(tmp_path, {1: 28.0}, {}), BOARD)
+    calibration = dp.calibrate(views[[0, 2, 3, 4, 5]], BOARD, "none")
+    files = "EXIF data speak against the photographs of cameras 0, 1 being of the camera that was given"
+    both = views[[0, 1]].expand(2)
+    assert dp.locate(both, BOARD, calibration).contradiction == f"{files}: see remarks"
+    assert (
+        dp.locate(both, BOARD, calibration, pixel_sigma=1e-4).contradiction
+        == f"{files}; the residuals of cameras 0, 1 are larger than pixel_sigma says: see remarks"
+    )
+
+
 def test_other_cameras_are_told_by_what_differs_first() -> None:
     own = [told_of(Exif(1, "Canon", "12", "50mm", 50.0), False)] * 2
     assert [value for name, value in own[0] if name == "serial"] == [
