@@ -199,6 +199,10 @@ def test_a_rig_is_told_of_a_camera_that_changed(tmp_path: Path) -> None:
     told = [one for one in rig.remarks if "EXIF" in one]
     assert len(told) == 1
     assert told[0].startswith("a: EXIF data tell of different focal lengths, 24 mm in 0.png")
+    few = torch.zeros_like(views.visible)
+    few[1, 3:] = True  # three corners do not make a view count
+    rig = dp.calibrate_rig({"a": views.hiding(few), "b": other}, BOARD, "none")
+    assert not [one for one in rig.remarks if "EXIF" in one]
 
 
 @pytest.mark.filterwarnings("ignore:photographs:UserWarning")
