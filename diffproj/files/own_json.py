@@ -58,6 +58,12 @@ def holds_fleet(document: Document) -> bool:
     return bool(_fleet(document))
 
 
+def holds_whole(document: Document) -> bool:
+    """Whether it calls itself a calibration, a rig, or those of a fleet, and so has more than cameras; not read yet."""
+    fields = document.mapping if recognises(document) else {}
+    return holds_fleet(document) or fields.get("format") == RIG or fields.get("calibration") is not None
+
+
 def write(path: Path, item: Camera | Calibration | RigCalibration) -> dict[Path, str]:
     """A camera, a calibration or a rig.
 
