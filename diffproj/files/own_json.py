@@ -193,11 +193,11 @@ def _tensor(fields: dict[str, Any], name: str, dtype: torch.dtype) -> Tensor:
 
 
 def _fleet(document: Document) -> dict[str, dict[str, Any]]:
-    """The lines of a fleet that have a camera, by its name; of two of one name, the later counts."""
+    """The lines of a fleet that have a camera, by its name; of two of one name, the later counts, a failure's too."""
     if document.path.suffix.lower() != ".jsonl":
         return {}
-    lines = [line for line in document.tree if isinstance(line, dict) and line.get("format") == KIND]
-    return {str(line["name"]): line for line in lines if "name" in line}
+    lines = {str(line["name"]): line for line in document.tree if isinstance(line, dict) and "name" in line}
+    return {name: line for name, line in lines.items() if line.get("format") == KIND}
 
 
 def _chosen(document: Document, camera: str | None) -> dict[str, Any]:
