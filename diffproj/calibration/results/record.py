@@ -102,9 +102,9 @@ class Recorded:
         if visible.ndim != len(batch) + 2 or tuple(visible.shape[:-2]) != batch:
             raise ValueError(f"visible: want shape (*{batch}, V, N) as the camera says, got {tuple(visible.shape)}")
         V, N = visible.shape[-2:]
-        names, size = _names(fields["names"], V), _size(fields["size"])
-        views = Views(tensor(fields, "pixels", (*batch, V, N, 2)), visible, names, size)
-        views = Views.unchecked(views.pixels, views.visible, names, size, _told("told", fields.get("told"), V) or ())
+        pixels = tensor(fields, "pixels", (*batch, V, N, 2))
+        names, size, told = _names(fields["names"], V), _size(fields["size"]), _told("told", fields.get("told"), V)
+        views = Views(pixels, visible, names, size, told)
         if None not in (views.size, camera.size) and views.size != camera.size:
             raise ValueError(f"size: want that of the camera, {camera.size}, got {views.size}")
         used, rejected = (mask(fields, name, (*batch, V, N)) for name in ("used", "rejected"))
