@@ -17,8 +17,6 @@ FIELD = 0.9
 """Part of that which the photograph takes, about."""
 SIDES = ((1, 1), (-1, 1), (1, -1), (-1, -1))
 """Where a name may stand beside its mark, right and up, the best first."""
-Box = tuple[float, float, float, float]
-"""A rectangle: left, top, right and bottom."""
 LETTER, LINE = 5.5, 11.0
 """Width of a letter and height of a line in points, about."""
 
@@ -105,22 +103,23 @@ def _sides(names: Sequence[str], places: Float[np.ndarray, "n 2"]) -> list[tuple
         names: what is to be written.
         places: of the marks, in points, down.
     """
-    taken, found = [(x - 5, y - 5, x + 5, y + 5) for x, y in places.tolist()], []
+    # Marks, and behind them the names that stand: left, top, right and bottom.
+    taken, found = np.concatenate([places - 5, places + 5], axis=1), []
+    taken = np.concatenate([taken, np.zeros_like(taken)])
     for n, (name, (x, y)) in enumerate(zip(names, places.tolist(), strict=True)):
         across, boxes = LETTER * len(name) + 6, []
         for right, up in SIDES:
             left, top = x + (6 if right > 0 else -across), y + (-6 - LINE if up > 0 else 6)
             boxes.append((left, top, left + across - 6, top + LINE))
-        others = [box for k, box in enumerate(taken) if k != n]
-        covered = [sum(_overlap(box, other) for other in others) for box in boxes]
-        best = covered.index(min(covered))
-        taken.append(boxes[best])
+        covered = _overlap(np.array(boxes)[:, None], taken[: len(names) + n])
+        covered[:, n] = 0  # its own mark
+        best = int(covered.sum(1).argmin())
+        taken[len(names) + n] = boxes[best]
         found.append(SIDES[best])
     return found
 
 
-def _overlap(one: Box, other: Box) -> float:
-    """The area that two rectangles share."""
-    across = min(one[2], other[2]) - max(one[0], other[0])
-    down = min(one[3], other[3]) - max(one[1], other[1])
-    return max(0.0, across) * max(0.0, down)
+def _overlap(one: Float[np.ndarray, "*#n 4"], other: Float[np.ndarray, "*#n 4"]) -> Float[np.ndarray, "*n"]:
+    """The areas that rectangles share: left, top, right and bottom each."""
+    sides = np.minimum(one[..., 2:], other[..., 2:]) - np.maximum(one[..., :2], other[..., :2])
+    return sides.clip(min=0).prod(-1)

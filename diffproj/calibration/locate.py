@@ -20,7 +20,7 @@ from diffproj.calibration.fitting.second_look import lower_fit
 from diffproj.calibration.known_poses import known_poses
 from diffproj.calibration.least_squares.normal_equations import Equations
 from diffproj.calibration.least_squares.solver import Solution, Status, equations_at
-from diffproj.calibration.outcome import outcome
+from diffproj.calibration.outcome import outcome, told_of_intrinsics
 from diffproj.calibration.problem.constraints import Priors
 from diffproj.calibration.problem.parametrisation import POSE, Parametrisation
 from diffproj.calibration.results.ambiguity import AmbiguousPoseWarning
@@ -120,7 +120,9 @@ def locate(
         if calibrated and found.landmarks is not None:
             text += " Pixels that were picked by hand are less exact than a detector's: pixel_sigma=0.5 says so"
         warn_caller(f"locate: {text}", CameraMismatchWarning)
-    if isinstance(camera, Calibration) and (text := of_another_camera(camera.views.told, views.names, views.told)):
+    if isinstance(camera, Calibration) and (
+        text := of_another_camera(told_of_intrinsics(camera), views.names, views.told)
+    ):
         warn_caller(f"locate: {text}", CameraMismatchWarning)
     return found
 

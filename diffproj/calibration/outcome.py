@@ -166,6 +166,7 @@ def outcome(
         degrees_of_freedom=shaped(noise.freedom),
         lens_region=None if known is None else known.region,
         rig=None if known is None else known.rig,
+        calibrated_on=None if known is None else told_of_intrinsics(known),
         _covariance=partial(_covariance, found, data, before, known, doubt),
         _others=partial(_others, found, data, before),
         _remarks=partial(
@@ -175,7 +176,7 @@ def outcome(
             doubt,
             data,
             [data.views] * len(status),
-            () if known is None else known.views.told,
+            () if known is None else told_of_intrinsics(known),
         ),
         landmarks=landmarks,
         uncertain=data.uncertain,
@@ -185,6 +186,17 @@ def outcome(
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)
     return calibration
+
+
+def told_of_intrinsics(known: Calibration) -> tuple[Told, ...]:
+    """What files tell of the photographs that intrinsics were found from; empty where those are not known.
+
+    The views of a calibration whose intrinsics were held, as `locate` holds them, are others.
+    """
+    if known.calibrated_on is not None:
+        return known.calibrated_on
+    held = known.lens_region is not None or (known.has_covariance and not known.knows_intrinsics)
+    return () if held else known.views.told
 
 
 def remarks_on(

@@ -21,7 +21,7 @@ from rich.table import Table
 
 from diffproj.calibration.calibrate import calibrate_and_tell
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
-from diffproj.cli.fleet_file import append, done_before, line_of
+from diffproj.cli.fleet_file import append, done_before, leave_out_replaced, line_of
 from diffproj.cli.fleet_folder import Folder, Searched, on_one_core, searched, state_of
 from diffproj.cli.inputs import check_writable, writing
 from diffproj.cli.terminal import RESULTS, as_json, counted, failure, in_words, note, progress_bars, result
@@ -48,6 +48,10 @@ def run(options: argparse.Namespace) -> int:
     left = [folder for folder in folders if folder.name not in done]
     if lines:
         note(f"{counted(len(lines), 'camera')} of {len(folders)} done before, by {options.output}")
+    unread = [name for name in done if not states.get(name, "?")]
+    if unread:
+        which = ", ".join(unread[:WORST]) + f" and {len(unread) - WORST} more" * (len(unread) > WORST)
+        note(f"{which}: cannot be looked into now; what {options.output} says stays")
     if changed:
         which = ", ".join(changed[:WORST]) + f" and {len(changed) - WORST} more" * (len(changed) > WORST)
         note(f"{which}: photographs were added, removed or changed since {options.output} was written; done anew")
@@ -65,6 +69,9 @@ def run(options: argparse.Namespace) -> int:
             lines += new
             waiting = []
             bars.update(task, completed=len(lines))
+    if changed:
+        with writing("--output", options.output):
+            leave_out_replaced(options.output)
     _tell(options, lines, len(left), time.perf_counter() - begin, side.unit)
     return 0 if any("camera" in line for line in lines) else 1
 

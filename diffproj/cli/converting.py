@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(said) from error
     told = _told(options, found)
     own = format_to_write(options.output, options.to) is own_json
-    if _is_whole(document) and not (own and isinstance(found, WHOLE)):
+    if own_json.holds_whole(document) and not (own and isinstance(found, WHOLE)):
         note(
             f"{options.output} holds the camera alone: error bars, views and unit of {options.input} stay there, and "
             "what is measured with the camera alone has error bars that are too small"
@@ -76,11 +76,6 @@ def _told(options: argparse.Namespace, found: Camera | Calibration | RigCalibrat
         "size": None if camera.size is None else list(camera.size),
         "lens": model_of(camera.distortion).name,
     }
-
-
-def _is_whole(document: Document) -> bool:
-    """Whether a file holds a calibration, or a rig, or those of a fleet."""
-    return own_json.holds_fleet(document) or isinstance(content_of(document), WHOLE)
 
 
 def _wanted(options: argparse.Namespace, document: Document) -> Camera | Calibration | RigCalibration:

@@ -103,7 +103,7 @@ def _corners(options: argparse.Namespace) -> tuple[Views, Chessboard, tuple[list
                 for i, camera in enumerate(bars.track(cameras, description="Rendering"))
             ]
             views = search(images, setup.board, bars).views
-        named = Views(views.pixels, views.visible, setup.names, views.size)
+        named = Views(views.pixels, views.visible, setup.names, views.size, views.told)
         count = len(setup.fit.R)
         return named, board, (list(range(count)), list(range(count, len(named))))
     views = example_views(options.data)

@@ -1,4 +1,7 @@
-"""The file of a fleet: one line of JSON a camera, appended whole as cameras are done, and picked up where it ends."""
+"""The file of a fleet: one line of JSON a camera, appended whole as cameras are done, and picked up where it ends.
+
+Of several lines of one camera the last counts.
+"""
 
 import json
 import os
@@ -23,12 +26,14 @@ STATE = "files"
 def done_before(
     path: Path, asked: Mapping[str, Any], states: Mapping[str, str]
 ) -> tuple[dict[str, dict[str, Any]], list[str]]:
-    """The lines of cameras that are done, by name; others are taken out of the file, and what was not written whole.
+    """The lines of cameras that are done, by name; of others the file keeps those that are done with other photographs.
+
+    These stay till they are done anew. Failures are taken out of it, and what was not written whole.
 
     Args:
         path: the file, which need not exist.
         asked: the options, which have to be those of its lines.
-        states: of the photographs of each camera now, by name, see `state_of`.
+        states: of the photographs of each camera now, by name, see `state_of`; empty where they are not known.
 
     Returns:
         The lines, and the names of cameras that were done with other photographs than are there now.
@@ -55,11 +60,23 @@ def done_before(
             f"--output: {path} holds cameras with {differ} {other.get(differ)}, not {asked.get(differ)}; {remedy}"
         )
     done = {name: line for name, line in found.items() if DONE in line}
-    changed = [name for name, line in done.items() if name in states and line.get(STATE) != states[name]]
-    done = {name: line for name, line in done.items() if name not in changed}
     if len(done) < len(lines) or not text.endswith("\n"):
-        write_whole(path, "".join(json.dumps(line) + "\n" for line in done.values()))
-    return done, changed
+        _write(path, done)
+    changed = [name for name, line in done.items() if states.get(name) and line.get(STATE) != states[name]]
+    return {name: line for name, line in done.items() if name not in changed}, changed
+
+
+def leave_out_replaced(path: Path) -> None:
+    """Take out the lines of cameras that have a later one.
+
+    Raises:
+        OSError: the file cannot be read, or be written.
+    """
+    _write(path, {line["name"]: line for line in json_lines(path.read_text(encoding="utf-8"))})
+
+
+def _write(path: Path, lines: Mapping[str, dict[str, Any]]) -> None:
+    write_whole(path, "".join(json.dumps(line) + "\n" for line in lines.values()))
 
 
 def line_of(

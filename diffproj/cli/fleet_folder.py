@@ -67,12 +67,16 @@ def searched(folder: Folder) -> Searched:
 def state_of(folder: Path) -> str:
     """What tells whether photographs came, went or changed: their names, sizes and times, in short.
 
-    Their contents are not read, for of a large fleet that takes minutes.
+    Their contents are not read, for of a large fleet that takes minutes. Empty where the folder cannot be looked into,
+    or a photograph went meanwhile: what it holds, or why it holds nothing, the search tells.
     """
     told = hashlib.blake2b(digest_size=16)
-    for file in sorted(one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES and one.exists()):
-        about = file.stat()
-        told.update(repr((file.name, about.st_size, about.st_mtime_ns)).encode("utf-8", "surrogateescape"))
+    try:
+        for file in sorted(one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES and one.exists()):
+            about = file.stat()
+            told.update(repr((file.name, about.st_size, about.st_mtime_ns)).encode("utf-8", "surrogateescape"))
+    except OSError:
+        return ""
     return told.hexdigest()
 
 

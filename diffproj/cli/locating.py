@@ -114,8 +114,7 @@ def _located(
     of_pose = [one for one in (*options.prior, *options.fixed) if one.name in POSE]
     target = surveyed.landmarks
     try:
-        views = Views(surveyed.pixels.unsqueeze(0), visible.unsqueeze(0), [view], size)
-        views = Views.unchecked(views.pixels, views.visible, views.names, size, told_by_file)
+        views = Views(surveyed.pixels.unsqueeze(0), visible.unsqueeze(0), [view], size, told_by_file)
         if of_pose and (free or count < FEWEST):
             found = _adjusted(options, camera, calibration, surveyed, views, sigma, free, tied)
         elif of_pose:

@@ -17,7 +17,7 @@ from diffproj.cli.terminal import counted, detail, note, working
 from diffproj.targets import videos
 from diffproj.targets.boards import Board
 from diffproj.targets.detection import Searched, searched
-from diffproj.targets.exif import MIRRORED, Exif, as_recorded, exif_of
+from diffproj.targets.exif import AS_RECORDED, MIRRORED, Exif, as_recorded, exif_of
 from diffproj.targets.images import SUFFIXES, NotAnImageError, Orientation, Photograph, decoded, listed
 from diffproj.targets.one_camera import doubts
 
@@ -89,12 +89,12 @@ def warn_if_shown_turned(path: Path, orientation: Orientation, pixels: str, exif
         pixels: what holds pixels that somebody read off it, for the message.
         exif: what its file tells, where it was read already: one that is not to be turned is not read again.
     """
-    if orientation == "upright" or (exif is not None and exif.orientation == 1):
+    if orientation == "upright" or (exif is not None and exif.orientation in AS_RECORDED):
         return
     file = _named(path)[0]
     content = file.read_bytes()
     asked = exif_of(content).orientation
-    if asked == 1:
+    if asked in AS_RECORDED:
         return
     small = cv2.IMREAD_REDUCED_GRAYSCALE_8  # a copy is enough to see a turn, and decodes fast
     with _silent_opencv():

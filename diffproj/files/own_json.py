@@ -58,6 +58,12 @@ def holds_fleet(document: Document) -> bool:
     return bool(_fleet(document))
 
 
+def holds_whole(document: Document) -> bool:
+    """Whether it calls itself a calibration, a rig, or those of a fleet, and so has more than cameras; not read yet."""
+    fields = document.mapping if recognises(document) else {}
+    return holds_fleet(document) or fields.get("format") == RIG or fields.get("calibration") is not None
+
+
 def write(path: Path, item: Camera | Calibration | RigCalibration) -> dict[Path, str]:
     """A camera, a calibration or a rig.
 
@@ -187,11 +193,11 @@ def _tensor(fields: dict[str, Any], name: str, dtype: torch.dtype) -> Tensor:
 
 
 def _fleet(document: Document) -> dict[str, dict[str, Any]]:
-    """The lines of a fleet that have a camera, by its name; of two of one name, the later counts."""
+    """The lines of a fleet that have a camera, by its name; of two of one name, the later counts, a failure's too."""
     if document.path.suffix.lower() != ".jsonl":
         return {}
-    lines = [line for line in document.tree if isinstance(line, dict) and line.get("format") == KIND]
-    return {str(line["name"]): line for line in lines if "name" in line}
+    lines = {str(line["name"]): line for line in document.tree if isinstance(line, dict) and "name" in line}
+    return {name: line for name, line in lines.items() if line.get("format") == KIND}
 
 
 def _chosen(document: Document, camera: str | None) -> dict[str, Any]:

@@ -233,9 +233,8 @@ def searched(
     kept = sorted({*range(len(seen))} - {k for k, differs in zip(chosen, new, strict=True) if not differs})
     pixels = torch.from_numpy(np.stack([grids[k] for k in kept])).reshape(len(kept), len(target), 2)
     names = [seen[k].name for k in kept]
-    views = Views(pixels, pixels.isfinite().all(dim=-1), names=names, size=size)
-    told = tuple(told_of(pairs[k][1].exif or pairs[k][0].exif, raster == "upright") for k in kept)
-    views = Views.unchecked(views.pixels, views.visible, views.names, size, told)
+    told = [told_of(pairs[k][1].exif or pairs[k][0].exif, raster == "upright") for k in kept]
+    views = Views(pixels, pixels.isfinite().all(dim=-1), names, size, told)
     made = () if beside is None else tuple(pairs[k][1].beside for k in kept)
     return Searched(views, tuple(seen[k] for k in kept), made, tuple(without), tuple(broken))
 

@@ -9,6 +9,9 @@ from diffproj.targets.animated import frames_of
 MIRRORED = frozenset({2, 4, 5, 7})
 """Orientations in which the picture as recorded and the picture as shown are mirror images of each other."""
 
+AS_RECORDED = (None, 1)
+"""Orientations in which the picture is shown as recorded: not told, and told."""
+
 BESIDE = 1 | 4
 """Bits of a TIFF's `NewSubfileType` that mark a smaller copy of another picture, or where one is transparent."""
 
@@ -38,7 +41,7 @@ class Exif(NamedTuple):
     """What a file tells of a photograph; what it does not tell is empty, or `None`.
 
     Attributes:
-        orientation: from 1, as recorded, to 8; see `MIRRORED`.
+        orientation: from 1, as recorded, to 8; see `MIRRORED`. Readers take a file that does not tell it as recorded.
         camera: maker and model.
         serial: number of the camera.
         lens: name of the lens.
@@ -49,7 +52,7 @@ class Exif(NamedTuple):
         turned_at: where in a TIFF the entry of its orientation begins.
     """
 
-    orientation: int = 1
+    orientation: int | None = None
     camera: str = ""
     serial: str = ""
     lens: str = ""
@@ -73,7 +76,7 @@ def exif_of(content: bytes) -> Exif:
 def as_recorded(content: bytes) -> bytes:
     """A file that OpenCV reads as the sensor recorded it, if told to: TIFFs it turns nevertheless."""
     found = exif_of(content) if content[:2] in (b"II", b"MM") else Exif()
-    if found.turned_at is None or found.orientation == 1:
+    if found.turned_at is None or found.orientation in AS_RECORDED:
         return content
     order, count = "<" if content[:2] == b"II" else ">", "Q" if content[:4] in BIG_TIFF else "I"
     one = struct.pack(f"{order}H{count}H", SHORT, 1, 1)  # the whole entry, for writers may have taken another type
@@ -142,7 +145,7 @@ class _Reader:
                 entries = {**self.entries(part)[0], **entries}
         names = [name for name in (self.text(entries, MAKER), self.text(entries, MODEL)) if name]
         return Exif(
-            orientation=int(orientation) if orientation is not None and 1 <= orientation <= 8 else 1,
+            orientation=int(orientation) if orientation is not None and 1 <= orientation <= 8 else None,
             camera=names[-1] if len(names) > 1 and names[-1].startswith(names[0]) else " ".join(names),
             serial=self.text(entries, SERIAL),
             lens=self.text(entries, LENS),

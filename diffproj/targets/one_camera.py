@@ -60,6 +60,8 @@ def told_of(exif: Exif | None, upright: bool) -> Told:
     if exif.serial:
         exif = exif._replace(serial=f"#{hashlib.blake2b(exif.serial.encode(), digest_size=4).hexdigest()}")
     kept = [(field, getattr(exif, field)) for field, _, _ in KEPT if getattr(exif, field)]
+    if exif.orientation is None:  # it may have been turned before it was saved
+        return tuple(kept)
     turn = (TURN, float(exif.orientation)) if upright else (FLIP, float(exif.orientation in MIRRORED))
     return (*kept, turn)
 
@@ -145,10 +147,11 @@ def _mirrored(files: list[tuple[str, Exif]]) -> str:
 
 
 def _turned_apart(files: list[tuple[str, Exif]]) -> str:
-    """Of photographs that are upright: whether they were turned alike."""
+    """Of photographs that are upright: whether they were turned alike, as far as their files tell."""
     turns: dict[int, list[str]] = {}
     for label, one in files:
-        turns.setdefault(one.orientation, []).append(label)
+        if one.orientation is not None:
+            turns.setdefault(one.orientation, []).append(label)
     if len(turns) < 2:
         return ""
     fewest = min(turns.values(), key=len)

@@ -56,6 +56,7 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
         visible: ArrayLike | None = None,
         names: Sequence[str] | None = None,
         size: Sequence[int] | None = None,
+        told: Sequence[Any] | None = None,
     ) -> None:
         """Copy pixels and mask, and check them.
 
@@ -67,10 +68,12 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
                 does not matter.
             names: V strings; `"view 1"`, `"view 2"`, ... if left out.
             size: `(width, height)` in px, where known.
+            told: what files tell, V tuples of a name and a text or number each, as other views' `told` holds it; empty
+                where nothing is known. Views that are made from detected ones take it along.
 
         Raises:
-            TypeError: pixels are not of floating-point type, visible is not boolean, names are not strings, or size
-                is not two whole numbers.
+            TypeError: pixels are not of floating-point type, visible is not boolean, names are not strings, size is
+                not two whole numbers, or told no names with texts and numbers.
             ValueError: shapes or lengths do not fit, devices differ, or a visible corner is not finite (checked where
                 values can be read).
         """
@@ -78,7 +81,7 @@ class Views(Batched, tensors={"pixels": 3, "visible": 2}, constants=("names", "s
         mask = _check_visible(visible, points)
         self.names = _check_names(names, points.shape[-3])
         self.size = checked_size(size)
-        self.told = ()
+        self.told = _check_told(told, points.shape[-3])
         batch = broadcast_batches(pixels=points.shape[:-3], visible=mask.shape[:-2])
         points, mask = points.expand(*batch, *points.shape[-3:]), mask.expand(*batch, *mask.shape[-2:])
         _check_finite(points, mask, self.names)
@@ -230,6 +233,20 @@ def _check_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:
     if len(names) != count:
         raise ValueError(f"names: want {count}, one for each view of pixels, got {len(names)}")
     return tuple(names)
+
+
+def _check_told(told: Any, count: int) -> tuple[Told, ...]:
+    if told is None or (isinstance(told, tuple | list) and not told):
+        return ()
+    if not isinstance(told, tuple | list) or not all(isinstance(one, tuple | list) for one in told):
+        raise TypeError(f"told: want {count} tuples of names and values, as views.told, got {called(told)}")
+    if len(told) != count:
+        raise ValueError(f"told: want {count}, one for each view of pixels, got {len(told)}")
+    for pair in (pair for one in told for pair in one):
+        named = isinstance(pair, tuple | list) and len(pair) == 2 and isinstance(pair[0], str)
+        if not named or type(pair[1]) not in (str, int, float):
+            raise TypeError(f"told: want names with a text or a number each, as views.told, got {pair!r}")
+    return tuple(tuple((name, value) for name, value in one) for one in told)
 
 
 def _check_finite(pixels: Tensor, visible: Tensor, names: tuple[str, ...]) -> None:

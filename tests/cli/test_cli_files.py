@@ -66,6 +66,17 @@ def test_what_a_format_has_no_place_for_is_told(folder: Path, capsys: pytest.Cap
         assert capsys.readouterr().err == ""
 
 
+def test_one_of_several_unlike_cameras_is_converted(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one, other = KALIBR.split("cam1:")
+    (folder / "unlike.yaml").write_text(one + "cam1:" + other.replace("radtan", "equidistant"))
+    lenses = [dp.load_camera(folder / "unlike.yaml", camera=name).distortion for name in ("cam0", "cam1")]
+    assert type(lenses[0]) is not type(lenses[1])
+    out = str(folder / "out.json")
+    assert main(["convert", str(folder / "unlike.yaml"), out, "--camera", "cam0"]) == 0
+    assert type(dp.load_camera(out).distortion) is type(lenses[0])
+    assert capsys.readouterr().err == ""
+
+
 def test_a_whole_calibration_stays_whole(folder: Path) -> None:
     calibration = dp.calibrate(dp.example_views("left")[:4], dp.Chessboard())
     dp.save_camera(folder / "c.json", calibration)

@@ -89,6 +89,28 @@ def test_each_camera_gets_its_line(fleet, truth, tmp_path, capsys):
     assert "The worst" in out
 
 
+def test_a_folder_that_cannot_be_looked_into_is_one_camera_s_failure(tmp_path, capsys, monkeypatch):
+    """As of another user, or where a photograph goes while its folder is looked through."""
+    fleet, file = tmp_path / "cameras", tmp_path / "out.jsonl"
+    for name in ("closed", "wall"):
+        (fleet / name).mkdir(parents=True)
+        benchmark.cv2.imwrite(str(fleet / name / "0.png"), np.full((240, 320), 90, np.uint8))
+    listed = Path.iterdir
+
+    def closed(folder):
+        if folder.name == "closed":
+            raise PermissionError(13, "Permission denied", str(folder))
+        return listed(folder)
+
+    monkeypatch.setattr(Path, "iterdir", closed)
+    code, out, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    assert (code, err) == (1, "")
+    assert "closed: " in out
+    lines = lines_of(file)
+    assert "Permission denied" in lines["closed"]["error"]
+    assert "found none in" in lines["wall"]["error"]
+
+
 def test_what_is_done_is_not_done_again(fleet, tmp_path, capsys, monkeypatch):
     file = tmp_path / "out.jsonl"
     run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
@@ -142,6 +164,38 @@ def test_photographs_that_came_or_changed_are_noticed(fleet, tmp_path, capsys):
     _, _, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
     assert "2 cameras of 5 done before" in err
     assert "photographs were added" not in err
+
+
+def test_a_camera_that_is_done_anew_stays_till_then(fleet, tmp_path, capsys, monkeypatch):
+    file = tmp_path / "out.jsonl"
+    run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    before = lines_of(file)
+    for name in ("cam2", "cam10"):
+        shutil.copy(fleet / name / "0.png", fleet / name / "9.png")
+    append = calibrating_fleet.append
+
+    def stopped(path, lines):
+        raise KeyboardInterrupt
+
+    def failed(path, lines):  # the line of a failure is behind that of before
+        append(path, [{**before["wall"], "name": "cam2"}])
+        raise KeyboardInterrupt
+
+    for stop, left in ((stopped, {"cam2", "cam10"}), (failed, {"cam10"})):
+        monkeypatch.setattr(calibrating_fleet, "append", stop)
+        run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+        cameras = {name for name, line in lines_of(file).items() if "camera" in line}
+        assert cameras == left
+        assert dp.load_camera(file).batch_shape == ((2,) if len(left) == 2 else ())
+        assert dp.load_calibration(file, "cam10").rms == pytest.approx(before["cam10"]["summary"]["rms"])
+    monkeypatch.setattr(calibrating_fleet, "append", append)
+    _, _, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    assert "cam10: photographs were added" in err
+    assert len(file.read_text().splitlines()) == 5
+    monkeypatch.setattr("diffproj.cli.calibrating_fleet.state_of", lambda folder: "")
+    _, _, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    assert f"cam10, cam2: cannot be looked into now; what {file} says stays" in " ".join(err.split())
+    assert {"cam2", "cam10"} <= {name for name, line in lines_of(file).items() if "camera" in line}
 
 
 def test_the_document_speaks_of_options_and_tells_notes(fleet, tmp_path, capsys, monkeypatch):

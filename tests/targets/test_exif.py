@@ -47,13 +47,13 @@ def test_files_without_it_and_damaged_ones_tell_nothing_wrong(kind: str) -> None
     for end in range(0, len(whole), 7):
         found = exif_of(whole[:end])
         assert found.focal in (None, 24.0)
-        assert found.orientation == 1
+        assert found.orientation in (None, 1)
     for seed in range(300):
         draw = np.random.default_rng(seed)
         damaged = bytearray(whole)
         for place in draw.integers(2, min(len(whole), 400), 8):
             damaged[place] = draw.integers(256)
-        assert 1 <= exif_of(bytes(damaged)).orientation <= 8
+        assert exif_of(bytes(damaged)).orientation in (None, *range(1, 9))
     assert exif_of(b"") == exif_of(b"GIF89a") == exif_of(b"II*\0") == Exif()
 
 

@@ -17,7 +17,7 @@ import diffproj as dp
 from diffproj.cli import main
 from diffproj.cli.photographs import one_photograph
 from diffproj.targets.exif import Exif
-from diffproj.targets.one_camera import doubts, of_another_camera, told_of
+from diffproj.targets.one_camera import against_one_camera, doubts, of_another_camera, told_of
 
 BOARD = dp.Chessboard(5, 4)
 
@@ -107,6 +107,18 @@ def test_upright_photographs_that_were_turned_apart_are_told(tmp_path: Path) -> 
     assert warned(tmp_path) == []
 
 
+def test_a_file_that_does_not_tell_how_it_was_turned_is_not_blamed() -> None:
+    """Messengers save photographs upright, without EXIF data."""
+    assert told_of(Exif(), upright=True) == told_of(Exif(), upright=False) == ()
+    turned, saved = [told_of(Exif(6, focal=24.0), upright=True)] * 2, told_of(Exif(focal=24.0), upright=True)
+    assert of_another_camera(turned, ["a"], [saved]) == ""
+    assert against_one_camera(["a", "b", "c"], [*turned, saved]) == []
+    assert against_one_camera(["a", "b"], [told_of(Exif(2), upright=False), told_of(Exif(), upright=False)]) == []
+    assert doubts(["a", "b", "c"], [Exif(6), Exif(6), Exif()], upright=True) == []
+    (told,) = doubts(["a", "b", "c"], [Exif(6), Exif(6), Exif(1)], upright=True)
+    assert told.startswith("c: EXIF data turn these another way")
+
+
 def test_a_file_of_several_pictures_is_told() -> None:
     assert doubts(["a.tif"], [Exif(pictures=3)], upright=False) == [
         "a.tif: want one picture a file, got several; the first was taken"
@@ -187,6 +199,10 @@ def test_a_rig_is_told_of_a_camera_that_changed(tmp_path: Path) -> None:
     told = [one for one in rig.remarks if "EXIF" in one]
     assert len(told) == 1
     assert told[0].startswith("a: EXIF data tell of different focal lengths, 24 mm in 0.png")
+    few = torch.zeros_like(views.visible)
+    few[1, 3:] = True  # three corners do not make a view count
+    rig = dp.calibrate_rig({"a": views.hiding(few), "b": other}, BOARD, "none")
+    assert not [one for one in rig.remarks if "EXIF" in one]
 
 
 @pytest.mark.filterwarnings("ignore:photographs:UserWarning")
@@ -207,6 +223,39 @@ def test_a_photograph_of_another_zoom_than_the_calibration_s_is_doubtful(tmp_pat
     with pytest.warns(dp.CameraMismatchWarning, match=said):
         fixed = dp.locate(views[[1]], BOARD, known, priors={"height": (200.0, 100.0)}, pixel_sigma=0.1)
     assert said in fixed.doubts
+
+
+@pytest.mark.filterwarnings("ignore:photographs:UserWarning")
+@pytest.mark.filterwarnings("ignore::diffproj.CameraMismatchWarning")
+@pytest.mark.parametrize("priors", [None, {"height": (200.0, 100.0)}])
+def test_a_located_photograph_is_not_taken_for_one_that_its_camera_was_calibrated_on(
+    tmp_path: Path, priors: dict[str, tuple[float, float]] | None
+) -> None:
+    views = dp.detect(zoomed(tmp_path, {1: 28.0}, {}), BOARD)
+    calibration = dp.calibrate(views[[0, 2, 3, 4, 5]], BOARD, "none")
+    once = dp.locate(views[[1]], BOARD, calibration, priors=priors, pixel_sigma=0.1)
+    dp.save_camera(tmp_path / "once.json", once)
+    for known in (once, dp.load_calibration(tmp_path / "once.json"), dp.locate(views[[1]], BOARD, once)):
+        assert "EXIF" not in dp.locate(views[[0]], BOARD, known).doubts
+        assert "another focal length" in dp.locate(views[[1]], BOARD, known).doubts
+    alone = dp.locate(views[[1]], BOARD, calibration.camera)  # nothing tells what that camera was calibrated on
+    dp.save_camera(tmp_path / "alone.json", alone)
+    for known in (alone, dp.load_calibration(tmp_path / "alone.json")):
+        assert "EXIF" not in dp.locate(views[[0]], BOARD, known).doubts
+
+
+@pytest.mark.filterwarnings("ignore:photographs:UserWarning")
+@pytest.mark.filterwarnings("ignore::diffproj.CameraMismatchWarning")
+def test_of_many_cameras_residuals_are_not_blamed_for_what_files_tell(tmp_path: Path) -> None:
+    views = dp.detect(zoomed(tmp_path, {1: 28.0}, {}), BOARD)
+    calibration = dp.calibrate(views[[0, 2, 3, 4, 5]], BOARD, "none")
+    files = "EXIF data speak against the photographs of cameras 0, 1 being of the camera that was given"
+    both = views[[0, 1]].expand(2)
+    assert dp.locate(both, BOARD, calibration).contradiction == f"{files}: see remarks"
+    assert (
+        dp.locate(both, BOARD, calibration, pixel_sigma=1e-4).contradiction
+        == f"{files}; the residuals of cameras 0, 1 are larger than pixel_sigma says: see remarks"
+    )
 
 
 def test_other_cameras_are_told_by_what_differs_first() -> None:

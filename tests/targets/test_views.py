@@ -304,3 +304,23 @@ def test_a_name_of_several_views_names_none() -> None:
         view_number("a", ["b", "a", "a"])
     assert view_number("b", ["b", "a", "a"]) == 0
     assert view_number(2, ["b", "a", "a"]) == 2
+
+
+def test_what_files_tell_goes_along_into_views_that_are_made_from_others() -> None:
+    pixels, told = torch.rand(2, 6, 2), ((("focal", 24.0), ("camera", "Nikon")), ())
+    views = Views(pixels, told=told)
+    assert views.told == told
+    assert Views(views.pixels, told=views[[1, 0]].told).told == told[::-1]
+    assert Views(pixels, told=()).told == Views(pixels).told == ()
+    with pytest.raises(ValueError, match="told: want 2, one for each view of pixels, got 1"):
+        Views(pixels, told=told[:1])
+    for wrong in (
+        "24 mm",
+        ["a", "b"],
+        [("focal", 24.0), ()],
+        [(("focal",),), ()],
+        [((1, 2),), ()],
+        [(("a", None),), ()],
+    ):
+        with pytest.raises(TypeError, match="told: want"):
+            Views(pixels, told=wrong)

@@ -24,6 +24,13 @@ from diffproj.calibration.results.remark import Kind, Remarks, text_of
 from diffproj.geometry.camera import Camera
 from diffproj.targets.views import Views
 
+OF_MANY = {
+    Kind.CONTRADICTION: "the residuals of cameras {} are larger than pixel_sigma says",
+    Kind.TOLD_APART: "EXIF data speak against the photographs of cameras {} being of the camera that was given",
+}
+REMARK = "something speaks against the poses of cameras {}"
+"""What a remark of a kind says against poses, and any other one, of some of many cameras."""
+
 SENTENCES = {
     Status.CONVERGED: "converged: no step lowers the error any more",
     Status.MAX_ITERATIONS: "was still falling when the iterations ended: raise max_iterations, or look for mixed-up "
@@ -158,14 +165,15 @@ class Account(Shown):
         """
         if not (self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics)):
             return ""
-        said = [
-            text_of(one for one in remarks if one.kind not in (Kind.BELOW, Kind.LEFT_OUT)) for remarks in self.findings
-        ]
+        said = [[one for one in remarks if one.kind not in (Kind.BELOW, Kind.LEFT_OUT)] for remarks in self.findings]
         if not self.views.batch_shape:
-            return said[0]
-        many = [camera for camera, text in enumerate(said) if text]
-        which = ", ".join(map(str, many))
-        return f"the residuals of cameras {which} are larger than pixel_sigma says: see remarks" if many else ""
+            return text_of(said[0])
+        cameras: dict[str, list[str]] = {}
+        for camera, remarks in enumerate(said):
+            for what in dict.fromkeys(OF_MANY.get(one.kind, REMARK) for one in remarks):
+                cameras.setdefault(what, []).append(str(camera))
+        found = "; ".join(what.format(", ".join(which)) for what, which in cameras.items())
+        return f"{found}: see remarks" if found else ""
 
     @property
     def ambiguity(self) -> str:

@@ -28,6 +28,7 @@ from diffproj.calibration.results.record import Recorded
 from diffproj.calibration.results.region import covered_region
 from diffproj.calibration.results.remark import Remarks, text_of
 from diffproj.geometry.camera import Camera
+from diffproj.targets.exif import Told
 from diffproj.targets.residuals import projected_minus_seen
 from diffproj.targets.views import Views
 
@@ -76,6 +77,7 @@ class Calibration(Account, Copied, Recorded, Indexed):
         degrees_of_freedom: how many independent residuals tell `pixel_sigma` `(*B,)`, and so the scale of the
             covariance; `None` where that is not known.
         lens_region: for what `locate` found with a calibration, the `region` of that one.
+        calibrated_on: for the same, what files tell of the photographs behind the intrinsics, as `Views.told` does.
         shares: how much each view counted for the camera `(*B, V)`: 1, or 1 over the number of views that show the
             board as it does, to within 2 px, which bring nothing new. `None` where all counted fully.
         skew: whether the skew of K is among the parameters: it was fitted, or K had some that was held.
@@ -113,6 +115,7 @@ class Calibration(Account, Copied, Recorded, Indexed):
     uncertain: Bool[Tensor, " n"] | None = None
     discounted: Bool[Tensor, "*batch v n"] | None = None
     rig: str | None = None
+    calibrated_on: tuple[Told, ...] | None = None
     _covariance: Callable[[], Covariance] | None = None
     _others: Callable[[], OtherPoses] | None = None
     _remarks: Callable[[], tuple[Remarks, ...]] | None = None

@@ -73,6 +73,7 @@ class Recorded:
             "names": list(self.views.names),
             "size": self.views.size,
             "told": [dict(one) for one in self.views.told] or None,
+            "calibrated_on": None if self.calibrated_on is None else [dict(one) for one in self.calibrated_on],
             **{name: None if found is None else found.tolist() for name, found in lists.items()},
             "covariance": self.covariance_of_kept_poses.to_fields() if self.has_covariance else None,
             "other_poses": others
@@ -101,9 +102,9 @@ class Recorded:
         if visible.ndim != len(batch) + 2 or tuple(visible.shape[:-2]) != batch:
             raise ValueError(f"visible: want shape (*{batch}, V, N) as the camera says, got {tuple(visible.shape)}")
         V, N = visible.shape[-2:]
-        names, size = _names(fields["names"], V), _size(fields["size"])
-        views = Views(tensor(fields, "pixels", (*batch, V, N, 2)), visible, names, size)
-        views = Views.unchecked(views.pixels, views.visible, names, size, _told(fields.get("told"), V))
+        pixels = tensor(fields, "pixels", (*batch, V, N, 2))
+        names, size, told = _names(fields["names"], V), _size(fields["size"]), _told("told", fields.get("told"), V)
+        views = Views(pixels, visible, names, size, told)
         if None not in (views.size, camera.size) and views.size != camera.size:
             raise ValueError(f"size: want that of the camera, {camera.size}, got {views.size}")
         used, rejected = (mask(fields, name, (*batch, V, N)) for name in ("used", "rejected"))
@@ -140,6 +141,7 @@ class Recorded:
             lens_region=_region(fields),
             unit=_unit(fields.get("unit")),
             rig=_rig(fields.get("rig")),
+            calibrated_on=_told("calibrated_on", fields.get("calibrated_on")),
             landmarks=_landmarks(fields.get("landmarks"), N),
             uncertain=mask(fields, "uncertain", (N,)) if present(fields, "uncertain") else None,
             discounted=discounted,
@@ -240,12 +242,13 @@ def _names(names: Any, count: int) -> tuple[str, ...]:
     return found
 
 
-def _told(told: Any, count: int) -> tuple[Told, ...]:
-    """What the views' photographs told of their camera; files of earlier releases lack it."""
+def _told(name: str, told: Any, count: int | None = None) -> tuple[Told, ...] | None:
+    """What so many photographs, or any number of them, told of their camera; files of earlier releases lack it."""
     if told is None:
-        return ()
-    if not isinstance(told, list | tuple) or len(told) != count or not all(map(_is_told, told)):
-        raise ValueError(f"told: want {count} objects of texts and numbers, one for each view, got something else")
+        return None
+    if not isinstance(told, list | tuple) or count not in (None, len(told)) or not all(map(_is_told, told)):
+        want = "objects" if count is None else f"{count} objects, one for each view,"
+        raise ValueError(f"{name}: want {want} of texts and numbers, got something else")
     return tuple(tuple(one.items()) for one in told)
 
 

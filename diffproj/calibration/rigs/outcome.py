@@ -260,7 +260,7 @@ def _remarks(
         flat = found.restraint is None and not found.parameters.bow
         # On its own it had a flat target; what that says of the tags' distance holds for a free one. And priors weighed
         # against corners of 1 px there, which in the rig do so against the noise that these have.
-        views_seen = views.data[name].views
+        views_seen = views.data[name].views[used.any(-1)]
         said += [f"{name}: {sentence}" for sentence, _ in against_one_camera(views_seen.names, views_seen.told)]
         own = (one for one in alone[name].findings() if one.kind not in (Kind.PRIOR_WEIGHT, Kind.TOLD_APART))
         told = text_of(one for one in own if flat or one.kind == Kind.SPACING)
