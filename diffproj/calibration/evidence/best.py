@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from diffproj.calibration.evidence.descent import FEW, Found, Rival, Task, descended, spare
+from diffproj.calibration.evidence.descent import FEW, Found, Rival, Task, descended, reach, spare
 from diffproj.calibration.evidence.observations import Seen
 from diffproj.calibration.evidence.pose_parameters import ANGLES, PLACE
 from diffproj.calibration.evidence.search import starts
@@ -30,7 +30,7 @@ RIVAL, RIVAL_STEPS = 50.0, 4
 ANOTHER = 2.0
 """Turn in degrees from which on a pose is another one."""
 ELSEWHERE = 0.05
-"""The same of its place, in the camera's height."""
+"""The same of its place, in the distance of what was seen."""
 ENOUGH = 4
 """Landmarks that tell a pose but for its mirror image."""
 SPARSE, SPARSE_TRIED, SPARSE_STEPS = 8, 8, 40
@@ -134,7 +134,7 @@ def _with_rival(task: Task, found: Found, steps: int) -> Found:
         return replace(found, rival=none)
     turn = turn if near.parameters.start is None else near.parameters.start
     other = descended(task, turn, near.values, found.prior, (), steps)
-    return _rivalled(found, other, told)
+    return _rivalled(task, found, other, told)
 
 
 def _with_other(task: Task, found: Found, steps: int, *, anywhere: bool) -> Found:
@@ -150,7 +150,7 @@ def _with_other(task: Task, found: Found, steps: int, *, anywhere: bool) -> Foun
     k = len(near.values) // P
     turn = near.parameters.rotation(near.values) if near.parameters.start is None else near.parameters.start
     ends = descended(task, turn, near.values, near.prior, (k,), min(steps, SPARSE_STEPS))
-    apart = _apart(found, ends)
+    apart = _apart(task, found, ends)
     if not anywhere:
         R = found.parameters.rotation(found.values).repeat(k, 1, 1)
         apart &= (ends.parameters.rotation(ends.values) * R).sum((-2, -1)) > 1
@@ -159,24 +159,24 @@ def _with_other(task: Task, found: Found, steps: int, *, anywhere: bool) -> Foun
     start = None if ends.parameters.start is None else ends.parameters.start[chosen]
     state = {name: getattr(ends, name)[chosen] for name in _STATE}
     other = replace(found, parameters=replace(ends.parameters, start=start), **state)
-    return _rivalled(found, other, told)
+    return _rivalled(task, found, other, told)
 
 
-def _apart(found: Found, other: Found) -> Tensor:
+def _apart(task: Task, found: Found, other: Found) -> Tensor:
     """Which of `(k P,)` poses are others than that of their camera `(P,)`."""
     k = len(other.values) // len(found.values)
     R = found.parameters.rotation(found.values).repeat(k, 1, 1)
     place, away = found.values[:, -3:].repeat(k, 1), other.values[:, -3:]
     # The trace of a rotation by an angle a is 1 + 2 cos a.
     turned = (other.parameters.rotation(other.values) * R).sum((-2, -1)) < 1 + 2 * math.cos(math.radians(ANOTHER))
-    return turned | ((away - place).norm(dim=-1) > ELSEWHERE * place[:, 2].abs())
+    return turned | ((away - place).norm(dim=-1) > ELSEWHERE * reach(task, found.values).repeat(k))
 
 
-def _rivalled(found: Found, other: Found, told: Tensor) -> Found:
+def _rivalled(task: Task, found: Found, other: Found, told: Tensor) -> Found:
     """The minima with others in the place of those that are much higher, and the higher of the two as rivals."""
     R, place = found.parameters.rotation(found.values), found.values[:, -3:]
     there, away = other.parameters.rotation(other.values), other.values[:, -3:]
-    cost = torch.where(told & _apart(found, other), _ended(other), torch.inf)
+    cost = torch.where(told & _apart(task, found, other), _ended(other), torch.inf)
     better = cost < found.cost - SURELY
     above = torch.where(better, found.cost - cost, cost - found.cost).nan_to_num(torch.inf, torch.inf)
     rival = Rival(above, torch.where(better[:, None, None], R, there), torch.where(better[:, None], place, away))

@@ -78,3 +78,18 @@ def test_three_landmarks_have_several_poses() -> None:
     assert int(found.converged.sum()) > 0.7 * COUNT  # 45; of others nothing tells the pose
     assert found.rivals is not None
     assert not (far_off(found) & (found.rivals.ratio >= 100)).any()
+
+
+@pytest.mark.parametrize("count", [3, 4, 5])
+@pytest.mark.parametrize("height", [0.0, 2000.0])
+def test_another_pose_lies_elsewhere_by_the_distance_of_what_was_seen(count: int, height: float) -> None:
+    """The world's origin may be the camera, or far below it: what differs by rounding alone is the same pose."""
+    at = torch.tensor([0.0, 0.0, height], dtype=D)
+    level = camera(5.0, 5.0, 0.0, 0.0, [0.0, 0.0])
+    mast = level.at(level.R, -(level.R @ at))
+    points = torch.tensor([[-3.0, 20, 1], [3, 20, 2], [0, 20, -2], [4, 20, -1], [-4, 20, 3]], dtype=D)[:count] + at
+    start = mast.at(level.R, -(level.R @ (at + torch.tensor([0.1, 0.1, 0.0], dtype=D))))
+    found = dp.adjust(start, dp.Seen(points, mast.project(points)[0] + noise(4, count, 2)), fixed=("height",))
+    assert found.rivals is not None
+    assert bool(found.rivals.ratio.isinf())
+    assert not found.doubts
