@@ -516,5 +516,6 @@ def test_another_pose_of_three_landmarks_is_told(
         assert bool(again.ambiguous)
         assert said in dp.measure([[600.0, 600.0]], again, dp.Plane.z(0.0), 0, 1.0).doubts
         adjusted = dp.adjust(camera, dp.Seen(points, seen), priors={"height": (6.0, 20.0)})
-        there = found["position"]["z"]["deviation"]
-        assert there == pytest.approx(float(adjusted.mounting_deviations.height), rel=0.05)
+        spread = adjusted.mounting_deviations
+        told = [found["position"][axis]["deviation"] for axis in "xyz"]
+        assert told == pytest.approx([*spread.position.tolist(), float(spread.height)], rel=1e-3)
