@@ -15,7 +15,9 @@ from diffproj.calibration.evidence.observations import Seen
 from diffproj.calibration.locate import locate
 from diffproj.calibration.problem.parametrisation import Parametrisation
 from diffproj.calibration.refine import refine
+from diffproj.calibration.results.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
+from diffproj.calibration.results.mismatch import CameraMismatchWarning
 from diffproj.calibration.results.remark import Kind
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
 from diffproj.cli.inputs import check_not_the_same, check_writable, writing
@@ -37,6 +39,8 @@ FEWEST = 4
 """Landmarks that a pose needs."""
 OPTIONS = {"priors": "--prior", "fixed": "--fixed", "pixel_sigma": "--pixel-sigma"}
 """Of the library, and what they are called here."""
+TOLD = {Kind.TOLD_APART: CameraMismatchWarning, Kind.RIVAL: AmbiguousPoseWarning}
+"""What is warned of here where `locate` would."""
 
 
 def run(options: argparse.Namespace) -> int:
@@ -175,7 +179,11 @@ def _adjusted(
         free=tuple(name for name in freed if name not in taken),
         tied_focal=tied,
     )
-    return of_view(adjusted, views, surveyed.landmarks, sigma)
+    found = of_view(adjusted, views, surveyed.landmarks, sigma, calibration, held=not free)
+    for remark in found.findings[0]:
+        if remark.kind in TOLD:
+            warn_caller(remark.sentence, TOLD[remark.kind])
+    return found
 
 
 def _check_count(options: argparse.Namespace, count: int) -> None:

@@ -484,3 +484,38 @@ def test_help_fits_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     assert code == 0
     assert "--landmarks" in out
     assert all(len(line) <= 80 for line in out.splitlines())
+
+
+THREE = [[624.0, 554.0], [770.0, 847.0], [508.0, 440.0]]
+
+
+@pytest.mark.parametrize("free", [(), ("--prior", "focal=1200+-2")])
+def test_another_pose_of_three_landmarks_is_told(
+    free: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What `adjust` doubts, the verdict, the warnings, the file and what is measured with it do too."""
+    camera = dp.Camera.mounted(6.0, 20.0, 2.0, 30.0, focal=1200.0, size=(1280, 960))
+    seen = torch.tensor(THREE, dtype=torch.float64)
+    points, _ = dp.back_project(seen, camera, dp.Plane.z(0.0))
+    seen = seen + torch.randn(seen.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    rows = [",".join(map(str, (*p, *x))) for p, x in zip(seen.tolist(), points.tolist(), strict=True)]
+    (tmp_path / "three.csv").write_text("\n".join(["u,v,x,y,z", *rows]))
+    dp.save_camera(tmp_path / "mast.json", camera.without_pose())
+    files = ("--camera", str(tmp_path / "mast.json"), "--landmarks", str(tmp_path / "three.csv"), "--pixel-sigma", "1")
+    known = ("--prior", "height=6+-20", *free)
+    code, out, err = run(capsys, *files, *known, "-o", tmp_path / "out.json", "--json")
+    found = json.loads(out)
+    assert code == 0
+    said = "another pose explains the evidence nearly as well"
+    assert said in found["verdict"]
+    assert said in err
+    assert any(said in text for text in found["warnings"])
+    again = dp.load_calibration(tmp_path / "out.json")
+    assert said in again.verdict
+    if not free:
+        assert bool(again.ambiguous)
+        assert said in dp.measure([[600.0, 600.0]], again, dp.Plane.z(0.0), 0, 1.0).doubts
+        adjusted = dp.adjust(camera, dp.Seen(points, seen), priors={"height": (6.0, 20.0)})
+        spread = adjusted.mounting_deviations
+        told = [found["position"][axis]["deviation"] for axis in "xyz"]
+        assert told == pytest.approx([*spread.position.tolist(), float(spread.height)], rel=1e-3)

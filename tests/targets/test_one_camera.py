@@ -301,5 +301,16 @@ def test_commands_tell_a_photograph_of_another_zoom_than_the_camera_s(
         said = "1.png: EXIF data tell of another focal length than those of the photographs"
         assert [text for text in told["warnings"] if said in text]
         assert said in told.get("doubts", told.get("verdict"))
+    few = "\n".join(["u,v,x,y,z", rows[0], rows[4], rows[-1]])
+    (tmp_path / "three.csv").write_text(few)
+    known, out = ("--prior", "tilt=-60+-30", "--pixel-sigma", "0.5"), str(tmp_path / "out.json")
+    for name, more in (("three.csv", ()), ("points.csv", ("--free", "focal"))):
+        at = ("--landmarks", str(tmp_path / name), *known, *more)
+        for photograph, expected in (("1.png", True), ("2.png", False)):
+            assert main(["locate", str(folder / photograph), *camera, *at, "-o", out, "--json"]) == 0
+            told = json.loads(capsys.readouterr().out)
+            assert bool([text for text in told["warnings"] if said in text]) == expected
+            assert (said in told["verdict"]) == expected
+            assert (said in dp.load_calibration(out).remarks[0]) == expected
     assert main([*["measure", str(folder / "2.png"), *camera, *on], "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["warnings"] == []

@@ -36,6 +36,7 @@ VERTICAL_WORDS = (
 )
 NEARLY = 100.0
 """Likelihood ratio below which another pose may be the true one."""
+ANOTHER_POSE = "another pose explains the evidence nearly as well"
 ANY_ANGLE = 180 / 3**0.5
 """Deviation of an angle in degrees of which nothing is known."""
 ROUNDED = 1e-7
@@ -167,11 +168,17 @@ class Adjustment(Calibration):
             return ""
         unit = f" {self.unit}" if self.unit else ""
         return (
-            f"another pose explains the evidence nearly as well, {float(1 / other.ratio):.2g} times as likely: height "
+            f"{ANOTHER_POSE}, {float(1 / other.ratio):.2g} times as likely: height "
             f"{float(other.height):.4g}{unit}, tilt {float(other.tilt):.1f}, roll {float(other.roll):.1f}, heading "
             f"{float(other.heading):.1f} degrees; a prior on one of these, or more evidence, as of landmarks off the "
             "plane of the others, tells them apart"
         )
+
+    @property
+    def rival_remarks(self) -> Remarks:
+        """The other pose of one camera as a remark, where it may be the right one."""
+        said = self._rival
+        return (Remark(said, Kind.RIVAL, ANOTHER_POSE),) if said else ()
 
     @property
     def region(self) -> None:  # type: ignore[override]

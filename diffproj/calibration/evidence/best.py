@@ -6,14 +6,15 @@ that it does not, and where points on a plane look alike from both sides, it goe
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from diffproj.calibration.evidence.descent import FEW, Found, Rival, Task, descended, spare
-from diffproj.calibration.evidence.observations import Seen
+from diffproj.calibration.evidence.descent import FEW, Found, Rival, Task, descended, reach, spare, surveyed
 from diffproj.calibration.evidence.pose_parameters import ANGLES, PLACE
 from diffproj.calibration.evidence.search import starts
+from diffproj.calibration.evidence.some_cameras import STATE, for_some
 from diffproj.calibration.least_squares.solver import Prior, Status
 from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.geometry.mounting import mounting_from_rotation
@@ -30,16 +31,15 @@ RIVAL, RIVAL_STEPS = 50.0, 4
 ANOTHER = 2.0
 """Turn in degrees from which on a pose is another one."""
 ELSEWHERE = 0.05
-"""The same of its place, in the camera's height."""
+"""The same of its place, in the distance of what was seen."""
 ENOUGH = 4
-"""Landmarks that tell a pose but for its mirror image."""
+"""Landmarks, as many as the camera sees, that tell a pose but for its mirror image."""
 SPARSE, SPARSE_TRIED, SPARSE_STEPS = 8, 8, 40
 """Spare residuals below which other minima are looked for; how many starts are followed, and for how many steps."""
 HAIR = 1e-4
 """Cost of half a turn away from the camera's own direction, over 4."""
 TRIED = 8
 """How many of them are followed, for `FEW` steps before the best is followed to its minimum."""
-_STATE = ("values", "status", "iterations", "cost")
 
 
 def best(task: Task, steps: int) -> Found:
@@ -49,12 +49,27 @@ def best(task: Task, steps: int) -> Found:
     whole pose, that at its mirror image; where it tells little more than the unknowns, any that other starts lead to.
     """
     found = _nearest(task, steps)
-    landmarks = sum(len(piece) for piece in task.pieces if isinstance(piece, Seen))
     if steps == 0 or not task.pieces:
         return found
-    if landmarks < ENOUGH and bool(((left := spare(task, found)) >= 0).logical_and(left < SPARSE).any()):
-        return _with_other(task, found, steps, anywhere=landmarks >= 3)
-    return found if landmarks < 3 else _with_rival(task, found, steps)
+    landmarks, left = surveyed(task)[1].sum(-1), spare(task, found)
+    sparse = (landmarks < ENOUGH) & (left >= 0) & (left < SPARSE)
+    mirrored = (landmarks >= 3) & ~sparse
+    if not bool((sparse | mirrored).any()):
+        return found
+    found = replace(found, rival=_none(found))
+    # Those of one number of landmarks together: starts depend on it, and each camera has those it had alone.
+    for count in landmarks[sparse].unique().tolist():
+        rows = (sparse & (landmarks == count)).nonzero().flatten()
+        found = for_some(task, found, rows, partial(_with_other, steps=steps, anywhere=count >= 3))
+    if bool(mirrored.any()):
+        found = for_some(task, found, mirrored.nonzero().flatten(), partial(_with_rival, steps=steps))
+    return found
+
+
+def _none(found: Found) -> Rival:
+    """No rival of any camera."""
+    R, place = found.parameters.rotation(found.values), found.values[:, -3:]
+    return Rival(torch.full_like(found.cost, torch.inf), R, place)
 
 
 def _nearest(task: Task, steps: int) -> Found:
@@ -111,33 +126,30 @@ def _exchanged(found: Found, other: Found, where: Tensor) -> Found:
         start = torch.where(where[:, None, None], other.parameters.start, found.parameters.start)
     parts = {
         name: torch.where(where.reshape(-1, *(1,) * (old.ndim - 1)), getattr(other, name), old)
-        for name, old in ((name, getattr(found, name)) for name in _STATE)
+        for name, old in ((name, getattr(found, name)) for name in STATE)
     }
     return replace(found, parameters=replace(found.parameters, start=start), **parts)
 
 
-def _with_rival(task: Task, found: Found, steps: int) -> Found:
+def _with_rival(task: Task, found: Found, *, steps: int) -> Found:
     """The minimum, or that at the mirrored pose if it is much lower; and the other of the two as its rival.
 
     Seen from afar, points on a plane look alike from both sides of the line of sight.
     """
     told = (spare(task, found) >= 0) & (found.status == Status.CONVERGED)
-    nothing = torch.full_like(found.cost, torch.inf)
-    R, place = found.parameters.rotation(found.values), found.values[:, -3:]
-    none = Rival(nothing, R, place)
     if not bool(told.any()):
-        return replace(found, rival=none)
+        return replace(found, rival=_none(found))
     begin, turn = _mirrored(task, found)
     near = descended(task, turn, begin, found.prior, (), min(steps, RIVAL_STEPS))
     told &= near.cost < found.cost + RIVAL  # of each by itself, whatever others of the batch there are
     if not bool(told.any()):
-        return replace(found, rival=none)
+        return replace(found, rival=_none(found))
     turn = turn if near.parameters.start is None else near.parameters.start
     other = descended(task, turn, near.values, found.prior, (), steps)
-    return _rivalled(found, other, told)
+    return _rivalled(task, found, other, told)
 
 
-def _with_other(task: Task, found: Found, steps: int, *, anywhere: bool) -> Found:
+def _with_other(task: Task, found: Found, *, steps: int, anywhere: bool) -> Found:
     """The same with the lowest other minimum that starts all around lead to.
 
     As many residuals as unknowns are explained by several poses, and a few more hardly tell them apart. Unless
@@ -150,33 +162,33 @@ def _with_other(task: Task, found: Found, steps: int, *, anywhere: bool) -> Foun
     k = len(near.values) // P
     turn = near.parameters.rotation(near.values) if near.parameters.start is None else near.parameters.start
     ends = descended(task, turn, near.values, near.prior, (k,), min(steps, SPARSE_STEPS))
-    apart = _apart(found, ends)
+    apart = _apart(task, found, ends)
     if not anywhere:
         R = found.parameters.rotation(found.values).repeat(k, 1, 1)
         apart &= (ends.parameters.rotation(ends.values) * R).sum((-2, -1)) > 1
     cost = torch.where(apart, _ended(ends), torch.inf).reshape(k, P)
     chosen = cost.argmin(0) * P + torch.arange(P, device=cost.device)
     start = None if ends.parameters.start is None else ends.parameters.start[chosen]
-    state = {name: getattr(ends, name)[chosen] for name in _STATE}
+    state = {name: getattr(ends, name)[chosen] for name in STATE}
     other = replace(found, parameters=replace(ends.parameters, start=start), **state)
-    return _rivalled(found, other, told)
+    return _rivalled(task, found, other, told)
 
 
-def _apart(found: Found, other: Found) -> Tensor:
+def _apart(task: Task, found: Found, other: Found) -> Tensor:
     """Which of `(k P,)` poses are others than that of their camera `(P,)`."""
     k = len(other.values) // len(found.values)
     R = found.parameters.rotation(found.values).repeat(k, 1, 1)
     place, away = found.values[:, -3:].repeat(k, 1), other.values[:, -3:]
     # The trace of a rotation by an angle a is 1 + 2 cos a.
     turned = (other.parameters.rotation(other.values) * R).sum((-2, -1)) < 1 + 2 * math.cos(math.radians(ANOTHER))
-    return turned | ((away - place).norm(dim=-1) > ELSEWHERE * place[:, 2].abs())
+    return turned | ((away - place).norm(dim=-1) > ELSEWHERE * reach(task, found.values).repeat(k))
 
 
-def _rivalled(found: Found, other: Found, told: Tensor) -> Found:
+def _rivalled(task: Task, found: Found, other: Found, told: Tensor) -> Found:
     """The minima with others in the place of those that are much higher, and the higher of the two as rivals."""
     R, place = found.parameters.rotation(found.values), found.values[:, -3:]
     there, away = other.parameters.rotation(other.values), other.values[:, -3:]
-    cost = torch.where(told & _apart(found, other), _ended(other), torch.inf)
+    cost = torch.where(told & _apart(task, found, other), _ended(other), torch.inf)
     better = cost < found.cost - SURELY
     above = torch.where(better, found.cost - cost, cost - found.cost).nan_to_num(torch.inf, torch.inf)
     rival = Rival(above, torch.where(better[:, None, None], R, there), torch.where(better[:, None], place, away))
@@ -186,17 +198,19 @@ def _rivalled(found: Found, other: Found, told: Tensor) -> Found:
 def _mirrored(task: Task, found: Found) -> tuple[Tensor, Tensor]:
     """Values `(P, q)` and rotations `(P, 3, 3)` of the pose that mirrors the plane of the points at the line of sight.
 
-    With n the normal of the plane, m the middle of the points and s the direction to it, `R' = (I - 2 s s^T) R
-    (I - 2 n n^T)`: what lies across s stays.
+    With n the normal of the plane, m the middle of the points that the camera sees and s the direction to it,
+    `R' = (I - 2 s s^T) R (I - 2 n n^T)`: what lies across s stays.
     """
     R, place = found.parameters.rotation(found.values), found.values[:, -3:]
-    points = torch.cat([piece.points.detach().to(R) for piece in task.pieces if isinstance(piece, Seen)])
-    middle = points.mean(0)
-    normal = torch.linalg.svd(points - middle, full_matrices=False).Vh[-1]
+    points, visible = surveyed(task)
+    seen = visible.unsqueeze(-1).to(R)
+    middle = (points * seen).sum(1) / seen.sum(1).clamp(min=1)
+    normal = torch.linalg.svd((points - middle.unsqueeze(1)) * seen, full_matrices=False).Vh[:, -1]
     toward = (R @ (middle - place).unsqueeze(-1)).squeeze(-1)
     sight = toward / toward.norm(dim=-1, keepdim=True).clamp(min=1e-300)
     across = R - 2 * sight.unsqueeze(-1) * (sight.unsqueeze(-2) @ R)
-    turn = across - 2 * (across @ normal).unsqueeze(-1) * normal
+    normal = normal.unsqueeze(-2)
+    turn = across - 2 * (across @ normal.mT) @ normal
     mirrored_place = middle - (turn.mT @ toward.unsqueeze(-1)).squeeze(-1)
     moving = torch.tensor([task.known.moves(name) for name in PLACE], device=R.device)
     angles = torch.zeros_like(place)

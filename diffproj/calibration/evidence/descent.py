@@ -242,11 +242,27 @@ def spare(task: Task, found: Found) -> Tensor:
     return seen + known - found.basis.shape[-1]
 
 
-def reach(task: Task, values: Tensor) -> Tensor:
-    """The distance of what was seen `(P,)`: of surveyed points, else the height of the camera."""
-    center = values[:, -3:]
-    seen = [piece.points.detach().to(center) for piece in task.pieces if isinstance(piece, Seen)]
-    height = center[:, 2].abs().clamp(min=1e-9)
+def surveyed(task: Task) -> tuple[Tensor, Tensor]:
+    """All surveyed points `(N, 3)` of the observations, and which of them each camera sees `(P, N)`."""
+    seen = [piece for piece in task.pieces if isinstance(piece, Seen)]
+    K = task.camera.K.detach()
     if not seen:
+        P = K.reshape(-1, 3, 3).shape[0]
+        return K.new_zeros(0, 3), torch.zeros(P, 0, dtype=torch.bool, device=K.device)
+    visible = [piece.visible.to(K.device).expand(*task.batch, -1).reshape(-1, len(piece)) for piece in seen]
+    return torch.cat([piece.points.detach().to(K) for piece in seen]), torch.cat(visible, dim=-1)
+
+
+def reach(task: Task, values: Tensor) -> Tensor:
+    """The distance of what was seen `(P,)`: of the surveyed points that were, else the height of the camera.
+
+    Values may be those of several starts in front of the batch of cameras.
+    """
+    center = values[:, -3:]
+    height = center[:, 2].abs().clamp(min=1e-9)
+    points, visible = surveyed(task)
+    if not bool(visible.any()):
         return height
-    return (torch.cat(seen) - center.unsqueeze(1)).norm(dim=-1).median(-1).values.maximum(1e-3 * height)
+    far = (points - center.unsqueeze(1)).norm(dim=-1)
+    far = torch.where(visible.repeat(len(far) // len(visible), 1), far, torch.nan).nanmedian(-1).values
+    return torch.where(far.isnan(), height, far.maximum(1e-3 * height))

@@ -41,9 +41,10 @@ def starts(
         begin: their values `(P, q)`.
         batch: the shape of the P cameras, over which observations broadcast.
     """
-    seen = [piece for piece in pieces if isinstance(piece, Seen) and len(piece) >= 2]
+    most = {piece: int(piece.visible.sum(-1).amax()) for piece in pieces if isinstance(piece, Seen)}
+    seen = [piece for piece, count in most.items() if count >= 2]
     turns = any(not isinstance(piece, Horizon | Heights | Lengths) for piece in pieces)  # those know no heading
-    angles = _directions(known, camera, begin, rolls=any(len(piece) >= 3 for piece in seen), turns=turns)
+    angles = _directions(known, camera, begin, rolls=any(count >= 3 for count in most.values()), turns=turns)
     R = rotation_from_mounting(*angles.unbind(-1))  # (K, P, 3, 3)
     held = [known.given(name) for name in PLACE]
     tries = [begin[:, -3:]]

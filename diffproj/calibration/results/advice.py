@@ -184,6 +184,12 @@ def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | 
         faults.append(f"pixel coordinates outnumber unknowns by {spare:.0f} only, so they hardly test each other")
         remedies.append("more landmarks, near and far, in all parts of the image")
     faults += _reasons(remarks, *OF_THE_CAMERA)
+    if apart := _reasons(remarks, Kind.TOLD_APART):
+        faults += apart
+        remedies.append("a calibration of this camera, lens and zoom, or photographs that it took alone")
+    if other := _reasons(remarks, Kind.RIVAL):
+        faults += other
+        remedies.append("more landmarks, off the plane of the others, or a prior that tells the poses apart")
     if contradicted := _reasons(remarks, Kind.CONTRADICTION, Kind.WRONG_PRIOR):
         faults += contradicted
         remedies.append("a look at wrong landmarks and wrong priors, or larger deviations for them")

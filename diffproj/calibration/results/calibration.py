@@ -290,11 +290,11 @@ class Calibration(Account, Copied, Recorded, Indexed):
 
     @property
     def _middle(self) -> Float[Tensor, "3"]:
-        """That of the target, about which its two poses turn; after `adjust` that of the covariance."""
-        if len(self.nominal):
-            return self.nominal.mean(0)
+        """That about which two poses turn: of the target; after `adjust` that of the covariance."""
         known = self.covariance_of_kept_poses.middle
-        return self.nominal.new_zeros(3) if known is None else known
+        if known is not None:
+            return known
+        return self.nominal.mean(0) if len(self.nominal) else self.nominal.new_zeros(3)
 
     @cached_property
     def covariance_of_kept_poses(self) -> Covariance:

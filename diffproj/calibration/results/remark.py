@@ -33,6 +33,8 @@ class Kind(StrEnum):
     """The corners of a view err together, another way in each view, as on a board that bends."""
     CONTRADICTION = "contradiction"
     """The residuals contradict the deviations that were given."""
+    RIVAL = "rival"
+    """Another pose explains the evidence nearly as well."""
     BELOW = "below"
     """Landmarks on a level plane are seen from below, by a camera that is upside down if z is up."""
     LEFT_OUT = "left out"

@@ -53,7 +53,9 @@ def test_what_is_well_known_is_as_slopes_tell() -> None:
 
 
 def test_priors_are_straight() -> None:
-    given = dp.adjust(TRUE, priors={"height": 2.0, "tilt": 10.0}, fixed=("roll", "heading", "position"))
+    """Followed to two deviations beside a person who tells nothing, they cost what their deviations say."""
+    anyone = dp.Heights([[640.0, 900.0]], [[640.0, 600.0]], 1.7, 1e4)
+    given = dp.adjust(TRUE, anyone, priors={"height": 2.0, "tilt": 10.0}, fixed=("roll", "heading", "position"))
     spread = given.mounting_deviations
     assert [float(spread.height), float(spread.tilt)] == pytest.approx([2.0, 10.0])
 

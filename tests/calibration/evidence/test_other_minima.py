@@ -1,9 +1,13 @@
 """Little evidence is explained by several poses: what `adjust` says is within its deviations, or doubted."""
 
+from typing import Any
+
 import pytest
 import torch
 
 import diffproj as dp
+from diffproj.calibration.evidence.best import _with_other
+from diffproj.calibration.evidence.descent import Found, Task
 
 D = torch.float64
 COUNT = 60
@@ -78,3 +82,93 @@ def test_three_landmarks_have_several_poses() -> None:
     assert int(found.converged.sum()) > 0.7 * COUNT  # 45; of others nothing tells the pose
     assert found.rivals is not None
     assert not (far_off(found) & (found.rivals.ratio >= 100)).any()
+
+
+@pytest.mark.parametrize("count", [3, 4, 5])
+@pytest.mark.parametrize("height", [0.0, 2000.0])
+def test_another_pose_lies_elsewhere_by_the_distance_of_what_was_seen(count: int, height: float) -> None:
+    """The world's origin may be the camera, or far below it: what differs by rounding alone is the same pose."""
+    at = torch.tensor([0.0, 0.0, height], dtype=D)
+    level = camera(5.0, 5.0, 0.0, 0.0, [0.0, 0.0])
+    mast = level.at(level.R, -(level.R @ at))
+    points = torch.tensor([[-3.0, 20, 1], [3, 20, 2], [0, 20, -2], [4, 20, -1], [-4, 20, 3]], dtype=D)[:count] + at
+    start = mast.at(level.R, -(level.R @ (at + torch.tensor([0.1, 0.1, 0.0], dtype=D))))
+    found = dp.adjust(start, dp.Seen(points, mast.project(points)[0] + noise(4, count, 2)), fixed=("height",))
+    assert found.rivals is not None
+    assert bool(found.rivals.ratio.isinf())
+    assert not found.doubts
+
+
+@pytest.mark.parametrize("unseen", [0, 3])
+def test_landmarks_that_are_not_seen_do_not_count(unseen: int) -> None:
+    """Measured: as with the three alone; where they counted, 2 of 60 were far off without a word."""
+    points, seen = ground([[624.0, 554.0], [770.0, 847.0], [508.0, 440.0]])
+    more = points[:unseen] + torch.tensor([3.0, 4.0, 1.0], dtype=D)
+    nowhere = torch.full((COUNT, unseen, 2), torch.nan, dtype=D)
+    pixels = torch.cat([seen + noise(3, COUNT, 3, 2), nowhere], dim=1)
+    start = camera(9.0, 40.0, 17.0, 50.0, [5.0, -5.0])
+    found = dp.adjust(start, dp.Seen(torch.cat([points, more]), pixels), throw=False)
+    assert found.rivals is not None
+    assert int(found.converged.sum()) == 45
+    assert int((found.rivals.ratio < 100).sum()) == 45
+    assert not (far_off(found) & (found.rivals.ratio >= 100)).any()
+
+
+def test_each_camera_of_a_batch_is_looked_at_as_if_alone() -> None:
+    """Some see three landmarks, some two, and some eight on a plane, which has a mirrored pose, off it others."""
+    places = [[624.0, 554.0], [770.0, 847.0], [508.0, 440.0], [600.0, 500.0], [650.0, 640.0], [560.0, 600.0]]
+    points, _ = ground(places)
+    middle = points.mean(0)
+    points = torch.cat([middle + 0.02 * (points - middle), middle + 3 * torch.eye(3, dtype=D)])
+    pixels = (TRUE.project(points)[0] + 0.3 * noise(6, 4, 9, 2)).reshape(2, 2, 9, 2)
+    hidden = [[[3, 4, 5, 6, 7, 8], [6, 7, 8]], [[2, 3, 4, 5, 6, 7, 8], []]]
+    for i in (0, 1):
+        for j in (0, 1):
+            pixels[i, j, hidden[i][j]] = torch.nan
+    start = camera(7.0, 24.0, 5.0, 36.0, [1.0, -1.0])
+    known = {"priors": {"height": (6.0, 0.5), "tilt": torch.tensor([3.0, 4.0], dtype=D)}, "throw": False}
+    batch = dp.adjust(start, dp.Seen(points, pixels), **known)  # type: ignore[arg-type]
+    assert batch.rivals is not None
+    for i in (0, 1):
+        for j in (0, 1):
+            kept = pixels[i, j].isfinite().all(-1)
+            seen = dp.Seen(points[kept], pixels[i, j, kept])
+            one = dp.adjust(start, seen, priors={"height": (6.0, 0.5), "tilt": 3.0 + j}, throw=False)
+            ratio = torch.inf if one.rivals is None else float(one.rivals.ratio)
+            assert float(batch.rivals.ratio[i, j]) == pytest.approx(ratio, rel=1e-4), (i, j)
+            assert float(batch.mounting.height[i, j]) == pytest.approx(float(one.mounting.height), rel=1e-6), (i, j)
+
+
+def test_few_of_many_are_looked_at_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of evidence of each kind, as the whole batch tells it."""
+    more = [[u, v] for u in (250.0, 500.0, 750.0, 1000.0) for v in (450.0, 600.0, 800.0)]
+    points, feet = ground(more)
+    tops = TRUE.project(points + torch.tensor([0.0, 0, 1.7], dtype=D))[0]
+    pixels = feet + noise(7, 5, 12, 2)
+    pixels[:4, 3:] = torch.nan
+    pixels[4, :3] = torch.nan
+    pieces = [
+        dp.Seen(points, pixels),
+        dp.Heights(
+            feet[:2].expand(5, 2, 2),
+            tops[:2] + noise(8, 5, 2, 2),
+            1.7,
+            torch.full((5, 2), 0.07, dtype=D),
+            pixel_sigma=1.0,
+        ),
+    ]
+    looked: list[tuple[int, ...]] = []
+
+    def spied(task: Task, found: Found, **options: Any) -> Found:
+        looked.append(task.batch)
+        return _with_other(task, found, **options)
+
+    monkeypatch.setattr("diffproj.calibration.evidence.best._with_other", spied)
+    found = dp.adjust(TRUE, pieces, throw=False)
+    assert looked == [(4,)]
+    monkeypatch.setattr("diffproj.calibration.evidence.some_cameras.OF_ITEMS", {})
+    whole = dp.adjust(TRUE, pieces, throw=False)
+    assert found.rivals is not None
+    assert whole.rivals is not None
+    assert torch.allclose(found.rivals.ratio, whole.rivals.ratio)
+    assert torch.allclose(found.cameras.t, whole.cameras.t)
