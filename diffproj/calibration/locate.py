@@ -20,12 +20,13 @@ from diffproj.calibration.fitting.second_look import lower_fit
 from diffproj.calibration.known_poses import known_poses
 from diffproj.calibration.least_squares.normal_equations import Equations
 from diffproj.calibration.least_squares.solver import Solution, Status, equations_at
-from diffproj.calibration.outcome import outcome, told_of_intrinsics
+from diffproj.calibration.outcome import outcome
 from diffproj.calibration.problem.constraints import Priors
 from diffproj.calibration.problem.parametrisation import POSE, Parametrisation
 from diffproj.calibration.results.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.results.mismatch import CameraMismatchWarning, described
+from diffproj.calibration.results.source import told_of_intrinsics
 from diffproj.geometry.camera import Camera, as_camera
 from diffproj.targets.boards import origin_doubt
 from diffproj.targets.chessboard import Chessboard

@@ -22,6 +22,7 @@ from diffproj.calibration.results.calibration import Calibration, CalibrationErr
 from diffproj.calibration.results.covariance import Covariance, points_turned, reshaped
 from diffproj.calibration.results.mismatch import Mismatch
 from diffproj.calibration.results.remark import Kind, Remark, Remarks
+from diffproj.calibration.results.source import told_of_intrinsics
 from diffproj.calibration.trust.adequacy import poses_only
 from diffproj.calibration.trust.compatibility import mismatch
 from diffproj.calibration.trust.discounted import discounted
@@ -186,17 +187,6 @@ def outcome(
     if throw and bool((status != Status.CONVERGED).any()):
         raise CalibrationError(f"{who}: {calibration.message}", calibration)
     return calibration
-
-
-def told_of_intrinsics(known: Calibration) -> tuple[Told, ...]:
-    """What files tell of the photographs that intrinsics were found from; empty where those are not known.
-
-    The views of a calibration whose intrinsics were held, as `locate` holds them, are others.
-    """
-    if known.calibrated_on is not None:
-        return known.calibrated_on
-    held = known.lens_region is not None or (known.has_covariance and not known.knows_intrinsics)
-    return () if held else known.views.told
 
 
 def remarks_on(

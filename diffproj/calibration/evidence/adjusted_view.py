@@ -10,6 +10,7 @@ from torch import Tensor
 from diffproj.calibration.evidence.adjustment import Adjustment
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.results.remark import Kind, Remark, Remarks
+from diffproj.calibration.results.source import told_of_intrinsics
 from diffproj.targets.exif import Told
 from diffproj.targets.landmarks import Landmarks
 from diffproj.targets.one_camera import of_another_camera
@@ -36,6 +37,7 @@ def of_view(
         held: whether all intrinsics are those of the calibration.
     """
     used = views.visible
+    before = () if calibration is None else told_of_intrinsics(calibration)
     each = torch.as_tensor(pixel_sigma, dtype=torch.float64, device=views.device).expand(used.shape)
     return Calibration(
         adjusted.camera,
@@ -52,9 +54,10 @@ def of_view(
         skew=adjusted.skew,
         landmarks=landmarks.names,
         lens_region=calibration.region if held and calibration is not None else None,
+        calibrated_on=before if held else None,
         _covariance=partial(getattr, adjusted, "covariance_of_kept_poses"),
         _others=adjusted._others,
-        _remarks=partial(_remarks, adjusted, views, () if calibration is None else calibration.views.told),
+        _remarks=partial(_remarks, adjusted, views, before),
     )
 
 
