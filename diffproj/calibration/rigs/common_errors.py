@@ -125,16 +125,11 @@ def common_errors(found: RigFit, variance: Tensor, freedom: Tensor, bend: Tensor
         freedom: the degrees of freedom that it is from `(C,)`.
         bend: the mean slope of a robust loss's score `(C,)`, 1 without a loss.
     """
-    C, H, basis = len(found.views.names), found.curvature(bend), found.basis
+    C, basis = len(found.views.names), found.basis
     moves = moves_of(found, bend, len(OF_KIND), lambda group, panel: _moved(group, panel, C))
-    S, F, inverse_W, _ = reduced(H, basis, None)
-    free, size = moves.shared, H.U.diagonal(dim1=-2, dim2=-1)
-    if basis is not None:
-        free, size = free @ basis[0], (basis.mT @ H.U @ basis).diagonal(dim1=-2, dim2=-1)
-    inverse_S = inverse(S, size)[0][0]
-    left = free - moves.local @ F[0].mT.unsqueeze(1)  # (M, C, 5, q): with the moment's pose eliminated
+    left, inverse_S, inverse_W = without_poses(found, bend, moves)
     # G is of views of one moment, but for what the shared unknowns do, which is of all moments.
-    G = -torch.einsum("mcai,mij,mdbj->mcadb", moves.local, inverse_W[0], moves.local)
+    G = -torch.einsum("mcai,mij,mdbj->mcadb", moves.local, inverse_W, moves.local)
     c = torch.arange(len(found.views.names), device=G.device)
     G[:, c, :, c] += moves.weight.transpose(0, 1)
     by_shared = torch.einsum("mcai,ij,mdbj->mcadb", left, inverse_S, left)
@@ -211,6 +206,19 @@ def moves_of(found: RigFit, bend: Tensor, count: int, moved: Callable[[Group, Te
         moves.pull[where] = torch.einsum("nbap,nap,np->nb", B, panel[:, -1], pull)
         moves.weight[where] = torch.einsum("nbap,ncap,np->nbc", B, B, weight)
     return moves
+
+
+def without_poses(found: RigFit, bend: Tensor, moves: Moves) -> tuple[Tensor, Tensor, Tensor]:
+    """What moves do to the scores by the free shared unknowns with the moment's pose eliminated `(M, C, b, q)`.
+
+    With it the inverses of the normal matrix of these unknowns `(q, q)`, and of the poses' blocks `(M, 6, 6)`.
+    """
+    H, basis = found.curvature(bend), found.basis
+    S, F, inverse_W, _ = reduced(H, basis, None)
+    free, size = moves.shared, H.U.diagonal(dim1=-2, dim2=-1)
+    if basis is not None:
+        free, size = free @ basis[0], (basis.mT @ H.U @ basis).diagonal(dim1=-2, dim2=-1)
+    return free - moves.local @ F[0].mT.unsqueeze(1), inverse(S, size)[0][0], inverse_W[0]
 
 
 def _moved(group: Group, panel: Tensor, cameras: int) -> Tensor:

@@ -18,9 +18,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffproj.calibration.least_squares.eliminated import inverse, reduced
 from diffproj.calibration.problem.parametrisation import POSE
-from diffproj.calibration.rigs.common_errors import moves_of
+from diffproj.calibration.rigs.common_errors import moves_of, without_poses
 from diffproj.calibration.rigs.fit import RigFit
 from diffproj.calibration.rigs.problem import Group
 from diffproj.calibration.rigs.uncertainty import CameraNoise, noisy_moments
@@ -81,14 +80,9 @@ def contradicting_moment(found: RigFit, noise: CameraNoise) -> Contradiction | N
     if not bool((level.sqrt() > EXACT_PX).all()):
         return None
     moves = moves_of(found, noise.bend, POSE, lambda group, panel: _by_pose(found, group, panel))
-    H, basis = found.curvature(noise.bend), found.basis
-    S, F, inverse_W, _ = reduced(H, basis, None)
-    free, size = moves.shared, H.U.diagonal(dim1=-2, dim2=-1)
-    if basis is not None:
-        free, size = free @ basis[0], (basis.mT @ H.U @ basis).diagonal(dim1=-2, dim2=-1)
-    inverse_S = inverse(S, size)[0][0]
-    left = free - moves.local @ F[0].mT.unsqueeze(1)  # (M, C, 6, q): with the moment's pose eliminated
-    V = moves.weight - torch.einsum("mcai,mij,mcbj->mcab", moves.local, inverse_W[0], moves.local)
+    basis = found.basis
+    left, inverse_S, inverse_W = without_poses(found, noise.bend, moves)
+    V = moves.weight - torch.einsum("mcai,mij,mcbj->mcab", moves.local, inverse_W, moves.local)
     V = V - left @ inverse_S @ left.mT
     told = moves.weight.diagonal(dim1=-2, dim2=-1)
     there = told[..., 0] > 0
