@@ -620,7 +620,7 @@ def test_deviations_are_opencvs(side: str) -> None:
 def test_the_full_covariance_is_the_dense_inverse() -> None:
     _, views = simulate(
         5, seed=1
-    )  # seed 0 also has a variance of focal lengths, by chance: test_own_focal.py tests that
+    )  # seed 0 also has a variance of focal lengths, by chance: test_own_intrinsics.py tests that
     found = dp.calibrate(views, BOARD, "brown4", fixed=("p1",), tied_focal=True)
     full = found.covariance.full()
     assert full.shape == (8 + 30, 8 + 30)

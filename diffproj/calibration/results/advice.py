@@ -155,6 +155,8 @@ def judged(seen: Evidence) -> Judgement:
         remedies.insert(0, "no other photograph yet, but shape='free', or a board whose sides were measured both ways")
     if Kind.FOCUS in seen.kinds:
         remedies.insert(0, "the photographs once more with focus and zoom held")
+    if Kind.STEADIED in seen.kinds:
+        remedies.insert(0, "the photographs once more with image stabilisation switched off")
     if Kind.SPACING in seen.kinds:
         remedies.insert(0, "no other photograph yet, but the side and the distance of the tags measured")
     if Kind.WRONG_PRIOR in seen.kinds:
@@ -235,6 +237,7 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
             Kind.UNEVEN_PRINT,
             Kind.SPACING,
             Kind.FOCUS,
+            Kind.STEADIED,
             Kind.BENT,
             Kind.FLEXING,
             *OF_THE_CAMERA,

@@ -27,6 +27,8 @@ class Kind(StrEnum):
     """The tags of an AprilGrid do not stand as far apart as it says."""
     FOCUS = "focus"
     """The focal length differs from view to view."""
+    STEADIED = "steadied"
+    """The principal point differs from view to view."""
     BENT = "bent board"
     """The board is bent."""
     FLEXING = "flexing board"

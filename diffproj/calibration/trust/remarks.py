@@ -32,7 +32,7 @@ from diffproj.calibration.trust.dispersion import Pulls, contradiction, dispersi
 from diffproj.calibration.trust.entangled import Entangled, Simpler
 from diffproj.calibration.trust.flexing import of_a_flexing_board
 from diffproj.calibration.trust.leftover import Leftover, f_deviations, leftover
-from diffproj.calibration.trust.own_focal import OwnFocal, own_focal
+from diffproj.calibration.trust.own_intrinsics import OwnIntrinsics, own_intrinsics
 from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
 from diffproj.calibration.trust.prior_weight import Elsewhere, weighed_anew
 from diffproj.calibration.trust.small_effects import SmallEffects
@@ -56,7 +56,8 @@ LIFTED = 2.0
 """Times as far off the board's plane as within it that corners must lie for the plane to be named."""
 CAMERAS_SAVE = 0.7
 """Part of the sum of squares that two groups must save to explain it: two zooms saved 0.74 to 0.99 in simulated views,
-on boards that bent another way in each view two groups saved 0.50 to 0.71."""
+on boards that bent another way in each view two groups saved 0.50 to 0.71. And that a principal point for each view
+must: of paper in hands .56, of recordings with corners that are .3 px off by it .73 to .9."""
 MOST_NAMED = 5
 """Views that are named."""
 NO_DENOMINATOR = {"brown8": "'brown5'"} | dict.fromkeys(("brown12", "brown14"), "fixed=('k4', 'k5', 'k6')")
@@ -134,12 +135,12 @@ def remarks(
         # What is known beforehand and does not fit holds the camera where turned photographs would fit better.
         turned = turned_photographs(found, which[~found.has_prior()[which]], sizes)
         small = SmallEffects(found, which, left, of_landmarks)
-        own = own_focal(found, dispersion(found, pulls), pulls)
+        own = own_intrinsics(found, dispersion(found, pulls), pulls)
         for i, p in enumerate(map(int, which.tolist())):
             saved = groups[p].saved if p in groups else 0.0
-            if p in turned and turned[p].saved > max(
-                BETTER * saved, _otherwise(left, i)
-            ):  # all else may come from that
+            shaken = own is not None and bool(own.point_told[p])
+            if p in turned and _is_turned(turned[p], shaken, max(BETTER * saved, _otherwise(left, i))):
+                # All else may come from that.
                 said[p].append(_turned(names[p], turned[p]))
                 continue
             if p in wrong:
@@ -155,9 +156,9 @@ def remarks(
                 continue
             remark = _left_over(task, left, i, p)
             two = p in groups and saved > BETTER * float(left.smooth.share[i])
-            focus = None if two or p in wrong else _of_the_focus(own, p, found.knows_noise)
-            # Cameras or focal lengths that differ leave residuals that are smooth in each view, too.
-            told = (two and saved > CAMERAS_SAVE) or focus is not None or p in wrong
+            differs = None if two or p in wrong or own is None else _of_own_intrinsics(own, p, found.knows_noise)
+            # Cameras or intrinsics that differ leave residuals that are smooth in each view, too.
+            told = (two and saved > CAMERAS_SAVE) or (differs is not None and _explains(differs, own, p)) or p in wrong
             if not (of_landmarks or told) and (remark is None or remark.kind not in OF_THE_CAMERA):
                 flexing = of_a_flexing_board(found, p, float(sigma[p]), float(left.shape.share[i]))
                 remark = flexing or remark or _noisy(float(sigma[p]))
@@ -165,7 +166,7 @@ def remarks(
                 said[p].append(_two_cameras(names[p], groups[p]))
                 remark = None if remark is not None and remark.kind in OF_THE_CAMERA else remark
             elif remark is None and p not in wrong:
-                remark = focus or small.of(i)
+                remark = differs or small.of(i)
             said[p] += [] if remark is None else [remark]
     return tuple(map(tuple, said))
 
@@ -313,18 +314,37 @@ def _of_the_print(left: Leftover, i: int) -> Remark:
     )
 
 
-def _of_the_focus(own: OwnFocal | None, p: int, knows_noise: bool) -> Remark | None:
-    if own is None or not bool(own.told[p]):
-        return None
-    part = f"{100 * float(own.spread[p]):.1g} %"
-    held = "those of pixel_sigma, which do not count that" if knows_noise else "those of the mean focal length"
-    return Remark(
-        f"the focal length differs by about {part} from view to view, as of a camera that focuses anew for each "
-        "photograph: switch autofocus off and hold the zoom, for calibrating and for measuring; the deviations are "
-        f"{held}, and in one photograph it may be off by {part}",
-        Kind.FOCUS,
-        "its focal length differs from view to view",
-    )
+def _is_turned(turned: Turned, shaken: bool, otherwise: float) -> bool:
+    """Whether photographs are turned, which saves more than all else does; principal points scatter in one heap."""
+    return turned.saved > otherwise and (turned.in_heaps or not shaken)
+
+
+def _explains(differs: Remark, own: OwnIntrinsics | None, p: int) -> bool:
+    """Whether intrinsics that differ are what there is to say; on a board that bends principal points seem to, too."""
+    return differs.kind != Kind.STEADIED or (own is not None and float(own.point.saved[p]) > CAMERAS_SAVE)
+
+
+def _of_own_intrinsics(own: OwnIntrinsics, p: int, knows_noise: bool) -> Remark | None:
+    held = "those of pixel_sigma, which do not count that" if knows_noise else "those of the mean"
+    if bool(own.focal_told[p]):
+        part = f"{100 * float(own.focal.spread[p]):.1g} %"
+        return Remark(
+            f"the focal length differs by about {part} from view to view, as of a camera that focuses anew for each "
+            "photograph: switch autofocus off and hold the zoom, for calibrating and for measuring; the deviations are "
+            f"{held}, and in one photograph it may be off by {part}",
+            Kind.FOCUS,
+            "its focal length differs from view to view",
+        )
+    if bool(own.point_told[p]):
+        part = f"{float(own.point.spread[p]):.2g} px"
+        return Remark(
+            f"the principal point differs by about {part} from view to view, as of a lens, a sensor or a recording "
+            "that is steadied against shaking: switch that off, for calibrating and for measuring; the deviations are "
+            f"{held}, and in one photograph it may be off by {part}",
+            Kind.STEADIED,
+            "its principal point differs from view to view",
+        )
+    return None
 
 
 def _left_over(task: Task, left: Leftover, i: int, p: int) -> Remark | None:

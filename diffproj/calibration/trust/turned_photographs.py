@@ -52,10 +52,14 @@ WIDTHS = (0.0, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5, 2.5, 4.0)
 
 
 class Turned(NamedTuple):
-    """The views of one camera that are turned against the others, and the part of the sum of squares they cost."""
+    """The views of one camera that are turned against the others, and the part of the sum of squares they cost.
+
+    `in_heaps` where the views are in two heaps, and not in one wide one.
+    """
 
     views: list[int]
     saved: float
+    in_heaps: bool
 
 
 def turned_photographs(found: Fit, which: Tensor, sizes: Sequence[tuple[int, int] | None]) -> dict[int, Turned]:
@@ -86,13 +90,14 @@ def turned_photographs(found: Fit, which: Tensor, sizes: Sequence[tuple[int, int
         choice = _Choice(seen, T, Q[:, :few, :few], pull[:, :few], size, *_turn(task.names[:few], shared, size))
         turned = choice.best(task.used.any(-1))
         share = task.used.any(-1).to(shared) * (1.0 if task.shares is None else task.shares)
-        saved, of_each, level, spare, clear = choice.judged(turned, share, part.degrees_of_freedom())
+        saved, of_each, level, spare, heaps = choice.judged(turned, share, part.degrees_of_freedom())
+        clear = heaps | (saved > BEYOND_CHOICE * share.sum(-1) * level)
         told = ((saved > _as_rare(CERTAIN, spare) * level) & clear).unsqueeze(-1) & turned
         told &= of_each > (_as_rare(OF_A_VIEW, spare) * level).unsqueeze(-1)
         total = 2 * seen.c.sum(-1)
     groups = {}
     for i in told.any(-1).nonzero().flatten().tolist():
-        groups[int(which[i])] = Turned(told[i].nonzero().flatten().tolist(), float(saved[i] / total[i]))
+        groups[int(which[i])] = Turned(told[i].nonzero().flatten().tolist(), float(saved[i] / total[i]), bool(heaps[i]))
     return groups
 
 
@@ -116,14 +121,14 @@ class _Judged(NamedTuple):
         of_each: the same by each view `(P, V)`.
         level: phi s^2 then `(P,)`.
         spare: degrees of freedom that phi is from `(P,)`.
-        clear: whether it is more than what a choice of views saves anyhow `(P,)`.
+        heaps: whether the views are in two heaps `(P,)`.
     """
 
     saved: Tensor
     of_each: Tensor
     level: Tensor
     spare: Tensor
-    clear: Tensor
+    heaps: Tensor
 
 
 class _Choice(NamedTuple):
@@ -204,9 +209,8 @@ class _Choice(NamedTuple):
         u, H = u * whole.unsqueeze(-1), H * whole[..., None, None]
         phi, spare, _ = contradiction(u, H, left[:, None, None, None] * H, share, A, pull)
         level = phi.clamp(min=1) * left
-        clear = self._two_heaps(x, turned, share, level) > TWO_HEAPS
-        clear |= saved > BEYOND_CHOICE * share.sum(-1) * level
-        return _Judged(saved, 2 * (costs[0] - costs[1]) * whole, level, spare, clear)
+        heaps = self._two_heaps(x, turned, share, level) > TWO_HEAPS
+        return _Judged(saved, 2 * (costs[0] - costs[1]) * whole, level, spare, heaps)
 
     def _two_heaps(self, x: Tensor, turned: Tensor, share: Tensor, level: Tensor) -> Tensor:
         """By how much two heaps of views, at x and at its turned place, are likelier than one `(P,)`, as a logarithm.

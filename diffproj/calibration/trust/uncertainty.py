@@ -28,7 +28,7 @@ from diffproj.calibration.trust.corner_scores import CornerScores, state_of
 from diffproj.calibration.trust.dispersion import dispersion, pulls_of
 from diffproj.calibration.trust.noise import Noise, with_known
 from diffproj.calibration.trust.noisy_views import widened_poses
-from diffproj.calibration.trust.own_focal import with_own_focal
+from diffproj.calibration.trust.own_intrinsics import with_own_focal
 from diffproj.calibration.trust.robust_loss import with_own_scores
 
 
