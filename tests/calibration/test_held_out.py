@@ -57,7 +57,7 @@ def test_no_pose_is_told_from_corners_on_a_line() -> None:
     assert torch.equal(one.evaluated, ~other.evaluated)
 
 
-@pytest.mark.parametrize("moments", [16, 5])
+@pytest.mark.parametrize("moments", [pytest.param(16, marks=pytest.mark.slow), 5])
 def test_a_lens_is_chosen_where_a_view_shows_two_columns(moments: int) -> None:
     """None was: no lens was determined without every second corner, the table said, and "brown5" was taken for that."""
     found = dp.calibrate(seen(TWO_COLUMNS, moments=moments), BOARD, "auto")

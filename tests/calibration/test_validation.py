@@ -58,7 +58,7 @@ def test_folds_without_an_error_are_left_out_of_the_total() -> None:
     assert "3 of 3 folds not evaluated" in repr(none)
 
 
-@pytest.mark.parametrize("who", ["camera", "rig"])
+@pytest.mark.parametrize("who", ["camera", pytest.param("rig", marks=pytest.mark.slow)])
 def test_corners_that_all_views_reject_are_no_held_out_errors(who: str) -> None:
     """A wrong corner tells nothing of the camera: one that is 40 px off made the held-out error 1.5 px."""
     views = dp.example_views("left")

@@ -114,6 +114,7 @@ def test_landmarks_that_are_not_seen_do_not_count(unseen: int) -> None:
     assert not (far_off(found) & (found.rivals.ratio >= 100)).any()
 
 
+@pytest.mark.slow
 def test_each_camera_of_a_batch_is_looked_at_as_if_alone() -> None:
     """Some see three landmarks, some two, and some eight on a plane, which has a mirrored pose, off it others."""
     places = [[624.0, 554.0], [770.0, 847.0], [508.0, 440.0], [600.0, 500.0], [650.0, 640.0], [560.0, 600.0]]
@@ -139,6 +140,7 @@ def test_each_camera_of_a_batch_is_looked_at_as_if_alone() -> None:
             assert float(batch.mounting.height[i, j]) == pytest.approx(float(one.mounting.height), rel=1e-6), (i, j)
 
 
+@pytest.mark.slow
 def test_few_of_many_are_looked_at_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of evidence of each kind, as the whole batch tells it."""
     more = [[u, v] for u in (250.0, 500.0, 750.0, 1000.0) for v in (450.0, 600.0, 800.0)]

@@ -62,7 +62,8 @@ def test_a_tilted_sensor_is_not_above_an_upright_one(seed: int, row: int) -> Non
     assert fourteen <= twelve * (1 + 1e-6)
 
 
-@pytest.mark.parametrize(("seed", "row"), [(5010, 24), pytest.param(5006, 18, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "row"), [(5010, 24), (5006, 18)])
 def test_what_folds_near_one_poorer_lens_is_held_near_another(seed: int, row: int) -> None:
     """Near the lowest of them these lenses folded however much they were held, and were refused."""
     assert dp.calibrate(drawn("any brown14", seed, row), BOARD, "brown14").converged
@@ -116,7 +117,7 @@ def test_a_needle_in_the_middle_of_the_image_is_not_taken() -> None:
     assert abs(float(found.camera.K[0, 0]) - 533.5) < 3
 
 
-@pytest.mark.parametrize("model", ["brown8", "brown12"])
+@pytest.mark.parametrize("model", ["brown8", pytest.param("brown12", marks=pytest.mark.slow)])
 def test_only_the_cameras_that_need_it_are_fitted_once_more(model: LensModel, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a batch as each by itself, with a prior that differs from camera to camera, too."""
     problems = KINDS["any brown8"](25, Draw(5000)).views

@@ -47,6 +47,7 @@ def said(rig: dp.RigCalibration) -> list[str]:
     return [remark for remark in rig.remarks if "all corners of a view together" in remark]
 
 
+@pytest.mark.slow
 def test_places_hold_that_a_camera_is_late() -> None:
     found, moved = [], []
     for seed in range(16):
@@ -61,6 +62,7 @@ def test_places_hold_that_a_camera_is_late() -> None:
     assert all(0.14 < px < 0.34 for px in moved)
 
 
+@pytest.mark.slow
 def test_places_hold_that_a_turning_board_is_seen_late() -> None:
     found, focal, named = [], [], 0
     for seed in range(16):

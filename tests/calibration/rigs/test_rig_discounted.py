@@ -64,6 +64,7 @@ def test_what_few_corners_tell_heeds_the_wrong_one(alone: bool) -> None:
     assert (off.abs() < 1.96).double().mean() > 0.94
 
 
+@pytest.mark.slow
 def test_the_pose_of_few_corners_lacks_the_wrong_one() -> None:
     """Measured: 0.88, and all in their 95 % intervals; 1.16 and 90 % with the wrong corner counted as one of many."""
     off = _off_with_a_wrong_corner(range(8), alone=True)
@@ -71,6 +72,7 @@ def test_the_pose_of_few_corners_lacks_the_wrong_one() -> None:
     assert (off.abs() < 1.96).double().mean() > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 9, 11])
 def test_a_moment_of_few_corners_of_which_one_is_wrong_adds_no_doubt(seed: int) -> None:
     """It tells next to nothing: f_x is as sure as without it, where it was 6.7, 1.26 and 1.27 times as uncertain."""

@@ -58,6 +58,7 @@ def _drawn(rig: dp.RigCalibration, pixels: dict[str, torch.Tensor], draws: int) 
     return torch.stack(points), torch.stack(valid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", ["brown4", "brown5"])
 def test_deviations_are_those_of_rigs_drawn_from_the_covariance(lens: LensModel) -> None:
     """Of 200: brown4 0.95 to 1.08 of theirs, brown5 0.82 to 1.08; all but where some of these have no ray."""

@@ -58,6 +58,7 @@ def same(one: object, other: dp.RigCalibration) -> None:
     assert one.message == other.message
 
 
+@pytest.mark.slow
 def test_each_ends_as_alone_in_any_order(
     scenes: list[Scene], alone: list[dp.RigCalibration], solved: list[int]
 ) -> None:
@@ -133,6 +134,7 @@ def test_options_hold_for_each(options: dict[str, Any], outliers: float, solved:
         same(one, dp.calibrate_rig(true.views, true.board, **options))
 
 
+@pytest.mark.slow
 def test_cameras_of_unlike_lenses_and_a_camera_that_is_missing(solved: list[int]) -> None:
     rigs = [scene(3, moments, missing=0.2, seed=seed) for moments, seed in ((10, 2), (12, 5), (11, 8))]
     views = [dict(one.views) for one in rigs]
@@ -148,7 +150,11 @@ def test_cameras_of_unlike_lenses_and_a_camera_that_is_missing(solved: list[int]
         same(one, dp.calibrate_rig(seen, rigs[0].board))
 
 
-@pytest.mark.parametrize("priors", [None, {"cam1.baseline": (800.0, 50.0)}], ids=["", "priors"])
+@pytest.mark.parametrize(
+    "priors",
+    [None, pytest.param({"cam1.baseline": (800.0, 50.0)}, marks=pytest.mark.slow)],
+    ids=["", "priors"],
+)
 def test_the_solver_goes_on_with_those_that_still_move(
     priors: Any, scenes: list[Scene], alone: list[dp.RigCalibration], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -187,6 +187,7 @@ def test_each_camera_measures_with_its_part_of_the_joint_covariance(three: Scene
     assert torch.allclose(projector(pixels)[0], found.points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blur", [1.2, 3.0])
 def test_points_at_a_moment_that_was_blurred_for_one_camera(blur: float) -> None:
     """By the noise of all moments together they would be off by twice their deviations and more."""

@@ -42,6 +42,7 @@ def _cross(v: torch.Tensor) -> torch.Tensor:
     return torch.stack([zero, -v[2], v[1], v[2], zero, -v[0], -v[1], v[0], zero]).unflatten(0, (3, 3))
 
 
+@pytest.mark.slow
 def test_folds_are_what_a_loop_by_hand_gives(two: Scene) -> None:
     found = dp.cross_validate_rig(two.views, two.board, folds=3)
     order = list(dict.fromkeys(name for views in two.views.values() for name in views.names))

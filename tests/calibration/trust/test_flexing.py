@@ -39,7 +39,15 @@ def told(views: dp.Views, board: dp.Chessboard = BOARD, **options) -> str:
     return dp.calibrate(views, board, throw=False, **options).remarks[0]
 
 
-@pytest.mark.parametrize("options", [{}, {"loss": dp.Huber(1.0)}, {"shape": "bow"}], ids=["", "huber", "bow"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        pytest.param({"loss": dp.Huber(1.0)}, marks=pytest.mark.slow),
+        pytest.param({"shape": "bow"}, marks=pytest.mark.slow),
+    ],
+    ids=["", "huber", "bow"],
+)
 def test_a_board_that_bends(options):
     said = [told(seen(seed, bend=12.0), **options) for seed in range(6)]
     assert sum(WORDS in text for text in said) >= 5
@@ -54,6 +62,7 @@ def test_the_verdict_says_what_to_do():
     assert "sharper photographs" not in verdict
 
 
+@pytest.mark.slow
 def test_corners_that_scatter_or_are_wrong_do_not_bend():
     assert all("look for blur" in told(seen(seed, noise=1.5)) for seed in range(4))
     assert all("look for blur" in told(seen(seed, wrong=10.0)) for seed in range(4))

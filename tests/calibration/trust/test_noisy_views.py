@@ -43,6 +43,7 @@ def errors_in_first_view(found: dp.Calibration) -> torch.Tensor:
     return ((measured.points - points) / measured.deviations)[..., :2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"loss": dp.Huber(0.5)}, {"reject_outliers": True}, {"objective": "plane"}])
 @pytest.mark.parametrize("blur", [SIGMA, 0.5, 1.2, 3.0])
 def test_points_in_a_blurred_view_are_within_their_deviations(blur: float, options: dict[str, Any]) -> None:

@@ -78,7 +78,7 @@ def test_it_is_told() -> None:
     assert "with focus and zoom held" in found[told].verdict
 
 
-@pytest.mark.parametrize("count", [5, 8, 20])
+@pytest.mark.parametrize("count", [5, 8, pytest.param(20, marks=pytest.mark.slow)])
 def test_errors_that_look_like_another_perspective_are_not_accused_of_it(count: int) -> None:
     one = dp.Camera(camera().K, distortion=camera().distortion, size=SIZE)
     views = with_smooth_errors(seen_at_random(one, BOARD, 100, count), BOARD.points, 0.2)
@@ -112,6 +112,7 @@ def test_frames_of_a_board_at_rest_are_no_more_than_one() -> None:
     assert 0.8 < (still / alone).median() < 1.25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"tied_focal": True, "fixed": ("k3",)}])
 def test_what_is_added_is_what_views_move_that_focus_anew(options: dict) -> None:
     """Against cameras that are calibrated from what they see, with one view's focal length a little longer."""
@@ -162,7 +163,7 @@ def told(found: dp.Calibration, words: str) -> int:
     return sum(words in remark for remark in found.remarks)
 
 
-@pytest.mark.parametrize(("px", "least"), [(8.0, 36), (15.0, 30)])
+@pytest.mark.parametrize(("px", "least"), [pytest.param(8.0, 36, marks=pytest.mark.slow), (15.0, 30)])
 def test_principal_points_that_differ_are_told(px: float, least: int) -> None:
     """Measured of 40: 38 at 8 px, of a focal length of 533; 32 at 15 px and else of a lens or two cameras. Before, 17
     were said to be turned at 15 px, and nothing said of the others."""
@@ -175,7 +176,7 @@ def test_principal_points_that_differ_are_told(px: float, least: int) -> None:
     assert "image stabilisation switched off" in found[first].verdict
 
 
-@pytest.mark.parametrize("count", [8, 20])
+@pytest.mark.parametrize("count", [8, pytest.param(20, marks=pytest.mark.slow)])
 def test_other_errors_are_not_called_a_principal_point_that_differs(count: int) -> None:
     one = dp.Camera(camera().K, distortion=camera().distortion, size=SIZE)
     smooth = with_smooth_errors(seen_at_random(one, BOARD, 100, count), BOARD.points, 0.3)

@@ -46,6 +46,7 @@ def share_within(level: float, found: dp.Calibration, cameras: dp.Camera, target
     return float(((low < truth) & (truth < high))[sure, 0].to(D).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [6, 8, 12])
 @pytest.mark.parametrize("loss", [dp.Huber(1.0), dp.Cauchy(1.0), dp.SoftL1(1.0)], ids=lambda loss: type(loss).__name__)
 @pytest.mark.filterwarnings("ignore::diffproj.AmbiguousPoseWarning", "ignore::diffproj.CameraMismatchWarning")
