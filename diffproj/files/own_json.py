@@ -77,13 +77,8 @@ def write(path: Path, item: Camera | Calibration | RigCalibration) -> dict[Path,
     return {path: _readable(json.dumps(_plain(_fields(item)), indent=1, allow_nan=False))}
 
 
-def as_line(item: Camera | Calibration, **more: Any) -> str:
-    """A camera or a calibration on one line, with more keys in front; `name` is that of the camera."""
-    return json.dumps(plain_fields(item, **more), allow_nan=False) + "\n"
-
-
 def plain_fields(item: Camera | Calibration, **more: Any) -> dict[str, Any]:
-    """What such a line says, as numbers, texts, lists and dictionaries."""
+    """A camera or a calibration as plain numbers, texts, lists and dictionaries, with more keys in front."""
     return _plain(more | _fields(item))
 
 
