@@ -208,9 +208,15 @@ def differentiated(task: Task, found: Found) -> Tensor:
         moving = torch.zeros(own.shape[-1], dtype=torch.bool, device=own.device)
         moving[list(task.known.columns)] = True
         base = torch.where(moving, found.values.detach(), own)
+        if task.known.tied:  # f_y follows f_x by the camera's own ratio, along the first direction
+            ratio = own[:, 1] / own[:, 0]
+            slope = torch.zeros_like(T[:1])
+            slope[0, 1, 0] = 1.0
+            turned = slope * (ratio - ratio.detach())[:, None, None]
+            base, T = base + turned[..., 0] * found.values[:, :1].detach(), T + turned
         _, gradient, H = _second_order(task, found.parameters, T, base, task.known.prior(own, task.batch))
         step = -torch.linalg.solve_ex(H, gradient.unsqueeze(-1))[0]
-        return base + (T @ (step - step.detach())).squeeze(-1)
+        return base + (T.detach() @ (step - step.detach())).squeeze(-1)
 
 
 def _second_order(
