@@ -125,6 +125,23 @@ def has_values(*tensors: Tensor) -> bool:
     return not (tracing or any(has_no_values(tensor) for tensor in tensors))
 
 
+def check_untransformed(who: str, remedy: str) -> None:
+    """Check that the code does not run under a transform of `torch.func`, where PyTorch's own message names no cause.
+
+    Args:
+        who: the call that reads values.
+        remedy: what to do.
+
+    Raises:
+        ValueError: it does.
+    """
+    if in_functional_transform():
+        raise ValueError(
+            f"{who}: want a call outside of torch.func's transforms, for it reads values, got one under vmap, grad, "
+            f"jvp or another; {remedy}"
+        )
+
+
 def all_true(mask: Tensor) -> bool:
     """Whether all are true; false where that cannot be read, or not without waiting for a device."""
     return mask.is_cpu and has_values(mask) and bool(mask.numpy().all())  # in a tenth of PyTorch's time

@@ -9,6 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.arguments import called, flag, listing, whole_number, words
+from diffproj._core.numerics import check_untransformed
 from diffproj.calibration.evidence.adjusted_covariance import covariance_of
 from diffproj.calibration.evidence.adjustment import Adjustment
 from diffproj.calibration.evidence.best import best
@@ -96,6 +97,11 @@ def adjust(
         >>> print("{:.2f} m ahead ± {:.2f}".format(ahead.points[0, 1], ahead.deviations[0, 1]))
         9.97 m ahead ± 0.43
     """
+    check_untransformed(
+        "adjust",
+        "cameras of a batch are adjusted side by side, and differentiable=True carries gradients for "
+        "torch.autograd.grad",
+    )
     known, calibration = camera, None
     if isinstance(camera, Calibration):
         calibration = camera
