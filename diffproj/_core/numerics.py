@@ -28,6 +28,7 @@ from diffproj._core.torch_private import (
     in_recording,
     traced_beside,
 )
+from diffproj._core.warn import warn_caller
 
 BLOCK_POINTS = 2**16
 """Points handled at once on a CPU when no derivative is asked: large enough to hide the cost of dispatch, small enough
@@ -139,6 +140,24 @@ def check_untransformed(who: str, remedy: str) -> None:
         raise ValueError(
             f"{who}: want a call outside of torch.func's transforms, for it reads values, got one under vmap, grad, "
             f"jvp or another; {remedy}"
+        )
+
+
+def gradient_only(step: Tensor) -> Tensor:
+    """Zero, with the first derivative of the step: what it is added to keeps its value to the bit.
+
+    For steps that are right to first order only. Who builds a graph of the derivative (`create_graph=True`) is warned.
+    """
+    if step.requires_grad:
+        step.register_hook(_warn_of_second_order)
+    return step - step.detach()
+
+
+def _warn_of_second_order(_: Tensor) -> None:
+    if torch.is_grad_enabled():
+        warn_caller(
+            "create_graph: want False for the gradient of a minimum, which is to first order, got True; second "
+            "derivatives, as of a penalty on that gradient, are without those of the minimum"
         )
 
 

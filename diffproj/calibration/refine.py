@@ -37,9 +37,9 @@ def refine(
             that is turned itself is fitted, which sees the same (`Camera.upright`).
         differentiable: carry gradients through the minimum: those of cameras and the target's shape by the views'
             pixels, the target's points, the weights and tensors among the priors are those of the minimiser (implicit
-            function theorem, exact Hessian). To first order. What is known of points, by priors or as the sigma of
-            landmarks, needs `pixel_sigma` then, so that the minimum is that of one cost. Not by the camera's own
-            values, which are a start, nor by a landmark's sigma.
+            function theorem, exact Hessian). To first order, and `create_graph=True` is warned of. What is known of
+            points, by priors or as the sigma of landmarks, needs `pixel_sigma` then, so that the minimum is that of one
+            cost. Not by the camera's own values, which are a start, nor by a landmark's sigma.
         options: as in `calibrate`: see `CalibrationOptions`.
 
     Returns:

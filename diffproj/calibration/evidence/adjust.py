@@ -76,7 +76,8 @@ def adjust(
         free: intrinsics that are to be found too, such as `"focal"`. All others keep the camera's values.
         tied_focal: `f_x : f_y` keeps the camera's ratio where `focal` is free.
         differentiable: carry gradients through the minimum, those with respect to the observations' tensors, the
-            camera's and those among the priors (implicit function theorem, exact Hessian). To first order.
+            camera's and those among the priors (implicit function theorem, exact Hessian). To first order, and
+            `create_graph=True` is warned of.
         max_iterations: of the solver.
         throw: raise where a camera did not converge, or the evidence does not determine it; if False, look at `status`.
 

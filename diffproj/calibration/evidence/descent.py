@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffproj._core.numerics import gradient_only
 from diffproj.calibration.evidence.knowledge import Knowledge
 from diffproj.calibration.evidence.observation import Observation
 from diffproj.calibration.evidence.observations import Seen
@@ -216,7 +217,7 @@ def differentiated(task: Task, found: Found) -> Tensor:
             base, T = base + turned[..., 0] * found.values[:, :1].detach(), T + turned
         _, gradient, H = _second_order(task, found.parameters, T, base, task.known.prior(own, task.batch))
         step = -torch.linalg.solve_ex(H, gradient.unsqueeze(-1))[0]
-        return base + (T.detach() @ (step - step.detach())).squeeze(-1)
+        return base + (T.detach() @ gradient_only(step)).squeeze(-1)
 
 
 def _second_order(

@@ -17,6 +17,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from diffproj._core.numerics import gradient_only
 from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.fit import Fit
 from diffproj.calibration.fitting.options import Options
@@ -100,8 +101,8 @@ def differentiated(found: Fit, data: Data, prior: Prior | None, options: Options
         dz = -torch.linalg.solve_ex(W + unused, h.unsqueeze(-1) + E.mT @ dx.unsqueeze(1))[0].squeeze(-1)
         if task.basis is not None:
             dx = task.basis @ dx
-        shared = solution.shared + _gradient_only(dx.squeeze(-1))
-        local = moved(solution.local, _gradient_only(dz))
+        shared = solution.shared + gradient_only(dx.squeeze(-1))
+        local = moved(solution.local, gradient_only(dz))
     return Fit(task, solution._replace(shared=shared, local=local), found.rejected)
 
 
@@ -136,11 +137,6 @@ def _restraining(task: Task, points: Tensor, found: Fit) -> Tensor:
     """The gradient `(P, 3 N)` of what restrains free points, whose frame follows the target's points `(N, 3)`."""
     held = task.restraint_at(points)
     return (held.precision @ found.displacements().flatten(1).unsqueeze(-1)).squeeze(-1)
-
-
-def _gradient_only(step: Tensor) -> Tensor:
-    """Zero, with the derivative of the step: the solver's minimum keeps its value to the bit."""
-    return step - step.detach()
 
 
 def _costs(

@@ -47,3 +47,10 @@ def test_gradients_by_the_camera(options: dict[str, Any]) -> None:
     direction = 1e-4 * torch.tensor([1.0, -2, 0.5, 1, -1, 3, 0.5, 1], dtype=D)
     numeric = (numbers(direction, False, options) - numbers(-direction, False, options)) / 2
     torch.testing.assert_close(slopes @ direction, numeric, rtol=1e-4, atol=1e-6 * float(numeric.abs().max()))
+
+
+def test_second_derivatives_are_warned_of() -> None:
+    seen = dp.Seen(POINTS, MAST.project(POINTS)[0].requires_grad_(), 1.0)
+    height = dp.adjust(MAST, seen, differentiable=True).cameras.t.sum()
+    with pytest.warns(UserWarning, match="create_graph: want False for the gradient of a minimum"):
+        torch.autograd.grad(height, seen.pixels, create_graph=True)

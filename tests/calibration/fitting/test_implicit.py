@@ -210,3 +210,13 @@ def test_values_are_those_of_the_solver_and_batches_keep_apart() -> None:
     assert (gradient[0][~visible] == 0).all()
     assert (gradient[0, 5] == 0).all()
     assert gradient[0, 0].abs().max() > 0
+
+
+def test_second_derivatives_are_warned_of() -> None:
+    """Of a penalty on a gradient only those of the minimum count, and were left out: 0 for 36."""
+    camera, pixels, visible, points = situation()
+    views = dp.Views(pixels.requires_grad_(), visible, size=(640, 480))
+    focal = dp.refine(views, Target(points), camera, differentiable=True).camera.K[0, 0]
+    torch.autograd.grad(focal, pixels, retain_graph=True)
+    with pytest.warns(UserWarning, match="create_graph: want False for the gradient of a minimum"):
+        torch.autograd.grad(focal, pixels, create_graph=True)
