@@ -28,6 +28,7 @@ from diffproj._core.torch_private import (
     in_recording,
     traced_beside,
 )
+from diffproj._core.warn import warn_caller
 
 BLOCK_POINTS = 2**16
 """Points handled at once on a CPU when no derivative is asked: large enough to hide the cost of dispatch, small enough
@@ -123,6 +124,41 @@ def has_values(*tensors: Tensor) -> bool:
     """Whether the values of these tensors can be read here: not of a graph, under `vmap`, or of a fake tensor."""
     tracing = torch.compiler.is_compiling() or in_functional_transform() or in_recording()
     return not (tracing or any(has_no_values(tensor) for tensor in tensors))
+
+
+def check_untransformed(who: str, remedy: str) -> None:
+    """Check that the code does not run under a transform of `torch.func`, where PyTorch's own message names no cause.
+
+    Args:
+        who: the call that reads values.
+        remedy: what to do.
+
+    Raises:
+        ValueError: it does.
+    """
+    if in_functional_transform():
+        raise ValueError(
+            f"{who}: want a call outside of torch.func's transforms, for it reads values, got one under vmap, grad, "
+            f"jvp or another; {remedy}"
+        )
+
+
+def gradient_only(step: Tensor) -> Tensor:
+    """Zero, with the first derivative of the step: what it is added to keeps its value to the bit.
+
+    For steps that are right to first order only. Who builds a graph of the derivative (`create_graph=True`) is warned.
+    """
+    if step.requires_grad:
+        step.register_hook(_warn_of_second_order)
+    return step - step.detach()
+
+
+def _warn_of_second_order(_: Tensor) -> None:
+    if torch.is_grad_enabled():
+        warn_caller(
+            "create_graph: want False for the gradient of a minimum, which is to first order, got True; second "
+            "derivatives, as of a penalty on that gradient, are without those of the minimum"
+        )
 
 
 def all_true(mask: Tensor) -> bool:

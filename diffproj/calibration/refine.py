@@ -9,7 +9,7 @@ from diffproj.calibration.circle_centres import with_true_centres
 from diffproj.calibration.fitting import start
 from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.free_points import with_free_points
-from diffproj.calibration.fitting.implicit import differentiated
+from diffproj.calibration.fitting.implicit import check_differentiable, differentiated
 from diffproj.calibration.fitting.options import CalibrationOptions, calibration_options
 from diffproj.calibration.outcome import begun, outcome
 from diffproj.calibration.results.calibration import Calibration
@@ -37,7 +37,9 @@ def refine(
             that is turned itself is fitted, which sees the same (`Camera.upright`).
         differentiable: carry gradients through the minimum: those of cameras and the target's shape by the views'
             pixels, the target's points, the weights and tensors among the priors are those of the minimiser (implicit
-            function theorem, exact Hessian). To first order.
+            function theorem, exact Hessian). To first order, and `create_graph=True` is warned of. What is known of
+            points, by priors or as the sigma of landmarks, needs `pixel_sigma` then, so that the minimum is that of one
+            cost. Not by the camera's own values, which are a start, nor by a landmark's sigma.
         options: as in `calibrate`: see `CalibrationOptions`.
 
     Returns:
@@ -45,8 +47,8 @@ def refine(
 
     Raises:
         TypeError: views are no `dp.Views`, the camera has a lens of another library, or an option is unknown.
-        ValueError: views, target, camera and options do not fit together, or the image is turned against a tilted
-            sensor.
+        ValueError: views, target, camera and options do not fit together, the image is turned against a tilted
+            sensor, or a minimum whose cost depends on itself is to be differentiated.
         CalibrationError: a camera did not converge, or its views do not determine it.
 
     Example:
@@ -71,12 +73,14 @@ def refine(
     def fit(views: Views) -> Calibration:
         data = Data(views, target, chosen.weights, chosen.pixel_sigma)
         data.check_options(chosen.objective, chosen.shape, (*chosen.fixed, *(chosen.priors or ())))
+        if differentiable:
+            check_differentiable(data, chosen)
         shared, local, parameters = start.from_camera(beginning, data, chosen.bow, chosen.skew)
         begin = begun(data, chosen, parameters, shared, local, shared)
         found, prior = begin.minimum(chosen), begin.prior
         found, prior = with_free_points(found, data, chosen, prior)
         if differentiable:
-            found = differentiated(found, data, prior)
+            found = differentiated(found, data, prior, chosen)
         return outcome("refine", data, found, beginning.size or views.size, chosen.throw)
 
     return with_true_centres(fit, views, target)

@@ -112,7 +112,8 @@ def measure(
         pixels, pixel_sigma, calibration if isinstance(calibration, Calibration) else None, number
     )
     warn_if_rounded(camera, plane)
-    camera, plane = camera.to(torch.float64), plane.to(torch.float64)
+    camera = camera.to(torch.float64)
+    plane = plane.like(camera.K).to(torch.float64)
     if plane_covariance is not None:
         plane_covariance = check_tensor("plane_covariance", plane_covariance, 4, 4)
         if plane_covariance.device != camera.device:

@@ -9,6 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.arguments import called, flag, listing, whole_number, words
+from diffproj._core.numerics import check_untransformed
 from diffproj.calibration.evidence.adjusted_covariance import covariance_of
 from diffproj.calibration.evidence.adjustment import Adjustment
 from diffproj.calibration.evidence.best import best
@@ -75,7 +76,8 @@ def adjust(
         free: intrinsics that are to be found too, such as `"focal"`. All others keep the camera's values.
         tied_focal: `f_x : f_y` keeps the camera's ratio where `focal` is free.
         differentiable: carry gradients through the minimum, those with respect to the observations' tensors, the
-            camera's and those among the priors (implicit function theorem, exact Hessian). To first order.
+            camera's and those among the priors (implicit function theorem, exact Hessian). To first order, and
+            `create_graph=True` is warned of.
         max_iterations: of the solver.
         throw: raise where a camera did not converge, or the evidence does not determine it; if False, look at `status`.
 
@@ -96,6 +98,11 @@ def adjust(
         >>> print("{:.2f} m ahead ± {:.2f}".format(ahead.points[0, 1], ahead.deviations[0, 1]))
         9.97 m ahead ± 0.43
     """
+    check_untransformed(
+        "adjust",
+        "cameras of a batch are adjusted side by side, and differentiable=True carries gradients for "
+        "torch.autograd.grad",
+    )
     known, calibration = camera, None
     if isinstance(camera, Calibration):
         calibration = camera

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffproj._core.numerics import gradient_only
 from diffproj.calibration.evidence.knowledge import Knowledge
 from diffproj.calibration.evidence.observation import Observation
 from diffproj.calibration.evidence.observations import Seen
@@ -208,9 +209,15 @@ def differentiated(task: Task, found: Found) -> Tensor:
         moving = torch.zeros(own.shape[-1], dtype=torch.bool, device=own.device)
         moving[list(task.known.columns)] = True
         base = torch.where(moving, found.values.detach(), own)
+        if task.known.tied:  # f_y follows f_x by the camera's own ratio, along the first direction
+            ratio = own[:, 1] / own[:, 0]
+            slope = torch.zeros_like(T[:1])
+            slope[0, 1, 0] = 1.0
+            turned = slope * (ratio - ratio.detach())[:, None, None]
+            base, T = base + turned[..., 0] * found.values[:, :1].detach(), T + turned
         _, gradient, H = _second_order(task, found.parameters, T, base, task.known.prior(own, task.batch))
         step = -torch.linalg.solve_ex(H, gradient.unsqueeze(-1))[0]
-        return base + (T @ (step - step.detach())).squeeze(-1)
+        return base + (T.detach() @ gradient_only(step)).squeeze(-1)
 
 
 def _second_order(

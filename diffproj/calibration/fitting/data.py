@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import Array, first_of, tensor_of
-from diffproj._core.numerics import in_float64
+from diffproj._core.numerics import check_untransformed, in_float64
 from diffproj.calibration.fitting.own_frame import OwnFrame, flattened, own_frame
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.least_squares.losses import SMALLEST
@@ -45,7 +45,8 @@ class Data:
 
     Raises:
         TypeError: views are no `Views`, the target is none, or the weights are no numbers.
-        ValueError: views, board and weights do not fit together, or the board is of no use.
+        ValueError: views, board and weights do not fit together, the board is of no use, or values cannot be read
+            under a transform of `torch.func`.
     """
 
     def __init__(
@@ -55,6 +56,11 @@ class Data:
         weights: Tensor | Array | float | None,
         pixel_sigma: Tensor | Array | float | None = None,
     ) -> None:
+        check_untransformed(
+            "views",
+            "views of many cameras are a batch, and refine(..., differentiable=True) carries gradients for "
+            "torch.autograd.grad",
+        )
         if len(as_views(views)) == 0:
             raise ValueError("views: want at least one, got none")
         if 0 in views.batch_shape:

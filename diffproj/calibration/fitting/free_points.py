@@ -78,6 +78,7 @@ def with_free_points(flat: Fit, data: Data, options: Options, prior: Prior | Non
 def _as_printed(data: Data, options: Options) -> tuple[Tensor | None, Tensor | None]:
     """The precision of each displacement `(P, N, 3, 3)`, if it is known, and where points may move: see `_basis`."""
     printed = printing_precision(options.priors, data.batch, data.points)
+    printed = None if printed is None else printed.detach()
     held = [axis for name in options.fixed for axis in of_points(name)]
     if not held:
         return printed, None

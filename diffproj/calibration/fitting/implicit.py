@@ -6,24 +6,59 @@ At the minimum the gradient of the cost by the parameters theta is zero for any 
 
 This is the first derivative of `theta - H^-1 gradient(theta, d)` with theta and H detached from the autograd graph. H
 has the block structure of the normal equations and is solved by the same Schur complement.
+
+That takes a cost which is the same function of parameters and data all the way. Where what is known of the target is
+weighed against the noise that the residuals tell, the cost follows its own minimum, and what it would be for other data
+is not in its derivatives: `check_differentiable` refuses that.
 """
+
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from diffproj._core.numerics import gradient_only
 from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.fit import Fit
+from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.least_squares.solver import Prior
 from diffproj.calibration.problem.bow import bowed
+from diffproj.calibration.problem.constraints import of_points, printing_precision
 from diffproj.calibration.problem.parametrisation import POSE, moved
 from diffproj.calibration.problem.shape import block_diagonal
 from diffproj.targets.residuals import projected_minus_seen, put_back_minus_known
 
 
-def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
-    """The same fit, with shared parameters and poses differentiable by pixels, points, weights and prior."""
-    sources = [data.given_pixels, data.given_points, data.given_weights, *(prior or ())]
+def check_differentiable(data: Data, options: Options) -> None:
+    """Check that the minimum is that of one cost, whose derivatives tell how it moves with the data.
+
+    Raises:
+        ValueError: something known of the target's points is weighed anew after each minimum.
+    """
+    surveyed, told = data.surveyed(options.shape), data.known_noise and options.loss is None
+    if data.spread is not None and not surveyed:
+        raise ValueError(
+            "differentiable: want several views of landmarks with a sigma, got one, whose corners are weighed by its "
+            "pose; or leave out the sigma"
+        )
+    printed = options.shape == "free" and any(of_points(name) for name in options.priors or ())
+    if (surveyed and not told) or (not surveyed and printed and data.weights is None):
+        want = (
+            "pixel_sigma= and no loss beside landmarks with a sigma"
+            if surveyed
+            else "pixel_sigma= or weights= beside priors on the target's points"
+        )
+        raise ValueError(
+            f"differentiable: want {want}, got noise that the residuals tell; what is known of the points is weighed "
+            "against it, which is in no derivative"
+        )
+
+
+def differentiated(found: Fit, data: Data, prior: Prior | None, options: Options) -> Fit:
+    """The same fit, with shared parameters and poses differentiable by pixels, points, weights and priors."""
+    printed = None if data.surveyed(options.shape) else printing_precision(options.priors, data.batch, data.points)
+    sources = [data.given_pixels, data.given_points, data.given_weights, printed, *(prior or ())]
     if not any(source is not None and source.requires_grad for source in sources):
         return found
     task, solution = found.task, found.solution
@@ -51,7 +86,8 @@ def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
             g = g + (prior.precision @ (solution.shared - prior.mean).unsqueeze(-1)).squeeze(-1)
         if task.restraint is not None:
             U = U + torch.nn.functional.pad(task.restraint.precision, (few, 0, few, 0))
-            g = g + torch.nn.functional.pad(_restraining(task, data.given_points - data.middle, found), (few, 0))
+            held = task if printed is None else replace(task, printed=printed)
+            g = g + torch.nn.functional.pad(_restraining(held, data.given_points - data.middle, found), (few, 0))
         E, W, h = H[..., :s, s:], H[..., s:, s:], gradient[..., s:]
         if task.basis is not None:
             T = task.basis.mT
@@ -65,8 +101,8 @@ def differentiated(found: Fit, data: Data, prior: Prior | None) -> Fit:
         dz = -torch.linalg.solve_ex(W + unused, h.unsqueeze(-1) + E.mT @ dx.unsqueeze(1))[0].squeeze(-1)
         if task.basis is not None:
             dx = task.basis @ dx
-        shared = solution.shared + _gradient_only(dx.squeeze(-1))
-        local = moved(solution.local, _gradient_only(dz))
+        shared = solution.shared + gradient_only(dx.squeeze(-1))
+        local = moved(solution.local, gradient_only(dz))
     return Fit(task, solution._replace(shared=shared, local=local), found.rejected)
 
 
@@ -101,11 +137,6 @@ def _restraining(task: Task, points: Tensor, found: Fit) -> Tensor:
     """The gradient `(P, 3 N)` of what restrains free points, whose frame follows the target's points `(N, 3)`."""
     held = task.restraint_at(points)
     return (held.precision @ found.displacements().flatten(1).unsqueeze(-1)).squeeze(-1)
-
-
-def _gradient_only(step: Tensor) -> Tensor:
-    """Zero, with the derivative of the step: the solver's minimum keeps its value to the bit."""
-    return step - step.detach()
 
 
 def _costs(

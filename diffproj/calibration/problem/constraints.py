@@ -116,6 +116,8 @@ def of_camera(priors: Priors | None) -> Priors | None:
 def printing_precision(priors: Priors | None, batch: Sequence[int], points: Tensor) -> Tensor | None:
     """The precision `(P, N, 3, 3)` of free points' displacements, in world units; `None` where nothing is known.
 
+    It carries gradients to deviations that are tensors.
+
     Raises:
         ValueError: a shape that does not fit, or a deviation that is not positive.
     """
@@ -136,7 +138,7 @@ def printing_precision(priors: Priors | None, batch: Sequence[int], points: Tens
             raise ValueError(f"priors: want a positive standard deviation for {name!r}, got {value}")
         want = (*batch, len(points), len(axes)) if len(axes) > 1 else (*batch, len(points))
         try:
-            deviation = deviation.detach().to(points).expand(want)
+            deviation = deviation.to(points).expand(want)
         except RuntimeError:
             got = tuple(deviation.shape)
             raise ValueError(f"priors: want {name!r} to broadcast to {want}, got {got}") from None

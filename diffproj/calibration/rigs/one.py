@@ -6,6 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
+from diffproj._core.numerics import check_untransformed
 from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.problem.parametrisation import Parametrisation
@@ -72,6 +73,7 @@ def rig_task(
 
     With `moved (N, 3)` the target's points are known to lie so far from where it has them.
     """
+    check_untransformed(who, "a list of rigs is calibrated side by side")
     views = rig_views(views_by_camera, target, moments, chosen.weights, who)
     known = checked_cameras(cameras, views.names)
     lens = lenses(distortion, views.names)

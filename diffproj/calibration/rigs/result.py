@@ -11,6 +11,7 @@ from torch import Tensor
 
 from diffproj._core.arguments import Array, choice
 from diffproj._core.copying import Copied
+from diffproj._core.numerics import check_untransformed
 from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.problem.shape_names import Shape
@@ -206,7 +207,8 @@ class RigCalibration(RigAccount, Copied, RigRecorded):
     ) -> Triangulation:
         """Points in the rig's frame from their pixels in several cameras, with error bars.
 
-        The sum of squared reprojection errors is minimised, each camera's over the variance of its pixels.
+        The sum of squared reprojection errors is minimised, each camera's over the variance of its pixels. The points
+        carry no gradients.
 
         Args:
             pixels_by_camera: pixels `(N, 2)` of the same N points, by camera; NaN where a camera does not see a point.
@@ -220,8 +222,8 @@ class RigCalibration(RigAccount, Copied, RigRecorded):
 
         Raises:
             TypeError: no mapping from names to pixels.
-            ValueError: no such camera, pixels of fewer than two cameras, other numbers of points, or a sigma that is
-                not positive.
+            ValueError: no such camera, pixels of fewer than two cameras, other numbers of points, a sigma that is not
+                positive, or a call under a transform of `torch.func`.
 
         Example:
             >>> import diffproj as dp
@@ -232,6 +234,7 @@ class RigCalibration(RigAccount, Copied, RigRecorded):
             >>> print(f"{side:.0f} mm")
             25 mm
         """
+        check_untransformed("triangulate", "it takes any number of points in one call, and carries no gradients")
         columns = {name: self.parameters_of(name) for name in self.names}
         rig = Rig(self.cameras, self.calibrations, self.covariance, columns)
         return triangulated(rig, pixels_by_camera, pixel_sigma)

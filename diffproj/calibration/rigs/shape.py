@@ -57,6 +57,7 @@ def with_points(flat: RigFit, held_points: Sequence[int], options: Options) -> R
     parameters = replace(flat.parameters, points=len(flat.views.points))
     surveyed = flat.views.spread is not None
     printed = printing_precision(options.priors, (), flat.views.points)
+    printed = None if printed is None else printed.detach()
     if flat.views.spread is not None:
         printed = _as_surveyed(flat.views.spread)
 
