@@ -25,6 +25,7 @@ from diffproj.cli.fleet_file import append, done_before, leave_out_replaced, lin
 from diffproj.cli.fleet_folder import Folder, Searched, on_one_core, searched, state_of
 from diffproj.cli.inputs import check_writable, writing
 from diffproj.cli.terminal import RESULTS, as_json, counted, failure, in_words, note, progress_bars, result
+from diffproj.cli.units import Length
 from diffproj.cli.which_board import KINDS, NEEDS, TAKES, given_board
 from diffproj.targets.boards import Board
 from diffproj.targets.tasks import as_done
@@ -96,15 +97,16 @@ def _asked(options: argparse.Namespace) -> dict[str, Any]:
     about_board = dict.fromkeys(name for names in (KINDS, *NEEDS.values(), *TAKES.values()) for name in names)
     names = (*about_board, "shape", "distortion", "skew", "reject_outliers", "orientation")
     values = {name: getattr(options, name) for name in names}
-    return {
-        name: value
-        if isinstance(value, bool)
-        else "x".join(map(str, value))
-        if isinstance(value, tuple)
-        else str(value)
-        for name, value in values.items()
-        if value is not None and value is not False
-    }
+    return {name: _plain(value) for name, value in values.items() if value is not None and value is not False}
+
+
+def _plain(value: Any) -> bool | str:
+    """An option as it is kept and told; lengths keep all their digits."""
+    if isinstance(value, Length):
+        return f"{repr(value.value).removesuffix('.0')}{value.unit or ''}"
+    if isinstance(value, tuple):
+        return "x".join(map(str, value))
+    return value if isinstance(value, bool) else str(value)
 
 
 @contextmanager

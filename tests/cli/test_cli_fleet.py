@@ -223,6 +223,9 @@ def test_other_options_are_not_mixed(fleet, tmp_path, capsys):
     code, _, err = run(capsys, "--fleet", fleet, *GIVEN, "--distortion", "none", "-o", file)
     assert code == 1
     assert "holds cameras with distortion brown4, not none; choose another file, or remove it" in err
+    code, _, err = run(capsys, "--fleet", fleet, *GIVEN, "--square", "25.0000004mm", "-o", file)
+    assert code == 1
+    assert "holds cameras with square 25mm, not 25.0000004mm; choose another file, or remove it" in err
     assert file.read_text() == text
     file.write_text("something else")
     code, _, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
