@@ -9,7 +9,7 @@ import os
 import re
 import time
 from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing import get_context
@@ -25,6 +25,7 @@ from diffproj.cli.fleet_file import append, done_before, leave_out_replaced, lin
 from diffproj.cli.fleet_folder import Folder, Searched, on_one_core, searched, state_of
 from diffproj.cli.inputs import check_writable, writing
 from diffproj.cli.terminal import RESULTS, as_json, counted, failure, in_words, note, progress_bars, result
+from diffproj.cli.units import Length
 from diffproj.cli.which_board import KINDS, NEEDS, TAKES, given_board
 from diffproj.targets.boards import Board
 from diffproj.targets.tasks import as_done
@@ -59,16 +60,27 @@ def run(options: argparse.Namespace) -> int:
         task = bars.add_task("Calibrating", total=len(folders), completed=len(lines))
         waiting: list[tuple[str, Searched]] = []
         work = [Folder(folder, board, options.orientation) for folder in left]
-        for number, (place, one) in enumerate(as_done(searched, work, executor), start=1):
-            waiting.append((left[place].name, one))
-            if len(waiting) < TOGETHER and number < len(left):
-                continue
+
+        def keep() -> None:
+            """Calibrate the cameras that came, and write their lines."""
             new = _calibrated(waiting, board, options, asked, states, side.unit)
             with writing("--output", options.output):
                 append(options.output, new)
-            lines += new
-            waiting = []
+            lines.extend(new)
+            waiting.clear()
             bars.update(task, completed=len(lines))
+
+        try:
+            for number, (place, one) in enumerate(as_done(searched, work, executor), start=1):
+                waiting.append((left[place].name, one))
+                if len(waiting) == TOGETHER or number == len(left):
+                    keep()
+        except Exception as error:
+            if not _was_killed(error):
+                raise
+            if waiting:
+                keep()
+            raise ChildProcessError(_about_killed(options, len(lines), len(folders))) from error
     if changed:
         with writing("--output", options.output):
             leave_out_replaced(options.output)
@@ -96,15 +108,16 @@ def _asked(options: argparse.Namespace) -> dict[str, Any]:
     about_board = dict.fromkeys(name for names in (KINDS, *NEEDS.values(), *TAKES.values()) for name in names)
     names = (*about_board, "shape", "distortion", "skew", "reject_outliers", "orientation")
     values = {name: getattr(options, name) for name in names}
-    return {
-        name: value
-        if isinstance(value, bool)
-        else "x".join(map(str, value))
-        if isinstance(value, tuple)
-        else str(value)
-        for name, value in values.items()
-        if value is not None and value is not False
-    }
+    return {name: _plain(value) for name, value in values.items() if value is not None and value is not False}
+
+
+def _plain(value: Any) -> bool | str:
+    """An option as it is kept and told; lengths keep all their digits."""
+    if isinstance(value, Length):
+        return f"{repr(value.value).removesuffix('.0')}{value.unit or ''}"
+    if isinstance(value, tuple):
+        return "x".join(map(str, value))
+    return value if isinstance(value, bool) else str(value)
 
 
 @contextmanager
@@ -127,6 +140,23 @@ def _workers(options: argparse.Namespace, cameras: int) -> Iterator[Executor | N
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _was_killed(error: Exception) -> bool:
+    """Whether a process that searched photographs was ended from outside; on a cluster, those that tried in turn."""
+    return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
+
+
+def _about_killed(options: argparse.Namespace, done: int, cameras: int) -> str:
+    """What ended a run, what is kept of it, and what to do."""
+    fewer = (
+        "a smaller --workers, or smaller photographs, need less" if options.dask is None else "give workers more of it"
+    )
+    kept = "no camera is done yet"
+    if done:
+        held = f"{options.output} holds {counted(done, 'camera')} of {cameras}"
+        kept = f"{held}, and the same command goes on from there"
+    return f"a process that searched photographs was killed, as happens where memory runs out: {fewer}; {kept}"
 
 
 def _calibrated(

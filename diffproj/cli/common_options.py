@@ -3,7 +3,7 @@
 import argparse
 
 from diffproj.cli.inputs import LARGEST_NUMBER, add_orientation, numbers, some_path
-from diffproj.cli.units import Length, height
+from diffproj.cli.units import height
 from diffproj.cli.which_board import add_kinds, add_measures
 
 EXIT_CODES = """\
@@ -75,7 +75,6 @@ def add_plane(command: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     which.add_argument(
         "--height",
         type=height,
-        default=Length(0.0),
         metavar="H",
         help="a plane parallel to the board, H above its face as the camera sees it, such as 12 or 12mm (default: 0, "
         "the face itself)",

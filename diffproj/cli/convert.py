@@ -26,7 +26,7 @@ examples:
   diffproj convert cameras.txt camera.yaml
   diffproj convert camchain.yaml left.json --camera cam0
   diffproj convert calibration.npz ost.yaml --to ros --size 1280x720
-  diffproj convert camera.json sparse/images.txt
+  diffproj convert located.json sparse/images.txt --view mast.jpg
 """
 
 
@@ -48,9 +48,14 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("--camera", metavar="NAME", help="which camera of IN, by its name, or its number from 0")
     command.add_argument("--size", type=image_size, metavar="WxH", help="size of the image in px, where IN has none")
-    command.add_argument(
-        "--without-pose", action="store_true", help="leave the pose out, and put the world in the camera"
+    pose = command.add_mutually_exclusive_group()
+    pose.add_argument(
+        "--view",
+        metavar="NAME",
+        help="of a whole calibration, the camera where it stood in this view, such as the one that 'diffproj locate' "
+        "found (default: the camera without a pose)",
     )
+    pose.add_argument("--without-pose", action="store_true", help="leave the pose out, and put the world in the camera")
     add_said(command)
     command.set_defaults(work="converting")
 

@@ -6,6 +6,7 @@ from typing import Any
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.cli.inputs import check_not_the_same, check_writable
+from diffproj.cli.scene import posed_view
 from diffproj.cli.terminal import as_json, note, result
 from diffproj.files import own_json
 from diffproj.files.document import Document
@@ -42,13 +43,18 @@ def run(options: argparse.Namespace) -> int:
         said = str(error)
         for python, remedy in REMEDIES:
             said = said.replace(python, remedy)
+        if options.view is not None:
+            said = said.replace("give --without-pose", "leave out --view")
         raise ValueError(said) from error
     told = _told(options, found)
     own = format_to_write(options.output, options.to) is own_json
     if own_json.holds_whole(document) and not (own and isinstance(found, WHOLE)):
+        pose = "" if options.view is None else f" at {options.view}"
         note(
-            f"{options.output} holds the camera alone: error bars, views and unit of {options.input} stay there, and "
-            "what is measured with the camera alone has error bars that are too small"
+            f"{options.output} holds the camera{pose} alone: error bars, views and unit of {options.input} stay there, "
+            "and what is measured with the camera alone has error bars that are too small"
+            + (isinstance(found, Calibration) and not own)
+            * "; --view NAME takes the camera where it stood"
         )
     if options.json:
         as_json(told)
@@ -80,6 +86,8 @@ def _told(options: argparse.Namespace, found: Camera | Calibration | RigCalibrat
 
 def _wanted(options: argparse.Namespace, document: Document) -> Camera | Calibration | RigCalibration:
     """What to write: a whole calibration or rig where nothing of it is to change."""
+    if options.view is not None:
+        return _sized(_at_view(options, document), options)
     plain = options.source is None and options.size is None and not options.without_pose
     if plain and options.camera is None:
         found = content_of(document)
@@ -93,6 +101,23 @@ def _wanted(options: argparse.Namespace, document: Document) -> Camera | Calibra
         except ValueError as error:
             raise ValueError(f"{options.input}: {error}") from error
     return found if isinstance(found, Calibration | RigCalibration) else _sized(found, options)
+
+
+def _at_view(options: argparse.Namespace, document: Document) -> Camera:
+    """The camera of a calibration at the pose of one of its views.
+
+    Raises:
+        ValueError: the file holds no calibration of one camera, or not that view.
+    """
+    one = options.camera
+    if one is not None and own_json.holds_fleet(document):
+        one = name_in(among := found_in(document, options.source), named(among, one))
+    found = content_of(document, one) if options.source in (None, "json") else None
+    if not isinstance(found, Calibration) or found.camera.batch_shape:
+        raise ValueError(
+            f"--view: want a .json with a whole calibration of one camera, got another file in {options.input}"
+        )
+    return found.cameras[posed_view(options.input, found, options.view)]
 
 
 def named(found: Found, name: str | None) -> str | int | None:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffproj._core.warn import warn_caller
 from diffproj.cli.spreadsheet import Spreadsheet
 from diffproj.targets.landmarks import Landmarks
 
@@ -26,6 +27,11 @@ TITLES = {
 
 WITHOUT_TITLES = ("name", "u", "v", "x", "y", "z")
 """The columns of a file that begins with numbers; z may be left out."""
+
+DEGREES = ("lat", "latitude", "lon", "long", "lng", "longitude")
+"""Titles, in small letters, of places that are not in metres yet."""
+
+FROM_DEGREES = "dp.metres_from_degrees makes x and y in metres of degrees, in Python"
 
 DEVIATIONS = ("sigma", "sigma_x", "sigma_y", "sigma_z", "pixel_sigma")
 WANT = "columns name, u, v, x, y, z"
@@ -50,16 +56,21 @@ def read_landmarks(path: Path) -> Surveyed:
 
     Its first line has the titles of the columns, in any order: u, v, x, y, and as far as they are known name, z (0 if
     left out), sigma or sigma_x, sigma_y and sigma_z (deviations in world units, 0 where empty) and pixel_sigma. Other
-    columns are passed over. A file without titles has name,u,v,x,y,z or name,u,v,x,y. Landmarks without u and v are in
-    the survey and not in the photograph.
+    columns are passed over, with a warning where z is left out and one of them may be it. A file without titles has
+    name,u,v,x,y,z or name,u,v,x,y. Landmarks without u and v are in the survey and not in the photograph.
 
     Raises:
         ValueError: a column is missing or there twice, a cell is no number, or a name stands twice; line and column are
             named.
         OSError: the file cannot be read.
+
+    Warns:
+        UserWarning: there is no z, and a column of numbers that is passed over.
     """
     table = Spreadsheet("--landmarks", path, f"lines with {WANT}")
     columns: list[str | None] | None = None
+    titles: list[str] = []
+    aside: list[list[float | None]] = []
     rows: list[dict[str, float | None]] = []
     names: list[str] = []
     for line, cells in table.lines():
@@ -67,6 +78,7 @@ def read_landmarks(path: Path) -> Surveyed:
             titled = all(table.number(cell) is None for cell in cells[1:3])
             columns = _columns(cells, path) if titled else _untitled(cells, path)
             if titled:
+                titles = cells
                 continue
         row = _row(columns, cells, table, line)
         name = dict(zip(columns, cells, strict=False)).get("name") or str(len(rows) + 1)
@@ -76,9 +88,32 @@ def read_landmarks(path: Path) -> Surveyed:
             raise ValueError(f"--landmarks: want each name once, got {name!r} again in line {line} of {path}")
         rows.append(row)
         names.append(name)
+        aside.append([None if column else table.number(cell) for column, cell in zip(columns, cells, strict=False)])
     if not rows:
         raise ValueError(f"--landmarks: want lines with {WANT}, found none in {path}")
+    if "z" not in rows[0]:
+        _warn_of_heights(titles, aside, path)
     return _surveyed(rows, names, path)
+
+
+def _warn_of_heights(titles: list[str], aside: list[list[float | None]], path: Path) -> None:
+    """Warn of columns of numbers that are passed over in a file without z: one of them may be it.
+
+    Args:
+        titles: of all columns.
+        aside: the numbers in the columns that are passed over, line by line.
+        path: of the file.
+    """
+    places = range(min(map(len, aside)))
+    columns = {titles[place]: [numbers[place] for numbers in aside] for place in places if place < len(titles)}
+    counting = list(range(1, len(aside) + 1))
+    found = [repr(title) for title, numbers in columns.items() if None not in numbers and numbers != counting]
+    if found:
+        them = "it is the height, call it z" if len(found) == 1 else "one is the height, call that z"
+        warn_caller(
+            f"{path}: no column is called z, so that all landmarks are taken to lie on z = 0; {' and '.join(found)} "
+            f"{'is' if len(found) == 1 else 'are'} passed over: if {them}"
+        )
 
 
 def _columns(cells: list[str], path: Path) -> list[str | None]:
@@ -90,9 +125,10 @@ def _columns(cells: list[str], path: Path) -> list[str | None]:
             raise ValueError(f"--landmarks: want one column {column!r}, got {columns.count(column)} in {path}")
     missing = [column for column in ("u", "v", "x", "y") if column not in columns]
     if missing:
+        degrees = any(cell.lower() in DEGREES for cell in cells)
         raise ValueError(
             f"--landmarks: want {WANT} by their titles in the first line, got no {missing[0]!r} in {path}: it has "
-            f"{', '.join(map(repr, cells))}"
+            f"{', '.join(map(repr, cells))}" + degrees * f"; {FROM_DEGREES}"
         )
     if "sigma" in columns and any(f"sigma_{axis}" in columns for axis in "xyz"):
         raise ValueError(f"--landmarks: want either a column 'sigma' or sigma_x, sigma_y, sigma_z, got both in {path}")

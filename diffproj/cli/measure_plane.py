@@ -1,29 +1,41 @@
 """The plane that is measured on: by its equation, or by its height above the board's face, and the same in words.
 
-Where the camera was found from landmarks, heights count from z = 0 towards z.
+Where the camera was found from landmarks, heights count from z = 0 towards z. Maps count theirs from the sea, so that
+z = 0 may lie far below the ground: where no plane is given, that is told.
 """
 
 import argparse
 
 import torch
 
+from diffproj._core.warn import warn_caller
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.cli.scene import Scene
 from diffproj.cli.units import Length, in_unit
 from diffproj.geometry.plane import Plane
+from diffproj.measurement.default_plane import far_from_landmarks
 
 FLAT = 1e-9
 """Parts of the board's size by which its corners may lie off a plane z = const, and still be flat."""
 
 
 def plane_of(scene: Scene, options: argparse.Namespace) -> Plane:
-    """The plane that the options say.
+    """The plane that the options say; the face, or z = 0 of landmarks, where they say none.
 
     Raises:
         ValueError: as `plane_at_height`.
+
+    Warns:
+        UserWarning: none is said, and z = 0 is far from all landmarks.
     """
     if options.plane is None:
-        return plane_at_height(scene, options.height)
+        far = far_from_landmarks(scene.calibration, scene.view) if options.height is None else None
+        if far is not None:
+            said = far.in_words(scene.square.unit)
+            warn_caller(
+                f"{said}; give its height, such as --height {far.nearest:.10g}, or --height 0 if z = 0 is meant"
+            )
+        return plane_at_height(scene, options.height or Length(0.0))
     return Plane(torch.tensor(options.plane[:3], dtype=torch.float64, device="cpu"), options.plane[3])
 
 

@@ -82,18 +82,7 @@ def stored_view(options: argparse.Namespace) -> Scene:
             f"--view: want a .json with a whole calibration, got a camera without views in {path}; give a photograph "
             "with --board and --square"
         )
-    names = calibration.views.names
-    if name not in names:
-        listed = ", ".join(names[:20]) + (f" and {len(names) - 20} more" if len(names) > 20 else "")
-        raise ValueError(f"--view: want a view of {path}, got {name!r}; it has {listed}")
-    if names.count(name) > 1:
-        raise ValueError(
-            f"--view: want a name of one view, got {name!r}, which {names.count(name)} views of {path} have; give the "
-            "photograph with --board and --square"
-        )
-    number = names.index(name)
-    if not bool(calibration.used[number].any()):
-        raise ValueError(f"--view: {name!r} was left out of the calibration in {path}, so its pose is not known")
+    number = posed_view(path, calibration, name, "give the photograph with --board and --square")
     includes = ("pixels", "pose") if calibration.has_covariance else ("pixels",)
     title = f"{path}: view {name}\nRMS {float(calibration.view_rms[number]):.4f} px"
     includes += ("camera",) if calibration.knows_intrinsics else ()
@@ -101,6 +90,33 @@ def stored_view(options: argparse.Namespace) -> Scene:
     return Scene(
         path, None, calibration, number, includes, title, square, heading(square.unit) or "the calibration's unit"
     )
+
+
+def posed_view(path: Path, calibration: Calibration, name: str, otherwise: str = "write it in Python") -> int:
+    """The number of the view of that name.
+
+    Args:
+        path: of the calibration's file.
+        calibration: with its views.
+        name: of one of them.
+        otherwise: what to do where several have that name.
+
+    Raises:
+        ValueError: there is no such view, or more than one, or no pose of it.
+    """
+    names = calibration.views.names
+    if name not in names:
+        listed = ", ".join(names[:20]) + (f" and {len(names) - 20} more" if len(names) > 20 else "")
+        raise ValueError(f"--view: want a view of {path}, got {name!r}; it has {listed}")
+    if names.count(name) > 1:
+        raise ValueError(
+            f"--view: want a name of one view, got {name!r}, which {names.count(name)} views of {path} have; "
+            f"{otherwise}"
+        )
+    number = names.index(name)
+    if not bool(calibration.used[number].any()):
+        raise ValueError(f"--view: {name!r} was left out of the calibration in {path}, so its pose is not known")
+    return number
 
 
 def new_photograph(options: argparse.Namespace, photograph: Photograph) -> Scene:

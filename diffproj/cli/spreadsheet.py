@@ -1,5 +1,6 @@
 """Tables as spreadsheets write them: commas, semicolons or tabs between cells; with the latter two, decimal commas."""
 
+import codecs
 import csv
 import io
 import re
@@ -28,13 +29,20 @@ class Spreadsheet:
             want: what its lines should be, for messages.
 
         Raises:
-            ValueError: it is no text in UTF-8.
+            ValueError: it is no text in UTF-8, nor in UTF-16 with the mark in front that says so.
             OSError: it cannot be read.
         """
+        content = path.read_bytes()
+        # As Excel writes its "Unicode text".
+        wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         try:
-            self._text = path.read_text(encoding="utf-8-sig")
+            text = content.decode("utf-16" if wide else "utf-8-sig")
         except UnicodeDecodeError:
-            raise ValueError(f"{option}: want a text file in UTF-8, got something else in {path}") from None
+            raise ValueError(
+                f"{option}: want a text file in UTF-8, got something else in {path}; spreadsheets write one as 'CSV "
+                "UTF-8'"
+            ) from None
+        self._text = text.replace("\r\n", "\n").replace("\r", "\n")
         self._option, self._want, self.path = option, want, path
         told = (line for line in self._text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
         first = next(told, "")

@@ -26,6 +26,7 @@ from diffproj.geometry.camera import Camera
 from diffproj.geometry.grid import pixel_grid
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.measurement.choices import chosen_view
+from diffproj.measurement.default_plane import warn_if_far_from_landmarks
 from diffproj.measurement.measure import measure
 from diffproj.targets.views import view_number
 
@@ -112,7 +113,7 @@ class AccuracyMap(Shown):
             raise ValueError(f"step: want a positive distance in px that gives at most 10^8 places, got {step:g}")
         columns, rows = (math.ceil((side - 1) / step) + 1 for side in size)
         pixels = _grid(rows, columns, (0.0, 0.0, size[0] - 1.0, size[1] - 1.0), camera.K)
-        return _mapped(pixels, calibration, camera, _single(plane, camera.K), view, pixel_sigma)
+        return _mapped(pixels, calibration, camera, _single(plane, camera.K, calibration, view), view, pixel_sigma)
 
     @classmethod
     def over_plane(
@@ -152,7 +153,7 @@ class AccuracyMap(Shown):
         x_min, y_min, x_max, y_max = numbers("extent", extent, want, 4)
         if not (x_max > x_min and y_max > y_min):
             raise ValueError(f"extent: want {want}, got {tuple(extent)}")
-        plane = _single(plane, camera.K)
+        plane = _single(plane, camera.K, calibration, view)
         if abs(float(plane.unit_normal[2])) < UPRIGHT:
             raise ValueError("plane: want one that is a height over the board's x and y, got an upright one")
         rows, columns = _checked_shape(shape)
@@ -199,8 +200,10 @@ def _one_camera(calibration: Calibration | Camera, view: int | str | None) -> Ca
     return camera.to(torch.float64)
 
 
-def _single(plane: Plane | None, points: Tensor) -> Plane:
+def _single(plane: Plane | None, points: Tensor, calibration: Calibration | Camera, view: int | str | None) -> Plane:
     """One plane in float64; the board's, where its points are, if none was given."""
+    if plane is None and isinstance(calibration, Calibration):
+        warn_if_far_from_landmarks(calibration, view_number(chosen_view(calibration, view), calibration.views.names))
     plane = (Plane.z(0.0) if plane is None else as_plane(plane)).like(points).to(torch.float64)
     if plane.normal.is_meta:
         raise ValueError("plane: want one with values, got one on the device meta")

@@ -14,6 +14,7 @@ from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane
 from diffproj.measurement.choices import HAND_PX
+from diffproj.measurement.default_plane import warn_if_far_from_landmarks
 from diffproj.report.document import Part, asset, data_uri, json_block, shortened
 from diffproj.report.measuring_model import as_one, measuring_model
 from diffproj.targets.images import Orientation, Photograph, as_8_bit, decoded, grey, listed
@@ -50,6 +51,8 @@ def measuring_part(
         name: what the photograph is called; the file's name, or the view's, if left out.
     """
     one, number = as_one(calibration, view)
+    if plane is None and isinstance(one, Calibration):
+        warn_if_far_from_landmarks(one, number)
     if unit is not None and not isinstance(unit, str):
         raise TypeError(f"unit: want a name such as 'mm', got {called(unit)}")
     found = _one(photograph)

@@ -189,8 +189,9 @@ def searched(
     if orientation not in get_args(Orientation):
         raise ValueError(f"orientation: want 'sensor' or 'upright', got {orientation!r}")
     raster: Orientation = "upright" if orientation == "upright" else "sensor"
-    if executor is not None and not callable(getattr(executor, "submit", None)):
-        raise TypeError(f"executor: want a concurrent.futures.Executor, got {type(executor).__name__}")
+    if executor is not None and (isinstance(executor, type) or not callable(getattr(executor, "submit", None))):
+        got = f"the class {executor.__name__}" if isinstance(executor, type) else type(executor).__name__
+        raise TypeError(f"executor: want a concurrent.futures.Executor, got {got}")
     if frames is not None:
         frames = whole_number("frames", frames, "a whole number from 1 on", least=1)
     listing = listed(photographs, frames)

@@ -1,6 +1,7 @@
 """`diffproj convert` and `diffproj info`."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,6 +65,48 @@ def test_what_a_format_has_no_place_for_is_told(folder: Path, capsys: pytest.Cap
     for inside, out in ((source, "f.json"), (str(folder / "e.yml"), "g.json"), (str(folder / "e.yml"), "g.xml")):
         assert main(["convert", inside, str(folder / out)]) == 0
         assert capsys.readouterr().err == ""
+
+
+def test_a_camera_is_converted_where_it_stood(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without --view formats that hold a pose get none, and the note says which option takes it along."""
+    source = folder / "stood.json"
+    calibration = dp.calibrate(dp.example_views("left")[:4], dp.Chessboard())
+    dp.save_camera(source, calibration)
+    name, point = calibration.views.names[2], torch.tensor([[25.0, 50, 0]], dtype=torch.float64)
+    want = calibration.cameras[2].project(point)[0]
+    (folder / "stood").mkdir()
+    for out, options in {"images.txt": [], "a.json": [], "a.npz": [], "t.json": ["--to", "nerfstudio"]}.items():
+        command = ["convert", str(source), str(folder / "stood" / out), *options]
+        assert main([*command, "--view", name]) == 0
+        assert f"{out} holds the camera at {name} alone: error bars, views and unit" in capsys.readouterr().err
+        found = dp.load_camera(folder / "stood" / out)
+        assert torch.allclose(found.project(point)[0], want, atol=1e-6, rtol=0)
+    assert main(["convert", str(source), str(folder / "stood" / "images.txt")]) == 0
+    assert "error bars that are too small; --view NAME takes the camera where it stood" in capsys.readouterr().err
+    assert torch.equal(dp.load_camera(folder / "stood" / "images.txt").t, torch.zeros(3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("given", "out", "view", "code", "told"),
+    [
+        (
+            "stood.json",
+            "new.npz",
+            "right01.jpg",
+            1,
+            "--view: want a view of .*, got 'right01.jpg'; it has left01.jpg, ",
+        ),
+        ("opencv.yml", "new.npz", "left01.jpg", 1, "--view: want a .json with a whole calibration of one camera, got"),
+        ("stood.json", "new.yaml", "left01.jpg", 1, "OpenCV's formats hold no pose; use .json, or leave out --view"),
+    ],
+)
+def test_a_view_that_cannot_be_converted(
+    folder: Path, capsys: pytest.CaptureFixture[str], given: str, out: str, view: str, code: int, told: str
+) -> None:
+    dp.save_camera(folder / "stood.json", dp.calibrate(dp.example_views("left")[:4], dp.Chessboard()))
+    assert main(["convert", str(folder / given), str(folder / out), "--view", view]) == code
+    assert re.search(told, capsys.readouterr().err)
+    assert not (folder / out).exists()
 
 
 def test_one_of_several_unlike_cameras_is_converted(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

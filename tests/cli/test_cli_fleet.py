@@ -4,6 +4,7 @@ import importlib.util
 import json
 import os
 import shutil
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import numpy as np
@@ -216,6 +217,32 @@ def test_the_document_speaks_of_options_and_tells_notes(fleet, tmp_path, capsys,
     assert 'Notes on photographs of cam10: see "notes" in the file' in out
 
 
+@pytest.mark.parametrize("together", [1, 32], ids=["one by one", "at once"])
+def test_a_killed_worker_leaves_what_came_before(fleet, truth, tmp_path, capsys, monkeypatch, together):
+    """As where memory runs out: one line says so, and the same command goes on."""
+    file, as_done = tmp_path / "out.jsonl", calibrating_fleet.as_done
+
+    def broken(work, items, executor):
+        yield next(as_done(work, items, executor))
+        raise BrokenProcessPool("A process in the process pool was terminated abruptly")
+
+    monkeypatch.setattr(calibrating_fleet, "TOGETHER", together)
+    monkeypatch.setattr(calibrating_fleet, "as_done", broken)
+    code, out, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    assert (code, out) == (1, "")
+    assert err == (
+        "diffproj: a process that searched photographs was killed, as happens where memory runs out: a smaller "
+        f"--workers, or smaller photographs, need less; {file} holds 1 camera of 5, and the same command goes on from "
+        "there\n"
+    )
+    assert list(lines_of(file)) == ["cam2"]
+    monkeypatch.setattr(calibrating_fleet, "as_done", as_done)
+    code, _, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
+    assert code == 0
+    assert "1 camera of 5 done before" in err
+    assert len(lines_of(file)) == 5
+
+
 def test_other_options_are_not_mixed(fleet, tmp_path, capsys):
     file = tmp_path / "out.jsonl"
     run(capsys, "--fleet", fleet, *GIVEN, "-o", file)
@@ -223,6 +250,9 @@ def test_other_options_are_not_mixed(fleet, tmp_path, capsys):
     code, _, err = run(capsys, "--fleet", fleet, *GIVEN, "--distortion", "none", "-o", file)
     assert code == 1
     assert "holds cameras with distortion brown4, not none; choose another file, or remove it" in err
+    code, _, err = run(capsys, "--fleet", fleet, *GIVEN, "--square", "25.0000004mm", "-o", file)
+    assert code == 1
+    assert "holds cameras with square 25mm, not 25.0000004mm; choose another file, or remove it" in err
     assert file.read_text() == text
     file.write_text("something else")
     code, _, err = run(capsys, "--fleet", fleet, *GIVEN, "-o", file)

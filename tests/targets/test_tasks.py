@@ -100,3 +100,5 @@ def test_an_exception_names_its_photograph(folder, monkeypatch):
 def test_no_executor():
     with pytest.raises(TypeError, match=r"executor: want a concurrent\.futures\.Executor, got int"):
         detect(np.zeros((100, 100), np.uint8), Chessboard(9, 6), executor=4)
+    with pytest.raises(TypeError, match="executor: want .*, got the class ThreadPoolExecutor"):
+        detect(np.zeros((100, 100), np.uint8), Chessboard(9, 6), executor=ThreadPoolExecutor)
