@@ -17,7 +17,6 @@ from diffproj.calibration.evidence.best import best
 from diffproj.calibration.evidence.descent import Found, Task, descended, spare
 from diffproj.calibration.evidence.knowledge import Knowledge, knowledge, prior_shapes
 from diffproj.calibration.evidence.observations import Seen
-from diffproj.calibration.evidence.pose_parameters import TURNS
 from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.fit import MAX_REJECTION_ROUNDS, Fit, inliers
 from diffproj.calibration.fitting.options import Options
@@ -178,7 +177,7 @@ def _ends(
     """Where each start leads, the lowest first."""
     batch = camera.batch_shape
     task = Task((piece,), camera, batch, known)
-    if known.angles or not any(one.name in (*TURNS, "turn") for one in known.priors):
+    if known.angles or known.turns_freely:
         other = alone.has_alternatives and bool(alone.likelihood_ratio.isfinite().any())
         starts = [alone.cameras, *([alone.alternatives] if other else [])]
     else:

@@ -134,12 +134,20 @@ def _checked(observation: object) -> Observation:
 
 def _batch(camera: Camera, pieces: Sequence[Observation], known: Knowledge) -> tuple[int, ...]:
     shapes = [camera.batch_shape, *prior_shapes(known)]
-    with torch.no_grad():
+    parameters = known.parameters(camera.R.detach().reshape(-1, 3, 3))
+    with torch.enable_grad():
+        values = parameters.pack(camera.detach()).reshape(-1, len(parameters.names)).requires_grad_()
+        moving = parameters.unpack(values, camera.batch_shape, camera.size)
         for piece in pieces:
-            found = piece.residuals(camera)
+            found, name = piece.residuals(moving), type(piece).__name__
             if not isinstance(found, Tensor) or found.ndim < 2 or not found.is_floating_point():
-                name = type(piece).__name__
                 raise ValueError(f"{name}.residuals: want a tensor (*B, M, k) of numbers, got {called(found)}")
+            if moving.K.requires_grad and not found.requires_grad and bool((found != 0).any()):
+                raise ValueError(
+                    f"{name}.residuals: want numbers that follow from the camera by PyTorch's functions, got a tensor "
+                    "without a gradient, which tells nothing of the camera: no NumPy, float(), .item() or .detach() on "
+                    "the way"
+                )
             shapes.append(found.shape[:-2])
     try:
         batch = tuple(torch.broadcast_shapes(*shapes))
