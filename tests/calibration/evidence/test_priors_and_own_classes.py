@@ -161,3 +161,16 @@ def test_the_level_of_a_shore_is_no_spare_residual() -> None:
     seen = dp.Coplanar(shore[:, :2], camera.project(shore)[0] + 0.3, pixel_sigma=1.0)
     found = dp.adjust(camera, seen, fixed=("position", "height"))
     assert int(found.spare) == 4
+
+
+def test_landmarks_in_degrees_are_refused() -> None:
+    """As they are in `Landmarks`; heights up one mast are none."""
+    places = [
+        [40.4168, -3.7038, 650.0],
+        [40.4169, -3.7037, 651.0],
+        [40.4170, -3.7036, 650.0],
+        [40.4169, -3.7034, 650.0],
+    ]
+    with pytest.raises(ValueError, match="landmarks: want metres .*latitude and longitude.*dp.metres_from_degrees"):
+        dp.Seen(places, torch.zeros(4, 2))
+    assert len(dp.Seen([[12.0, 30.0, up] for up in (0.0, 1.0, 2.0, 3.0)], torch.zeros(4, 2))) == 4
