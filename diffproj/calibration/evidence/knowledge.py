@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import called, words
+from diffproj._core.copying import ordinary
 from diffproj._core.numerics import check_tensor, in_float64
 from diffproj.calibration.evidence.pose_parameters import ANGLES, PLACE, TURNS, PoseParameters
 from diffproj.calibration.least_squares.solver import Prior
@@ -209,7 +210,7 @@ def _numbers(name: str, value: Any, count: int) -> Tensor:
     """`(*B, count)` of a number, `(*B,)` for a single parameter, or `(*B, count)`."""
     if value is None or isinstance(value, bool | str):
         raise TypeError(f"priors: want numbers for {name!r}, got {called(value)}")
-    tensor = in_float64(check_tensor(f"priors[{name!r}]", value))
+    tensor = ordinary(in_float64(check_tensor(f"priors[{name!r}]", value)))
     if not bool(tensor.detach().isfinite().all()):
         raise ValueError(f"priors: want finite numbers for {name!r}, got {called(value)}")
     if tensor.ndim == 0 or count == 1:
