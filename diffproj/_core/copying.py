@@ -1,13 +1,16 @@
-"""Deep copies of what holds results of a computation, which PyTorch refuses to copy along with their graph."""
+"""Copies of what PyTorch refuses: deep ones of results of a computation, and of what inference mode made."""
 
 import copy
 from collections.abc import Iterator
 from functools import partial
 from typing import Any, TypeVar
 
+import torch
 from torch import Tensor
+from torch.utils._pytree import tree_leaves, tree_map
 
 C = TypeVar("C", bound="Copied")
+T = TypeVar("T")
 
 
 class Copied:
@@ -22,6 +25,25 @@ class Copied:
         for name, value in _state(self):
             object.__setattr__(new, name, copy.deepcopy(value, memo))
         return new
+
+
+def ordinary(tree: T) -> T:
+    """A tensor, a camera or another tree with copies of the tensors that inference mode made: those have no slopes."""
+    if not any(isinstance(leaf, Tensor) and leaf.is_inference() for leaf in tree_leaves(tree)):
+        return tree
+    with torch.inference_mode(False):
+        return tree_map(lambda leaf: leaf.clone() if isinstance(leaf, Tensor) and leaf.is_inference() else leaf, tree)
+
+
+def with_ordinary(thing: T) -> T:
+    """A thing, or a copy of it, whose attributes are `ordinary`."""
+    new = thing
+    for name, value in list(_state(thing)):
+        kept = ordinary(value)
+        if kept is not value:
+            new = copy.copy(thing) if new is thing else new
+            object.__setattr__(new, name, kept)
+    return new
 
 
 def _state(thing: Any) -> Iterator[tuple[str, Any]]:

@@ -12,12 +12,12 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from diffproj._core.copying import ordinary, with_ordinary
 from diffproj.calibration.evidence.adjusted_covariance import pose_errors
 from diffproj.calibration.evidence.best import best
 from diffproj.calibration.evidence.descent import Found, Task, descended, spare
 from diffproj.calibration.evidence.knowledge import Knowledge, knowledge, prior_shapes
 from diffproj.calibration.evidence.observations import Seen
-from diffproj.calibration.evidence.pose_parameters import TURNS
 from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.fit import MAX_REJECTION_ROUNDS, Fit, inliers
 from diffproj.calibration.fitting.options import Options
@@ -68,12 +68,15 @@ def known_poses(
         CalibrationError: a view did not converge.
     """
     batch = (*data.batch, len(data.views))
-    camera = camera.to(torch.float64)[..., None].expand(*batch).detach()
+    if torch.is_inference_mode_enabled():  # which has no derivatives
+        with torch.inference_mode(False):
+            return known_poses(data, camera, alone, calibration, options, fixed, priors)
+    camera = ordinary(camera.to(torch.float64))[..., None].expand(*batch).detach()
     known = _checked(data, camera, options, fixed, priors)
     single = _single(data, known)
 
     def seen_by(used: Tensor) -> tuple[Seen, tuple[Found, ...], Fit]:
-        piece = _seen(data, used.reshape(*batch, -1))
+        piece = with_ordinary(_seen(data, used.reshape(*batch, -1)))
         ends = _ends(camera, alone, known, piece, options.max_iterations)
         return piece, ends, _fit(data, single, used, ends[0])
 
@@ -178,7 +181,7 @@ def _ends(
     """Where each start leads, the lowest first."""
     batch = camera.batch_shape
     task = Task((piece,), camera, batch, known)
-    if known.angles or not any(one.name in (*TURNS, "turn") for one in known.priors):
+    if known.angles or known.turns_freely:
         other = alone.has_alternatives and bool(alone.likelihood_ratio.isfinite().any())
         starts = [alone.cameras, *([alone.alternatives] if other else [])]
     else:
@@ -192,6 +195,7 @@ def _ends(
     found = []
     for start in starts:
         start = Camera.unchecked(camera.K, start.R.to(camera.K), start.t.to(camera.K), camera.distortion, camera.size)
+        start = ordinary(start)
         R = start.R.reshape(-1, 3, 3)
         begin = known.parameters(R).pack(start).reshape(own.shape)
         begin[:, held] = own[:, held]
@@ -276,7 +280,7 @@ def _covariance(
 ) -> Covariance:
     s, batch = found.parameters.camera.size, tuple(data.batch)
     before = None if calibration is None or not calibration.has_covariance else calibration.covariance_of_kept_poses
-    with torch.no_grad():
+    with torch.inference_mode(False), torch.no_grad():
         errors = pose_errors(task, found, data.middle, follows=before is not None, level=scale)
     V = len(data.views)
 

@@ -31,7 +31,7 @@ def metres_from_degrees(
 
     Returns:
         The points `(*B, N, 2)` or `(*B, N, 3)`, east, north, and the heights as they were, in float64; and the
-        coordinate reference system.
+        coordinate reference system. East and north carry no gradient.
 
     Raises:
         TypeError: no numbers, or a system that is no text.
@@ -55,7 +55,8 @@ def metres_from_degrees(
         )
     if crs is None:
         first = longitude.flatten()[:1]  # The middle is near the points on either side of the date line too.
-        crs = _utm(float(latitude.mean()), float((first + (longitude - first + 180) % 360 - 180).mean()))
+        middle = (first + (longitude - first + 180) % 360 - 180).mean()
+        crs = _utm(float(latitude.detach().mean()), float(middle.detach()))
     pyproj = _pyproj()
     system = _map(pyproj, crs)
     east, north = _transformed(pyproj, WGS84, system, latitude, longitude, swap=True)
@@ -73,7 +74,7 @@ def degrees_from_metres(points: Float[Tensor, "*batch n d"] | Array, crs: str) -
     Raises:
         TypeError: no numbers, or a system that is no text.
         ValueError: a system that pyproj does not know, that is not in metres, that counts to the west or south, or that
-            does not reach the points.
+            does not reach the points; or points that lie far off the map's area, as where east and north are exchanged.
         ModuleNotFoundError: pyproj is not installed.
 
     Example:
@@ -83,7 +84,9 @@ def degrees_from_metres(points: Float[Tensor, "*batch n d"] | Array, crs: str) -
     """
     points = _checked("points", points)
     pyproj = _pyproj()
-    latitude, longitude = _transformed(pyproj, _map(pyproj, crs), WGS84, points[..., 0], points[..., 1], swap=False)
+    system = _map(pyproj, crs)
+    latitude, longitude = _transformed(pyproj, system, WGS84, points[..., 0], points[..., 1], swap=False)
+    _check_place(pyproj, crs, system, points, latitude, longitude)
     return torch.stack([latitude, longitude, *points[..., 2:].unbind(-1)], dim=-1)
 
 
@@ -119,7 +122,12 @@ def _transformed(
     pyproj: Any, source: Any, target: Any, first: Tensor, second: Tensor, swap: bool
 ) -> tuple[Tensor, Tensor]:
     """Two coordinates from one system to another, east before north, latitude before longitude."""
-    transformer = pyproj.Transformer.from_crs(source, target, always_xy=True)
+    try:
+        transformer = pyproj.Transformer.from_crs(source, target, always_xy=True)
+    except pyproj.exceptions.ProjError as error:
+        raise ValueError(
+            f"crs: want a map that pyproj can work out, got {getattr(target, 'name', target)}: {error}"
+        ) from error
     given = (second, first) if swap else (first, second)
     found = transformer.transform(*(part.detach().cpu().numpy() for part in given))
     x, y = (torch.as_tensor(part, dtype=first.dtype, device=first.device).reshape(first.shape) for part in found)
@@ -152,17 +160,44 @@ def _map(pyproj: Any, name: str) -> Any:
 
 def _check_lengths(pyproj: Any, name: str, system: Any, latitude: Tensor, longitude: Tensor) -> None:
     """Check that a metre on the map is about one on the ground, in every direction."""
+    off = _stretch(pyproj, system, latitude, longitude)
+    if len(off) == 0:
+        return
+    worst = off[off.abs().argmax()]
+    if not float(worst.abs()) <= STRETCHED:
+        raise ValueError(
+            f"crs: want a map whose metres are those on the ground, got {name!r} ({system.name}), where a metre on "
+            f"the ground is {1 + float(worst):.4g} at the points; leave crs out for the UTM zone of their middle, "
+            "look whether the degrees are exchanged, or take points that lie closer together"
+        )
+
+
+def _check_place(pyproj: Any, name: str, system: Any, points: Tensor, latitude: Tensor, longitude: Tensor) -> None:
+    """Check that points `(*B, N, d)` lie within a map's area, or not so far from it that its metres are none."""
+    area = system.area_of_use
+    if area is None:
+        return
+    low, high = points.new_tensor([area.west, area.south]), points.new_tensor([area.east, area.north])
+    width = (high[0] - low[0]) % 360 or 360
+    within = ((longitude - low[0]) % 360 <= width) & (latitude >= low[1]) & (latitude <= high[1])
+    stretched = ~(_stretch(pyproj, system, latitude, longitude).abs() <= STRETCHED)
+    wrong = ~within & stretched.to(within.device).reshape(2, *within.shape).any(0)
+    if bool(wrong.any()):
+        there = float(latitude[wrong][0]), float(longitude[wrong][0])
+        raise ValueError(
+            f"points: want east, then north, on the map {name!r} ({system.name}), got {first_of(points, wrong)}, which "
+            "would be latitude {:.2f}, longitude {:.2f}, far off it; are they exchanged, or of another map?".format(
+                *there
+            )
+        )
+
+
+def _stretch(pyproj: Any, system: Any, latitude: Tensor, longitude: Tensor) -> Tensor:
+    """By which part a map makes lengths longer where it does most, and then where it does least, `(2 n,)`."""
     flat = (part.detach().cpu().numpy().ravel() for part in (longitude, latitude))
     factors = pyproj.Proj(system).get_factors(*flat)
-    for scale in (factors.tissot_semimajor, factors.tissot_semiminor):
-        off = torch.as_tensor(scale, dtype=torch.float64, device="cpu") - 1
-        worst = off[off.abs().argmax()] if len(off) else off.sum()
-        if not float(worst.abs()) <= STRETCHED:
-            raise ValueError(
-                f"crs: want a map whose metres are those on the ground, got {name!r} ({system.name}), where a metre on "
-                f"the ground is {1 + float(worst):.4g} at the points; leave crs out for the UTM zone of their middle, "
-                "look whether the degrees are exchanged, or take points that lie closer together"
-            )
+    scales = (factors.tissot_semimajor, factors.tissot_semiminor)
+    return torch.cat([torch.as_tensor(scale, dtype=torch.float64, device="cpu").reshape(-1) - 1 for scale in scales])
 
 
 def _utm(latitude: float, longitude: float) -> str:

@@ -7,6 +7,11 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
+from diffproj._core.arguments import called
+
+SHOWN = 160
+"""Characters of an error of PyTorch's."""
+
 
 def at_each(function: Callable[[Tensor], Any]) -> Callable[[Tensor], Any]:
     """The function of points `(k, 3)` for points `(*B, k, 3)`, which may be none; its results get one axis in front.
@@ -25,3 +30,31 @@ def at_each(function: Callable[[Tensor], Any]) -> Callable[[Tensor], Any]:
 def number_of_each(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     """The same of a function that gives a number: `(*B,)` for points `(*B, k, 3)`."""
     return lambda points: at_each(function)(points).reshape(points.shape[:-2])
+
+
+def checked_number(given: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+    """A function of a caller's from points to a number, which names what is wrong with it.
+
+    Raises:
+        ValueError: it gives something else, or does what PyTorch cannot do for many points at once or differentiate.
+    """
+
+    def checked(points: Tensor) -> Tensor:
+        try:
+            found = given(points)
+        except torch.cuda.OutOfMemoryError:
+            raise
+        except RuntimeError as error:
+            reason = str(error)[:SHOWN].partition("\n")[0]
+            raise ValueError(
+                "function: want one written in PyTorch's functions of the points, with torch.where in the place of if, "
+                f"and without .item(), float(), NumPy or writing to them; got one that fails: {reason}"
+            ) from error
+        if not isinstance(found, Tensor) or found.ndim or not found.is_floating_point():
+            raise ValueError(
+                "function: want one that gives a number, a tensor without axes of floating-point type, got "
+                f"{called(found)}"
+            )
+        return found
+
+    return checked

@@ -15,7 +15,7 @@ from diffproj._core.shown import Shown, counted, decimals, rounded
 from diffproj.calibration.results.covariance import zero_where_infinite
 from diffproj.calibration.results.region import in_region
 from diffproj.geometry.back_projection import Reason, explain
-from diffproj.measurement.each import at_each
+from diffproj.measurement.each import at_each, checked_number
 from diffproj.measurement.ellipses import Ellipses, plane_ellipses
 from diffproj.measurement.folded import longest_first, norm_variance
 from diffproj.measurement.intervals import Function, Interval, angle_interval, curved_interval, norm_interval
@@ -167,7 +167,8 @@ class Measurement(Copied, Shown):
 
         Raises:
             TypeError: no function, or no whole numbers.
-            ValueError: not of shape `(M, k)`, or the function gives something else than a number with a gradient.
+            ValueError: not of shape `(M, k)`, or the function gives something else than a number with a gradient, or is
+                not written in PyTorch's functions alone.
             IndexError: there is no such point.
 
         Example:
@@ -182,16 +183,7 @@ class Measurement(Copied, Shown):
         given = arguments.function("function", function, "a function of k points (k, 3)")
         chosen = self.points[..., index, :]  # (*B, M, k, 3)
 
-        def checked(points: Tensor) -> Tensor:
-            found = given(points)
-            if not isinstance(found, Tensor) or found.ndim or not found.is_floating_point():
-                raise ValueError(
-                    "function: want one that gives a number, a tensor without axes of floating-point type, got "
-                    f"{arguments.called(found)}"
-                )
-            return found
-
-        gradient, value = at_each(torch.func.grad_and_value(checked))(chosen)
+        gradient, value = at_each(torch.func.grad_and_value(checked_number(given)))(chosen)
         gradient, value = gradient.reshape(chosen.shape), value.reshape(chosen.shape[:-2])
         spread = Propagated.of(self._noise, index, gradient.nan_to_num(0.0, 0.0, 0.0).unsqueeze(-3))
         with torch.no_grad():

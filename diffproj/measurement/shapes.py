@@ -75,7 +75,8 @@ def turn(points: Tensor) -> tuple[Tensor, Tensor]:
     """
     a, b = points[0] - points[1], points[2] - points[1]
     cross, dot = torch.linalg.cross(a, b), (a * b).sum()
-    obtuse, dot = dot < 0, dot.abs()
+    obtuse = dot < 0
+    dot = torch.where(obtuse, -dot, dot)  # at a right angle its absolute value has no slope
     squared = cross.square().sum()
     turned = squared > 0
     sine = torch.where(turned, squared, 1.0).sqrt()

@@ -117,16 +117,28 @@ def _check_values(points: Tensor) -> None:
             f"points: want float64 so far from the origin, got {name}, which holds {size:.3g} only to "
             f"{torch.finfo(points.dtype).eps * size / 2:.1g}: read them as float64, or subtract an origin first"
         )
+    refuse_degrees("points", points)
+
+
+def refuse_degrees(name: str, points: Tensor) -> None:
+    """Refuse points `(N, 3)` that look like latitude and longitude, in either order, and a height.
+
+    Raises:
+        ValueError: they do.
+    """
     along = points[:, :2].to(torch.float64)
-    middle = along.mean(0).abs()
+    middle, spread = along.abs().mean(0), points.amax(0) - points.amin(0)
+    turned = along % 360  # on both sides of the date line they are neighbours
+    across = torch.minimum(spread[:2].to(torch.float64), turned.amax(0) - turned.amin(0))
     angles = bool((middle <= middle.new_tensor([180.0, 180.0])).all()) and bool((middle <= 90).any())
-    small = (spread[:2] < DEGREES_SPREAD).all() & (spread[:2] < DEGREES_PART * middle.amax()).all()
+    small = (across < DEGREES_SPREAD).all() & (across < DEGREES_PART * middle.amax()).all()
     upright = len(points) < 4 and bool(spread[2] > spread[:2].amax())  # the foot and the top of a mast
-    if angles and bool(small) and not upright and extent > 0 and float(middle.amax()) > 1 and float(middle.amin()) > 0:
+    apart = float(spread[:2].amax()) > 0  # not several places up one mast
+    if angles and bool(small) and not upright and apart and float(middle.amax()) > 1 and float(middle.amin()) > 0:
         raise ValueError(
-            f"points: want metres or another unit of length, got what looks like latitude and longitude in degrees "
-            f"({along[0, 0]:.5f}, {along[0, 1]:.5f}): convert them, to UTM with pyproj; if they are lengths, subtract "
-            "an origin"
+            f"{name}: want metres or another unit of length, got what looks like latitude and longitude in degrees "
+            f"({along[0, 0]:.5f}, {along[0, 1]:.5f}): dp.metres_from_degrees converts them, latitude first; if they "
+            "are lengths, subtract an origin"
         )
 
 

@@ -149,6 +149,33 @@ def test_a_map_whose_metres_are_none_is_refused(degrees: list[list[float]], crs:
         dp.metres_from_degrees([[45.0, 3.0]], system)
 
 
+def test_east_and_north_exchanged_are_refused_on_the_way_back() -> None:
+    """Madrid's would lie in Kenya."""
+    pytest.importorskip("pyproj")
+    points, crs = dp.metres_from_degrees([[40.4168, -3.7038], [40.4170, -3.7036]])
+    with pytest.raises(ValueError, match=r"points: want east, then north, .*latitude 3.31.*are they exchanged"):
+        dp.degrees_from_metres(points.flip(-1), crs)
+    for place, system in (  # a neighbouring zone, zones that touch the date line, a pole, and a world map
+        ([40.0, -74.0], "EPSG:32617"),
+        ([-18.0, -179.9], "EPSG:32760"),
+        ([65.0, 179.9], "EPSG:32601"),
+        ([-80.0, 170.0], "EPSG:3031"),
+    ):
+        there, _ = dp.metres_from_degrees([place], system)
+        torch.testing.assert_close(
+            dp.degrees_from_metres(there, system), torch.tensor([place], dtype=D), rtol=0, atol=1e-7
+        )
+    assert dp.degrees_from_metres([[0.0, 8399737.9]], "EPSG:3857").tolist()[0] == pytest.approx([60, 0], abs=1e-6)
+
+
+def test_a_map_that_is_none_is_refused_and_a_gradient_is_no_warning() -> None:
+    pytest.importorskip("pyproj")
+    with pytest.raises(ValueError, match="crs: want a map that pyproj can work out, got WGS 84 / UTM grid system"):
+        dp.metres_from_degrees([[40.4, -3.7]], "EPSG:32600")
+    points, _ = dp.metres_from_degrees(torch.tensor([[40.4, -3.7]], dtype=D, requires_grad=True))
+    assert not points.requires_grad
+
+
 @pytest.mark.plain
 def test_without_pyproj_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyproj", None)

@@ -112,3 +112,19 @@ def test_joint_reach() -> None:
     found = joint_reach(0.95, torch.tensor([1.0, 2.0, 3.0], dtype=D))
     torch.testing.assert_close(found.square(), torch.tensor([3.841459, 5.991465, 7.814728], dtype=D), rtol=1e-6, atol=0)
     assert float(found[0]) == pytest.approx(normal_reach(0.95), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("function", "reason"),
+    [
+        (lambda p: p[0, 0] if p[0, 0] > 0 else -p[0, 0], "data-dependent"),
+        (lambda p: torch.tensor(p[0, 0].item()), ".item"),
+        (lambda p: p.numpy().sum(), "numpy"),
+        (lambda p: p.mul_(2).sum(), "in-place"),
+    ],
+    ids=["if", "item", "numpy", "in place"],
+)
+def test_a_function_that_is_not_pytorchs_is_refused_by_name(function: Callable[..., object], reason: str) -> None:
+    measured = dp.measure(torch.tensor([[300.0, 200], [200, 210]], dtype=D), FRONTAL, dp.Plane.z(0.0), pixel_sigma=0.5)
+    with pytest.raises(ValueError, match=f"function: want one written in PyTorch's functions.*{reason}"):
+        measured.quantity(function, [[0, 1]])  # type: ignore[arg-type]

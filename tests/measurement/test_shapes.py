@@ -27,6 +27,17 @@ def test_lengths_with_a_gradient_everywhere() -> None:
     torch.testing.assert_close(gradient, torch.tensor([[0.6, 0.8, 0], [0, 0, 0]], dtype=D))
 
 
+def test_a_right_angle_has_the_slopes_of_those_near_it() -> None:
+    """Its cosine is exactly 0, where the absolute value that tells the angle's supplement apart has no slope."""
+    arms = torch.tensor([[2.0, 0, 0], [0, 0, 0], [0, 3, 0]], dtype=D, requires_grad=True)
+    vector, obtuse = turn(arms)
+    assert float(vector.detach().norm()) == math.pi / 2
+    assert not obtuse
+    (gradient,) = torch.autograd.grad(vector[2], arms)
+    want = torch.tensor([[0, -1 / 2, 0], [1 / 3, 1 / 2, 0], [-1 / 3, 0, 0]], dtype=D)
+    torch.testing.assert_close(gradient, want, rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize("degrees", [0.0, 1e-6, 10.0, 89.0, 91.0, 170.0, 179.9999, 180.0])
 def test_angles_and_their_supplements(degrees: float) -> None:
     angle = math.radians(degrees)

@@ -9,6 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.arguments import called, flag, listing, whole_number, words
+from diffproj._core.copying import ordinary, with_ordinary
 from diffproj._core.numerics import check_untransformed
 from diffproj.calibration.evidence.adjusted_covariance import covariance_of
 from diffproj.calibration.evidence.adjustment import Adjustment
@@ -103,29 +104,32 @@ def adjust(
         "cameras of a batch are adjusted side by side, and differentiable=True carries gradients for "
         "torch.autograd.grad",
     )
-    known, calibration = camera, None
-    if isinstance(camera, Calibration):
-        calibration = camera
-        known = camera.cameras[..., 0] if isinstance(camera, Adjustment) else camera.camera
-    start = as_camera(known).upright()  # type: ignore[arg-type]
-    given = (observations,) if isinstance(observations, Observation) else listing("observations", observations, _WANT)
-    pieces = tuple(_checked(one) for one in given)
-    fixed, free = words("fixed", fixed, "several names"), words("free", free, "several names")
-    tied, through = flag("tied_focal", tied_focal), flag("differentiable", differentiable)
-    steps = whole_number("max_iterations", max_iterations, "a whole number of steps", least=0)
-    throw = flag("throw", throw)
-    if 0 in start.batch_shape:
-        raise ValueError(f"camera: want at least one, got batch shape {tuple(start.batch_shape)}")
-    given, start = start, start.to(torch.float64)
-    known_of = knowledge(start, priors, fixed, free, tied)
-    if {"mounting", "position", *PLACE} & {*fixed, *(priors or ())} and looks_at_rounding(given.t):
-        center = given.detach().center
-        warn_of_rounding(center.norm(dim=-1), center[..., 2].abs())
-    batch = _batch(start, pieces, known_of)
-    task = Task(pieces, start.expand(*batch), batch, known_of)
-    with torch.no_grad():
-        found = best(task, steps)
-    return _outcome(task, found, calibration, through, throw)
+    with torch.inference_mode(False):  # which has no derivatives
+        known, calibration = camera, None
+        if isinstance(camera, Calibration):
+            calibration = camera
+            known = camera.cameras[..., 0] if isinstance(camera, Adjustment) else camera.camera
+        start = ordinary(as_camera(known).upright())  # type: ignore[arg-type]
+        given = (
+            (observations,) if isinstance(observations, Observation) else listing("observations", observations, _WANT)
+        )
+        pieces = tuple(_checked(one) for one in given)
+        fixed, free = words("fixed", fixed, "several names"), words("free", free, "several names")
+        tied, through = flag("tied_focal", tied_focal), flag("differentiable", differentiable)
+        steps = whole_number("max_iterations", max_iterations, "a whole number of steps", least=0)
+        throw = flag("throw", throw)
+        if 0 in start.batch_shape:
+            raise ValueError(f"camera: want at least one, got batch shape {tuple(start.batch_shape)}")
+        given, start = start, start.to(torch.float64)
+        known_of = knowledge(start, priors, fixed, free, tied)
+        if {"mounting", "position", *PLACE} & {*fixed, *(priors or ())} and looks_at_rounding(given.t):
+            center = given.detach().center
+            warn_of_rounding(center.norm(dim=-1), center[..., 2].abs())
+        batch = _batch(start, pieces, known_of)
+        task = Task(pieces, start.expand(*batch), batch, known_of)
+        with torch.no_grad():
+            found = best(task, steps)
+        return _outcome(task, found, calibration, through, throw)
 
 
 _WANT = "observations such as [dp.Seen(landmarks, pixels), dp.Horizon(pixels)]"
@@ -136,17 +140,25 @@ def _checked(observation: object) -> Observation:
     if isinstance(observation, type) or not isinstance(observation, Observation) or not callable(residuals):
         raise TypeError(f"observations: want {_WANT}, got {called(observation)}")
     check_loss(getattr(observation, "loss", None))
-    return observation
+    return with_ordinary(observation)
 
 
 def _batch(camera: Camera, pieces: Sequence[Observation], known: Knowledge) -> tuple[int, ...]:
     shapes = [camera.batch_shape, *prior_shapes(known)]
-    with torch.no_grad():
+    parameters = known.parameters(camera.R.detach().reshape(-1, 3, 3))
+    with torch.enable_grad():
+        values = parameters.pack(camera.detach()).reshape(-1, len(parameters.names)).requires_grad_()
+        moving = parameters.unpack(values, camera.batch_shape, camera.size)
         for piece in pieces:
-            found = piece.residuals(camera)
+            found, name = piece.residuals(moving), type(piece).__name__
             if not isinstance(found, Tensor) or found.ndim < 2 or not found.is_floating_point():
-                name = type(piece).__name__
                 raise ValueError(f"{name}.residuals: want a tensor (*B, M, k) of numbers, got {called(found)}")
+            if moving.K.requires_grad and not found.requires_grad and bool((found != 0).any()):
+                raise ValueError(
+                    f"{name}.residuals: want numbers that follow from the camera by PyTorch's functions, got a tensor "
+                    "without a gradient, which tells nothing of the camera: no NumPy, float(), .item() or .detach() on "
+                    "the way"
+                )
             shapes.append(found.shape[:-2])
     try:
         batch = tuple(torch.broadcast_shapes(*shapes))

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from diffproj.calibration.evidence.adjustment import pose_covariance
 from diffproj.calibration.evidence.curved import further
-from diffproj.calibration.evidence.descent import Found, Task, reach
+from diffproj.calibration.evidence.descent import Found, Task, reach, surveyed
 from diffproj.calibration.evidence.problem import jacobian
-from diffproj.calibration.evidence.undetermined import Lacking, inverse, natural, undetermined, units
+from diffproj.calibration.evidence.undetermined import Lacking, decisive, inverse, natural, undetermined
 from diffproj.calibration.least_squares.robust import robust_factors
 from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.problem.parametrisation import POSE
@@ -60,16 +60,18 @@ def pose_errors(
     H, M = _normal_matrices(task, found, sorted({*task.known.columns, *(range(s) if follows else ())}))
     M = M if level is None else level[:, None, None] * M
     precision = found.prior.precision.detach()
-    scale = natural(values, reach(task, values))
-    Hr, lost, vectors = inverse(T.mT @ (H + precision) @ T, units(T, scale))
+    scale, placed = natural(values, reach(task, values)), surveyed(task)[1].any(-1)
+    unit = decisive(T, scale, precision.diagonal(dim1=-2, dim2=-1), placed)
+    told, known = T.mT @ H @ T, T.mT @ precision @ T
+    Hr, lost, vectors = inverse(told + known, unit)
     reduced = Hr @ (T.mT @ (M + precision) @ T) @ Hr
     C = T @ reduced @ T.mT
     if curved:
-        more = further(task, found, reduced, units(T, scale)).unsqueeze(-1)
+        more = further(task, found, reduced, unit, told, known).unsqueeze(-1)
         C = C + more @ more.mT
     held = torch.tensor([at not in task.known.columns for at in range(s)], device=values.device).to(values)
     follow = torch.nn.functional.pad(torch.diag(held), (0, 0, 0, POSE)) - T @ Hr @ (T.mT @ H[..., :s] * held)
-    unknown, names = undetermined(parameters, values, T, scale, lost, vectors)
+    unknown, names = undetermined(parameters, values, T, scale, unit, lost, vectors)
     names = [
         each if code != Status.DIVERGED else Lacking() for each, code in zip(names, found.status.tolist(), strict=True)
     ]

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from diffproj._core.copying import ordinary
 from diffproj._core.shown import counted, decimals, number
 from diffproj.calibration.evidence.observation import Observation
 from diffproj.calibration.evidence.pose_parameters import MOUNTING, PLACE
@@ -303,23 +304,26 @@ class Adjustment(Calibration):
 
 def mounting_covariance(calibration: Calibration, view: int = 0) -> Float[Tensor, "*batch 6 6"]:
     """The covariance of tilt, roll, heading in degrees, x, y and height in a view: see `Adjustment`."""
-    camera = calibration.cameras[..., view]
-    middle, pose = calibration.covariance.middle, calibration.covariance.about_middle.between(view, view)
-    lost = pose.diagonal(dim1=-2, dim2=-1).isinf()
-    pose = torch.where(lost.unsqueeze(-1) | lost.unsqueeze(-2), 0.0, pose)
-    batch = pose.shape[:-2]
-    R, t = camera.R.detach().reshape(-1, 3, 3), camera.t.detach().reshape(-1, 3)
-    m = torch.zeros_like(t) if middle is None else middle.expand_as(t)
-    t = t + (R @ m.unsqueeze(-1)).squeeze(-1)
+    with torch.inference_mode(False):
+        camera = calibration.cameras[..., view]
+        middle, pose = calibration.covariance.middle, calibration.covariance.about_middle.between(view, view)
+        lost = pose.diagonal(dim1=-2, dim2=-1).isinf()
+        pose = torch.where(lost.unsqueeze(-1) | lost.unsqueeze(-2), 0.0, pose)
+        batch = pose.shape[:-2]
+        R, t = ordinary(camera.R.detach().reshape(-1, 3, 3)), ordinary(camera.t.detach().reshape(-1, 3))
+        m = torch.zeros_like(t) if middle is None else ordinary(middle).expand_as(t)
+        t = t + (R @ m.unsqueeze(-1)).squeeze(-1)
 
-    def mounted(step: Tensor) -> Tensor:
-        again = turned(R, step[..., :3])
-        center = m - (again.mT @ (t + step[..., 3:]).unsqueeze(-1)).squeeze(-1)
-        return torch.cat([torch.stack(mounting_from_rotation(again), dim=-1), center], dim=-1)
+        def mounted(step: Tensor) -> Tensor:
+            again = turned(R, step[..., :3])
+            center = m - (again.mT @ (t + step[..., 3:]).unsqueeze(-1)).squeeze(-1)
+            return torch.cat([torch.stack(mounting_from_rotation(again), dim=-1), center], dim=-1)
 
-    J = jacobian(mounted, t.new_zeros(len(t), POSE))[1].permute(1, 2, 0)
-    C = _any_angle(J @ pose.reshape(-1, POSE, POSE) @ J.mT, mounting_from_rotation(R)[0]).reshape(*batch, POSE, POSE)
-    return C + torch.diag_embed(torch.where(lost, torch.inf, 0.0).to(C))
+        J = jacobian(mounted, t.new_zeros(len(t), POSE))[1].permute(1, 2, 0)
+        C = _any_angle(J @ pose.reshape(-1, POSE, POSE) @ J.mT, mounting_from_rotation(R)[0]).reshape(
+            *batch, POSE, POSE
+        )
+        return C + torch.diag_embed(torch.where(lost, torch.inf, 0.0).to(C))
 
 
 def _any_angle(C: Tensor, tilt: Tensor) -> Tensor:

@@ -36,6 +36,8 @@ ENOUGH = 4
 """Landmarks, as many as the camera sees, that tell a pose but for its mirror image."""
 SPARSE, SPARSE_TRIED, SPARSE_STEPS = 8, 8, 40
 """Spare residuals below which other minima are looked for; how many starts are followed, and for how many steps."""
+FAR = 30.0
+"""Turn in degrees from where the camera began from which on it is taken as the new beginning for the last steps."""
 HAIR = 1e-4
 """Cost of half a turn away from the camera's own direction, over 4."""
 TRIED = 8
@@ -48,6 +50,11 @@ def best(task: Task, steps: int) -> Found:
     With it comes the lowest other one as its rival, or in its place if it is much lower: where the evidence tells the
     whole pose, that at its mirror image; where it tells little more than the unknowns, any that other starts lead to.
     """
+    return _about_itself(task, _lowest(task, steps), steps)
+
+
+def _lowest(task: Task, steps: int) -> Found:
+    """The same, with turns about where each camera began."""
     found = _nearest(task, steps)
     if steps == 0 or not task.pieces:
         return found
@@ -64,6 +71,25 @@ def best(task: Task, steps: int) -> Found:
     if bool(mirrored.any()):
         found = for_some(task, found, mirrored.nonzero().flatten(), partial(_with_rival, steps=steps))
     return found
+
+
+def _about_itself(task: Task, found: Found, steps: int) -> Found:
+    """The minimum with turns about where the camera is now, if nothing is known of turns.
+
+    Cayley's map is stretched far from where it began, without end at half a turn: what is small there is not what is
+    small here. So cameras that turned far take their last steps here.
+    """
+    if found.parameters.start is None or not task.known.turns_freely:
+        return found
+    far = (found.values[:, -POSE:-3].norm(dim=-1) > FAR) & (found.status == Status.CONVERGED)
+    R = found.parameters.rotation(found.values)
+    values = found.values.clone()
+    values[:, -POSE:-3] = 0.0
+    here = replace(found, parameters=replace(found.parameters, start=R), values=values)
+    if steps == 0 or not task.pieces or not bool(far.any()):
+        return here
+    again = descended(task, R, values, found.prior, (), steps)
+    return _exchanged(here, again, far & (_ended(again) <= found.cost))
 
 
 def _none(found: Found) -> Rival:
@@ -103,11 +129,15 @@ def _elsewhere(task: Task, found: Found, count: int) -> tuple[Found, Tensor]:
     camera = task.known.parameters(R).unpack(begin, (len(begin),), task.camera.size)
     rotations, values = starts(task.pieces, task.known, camera, begin, task.batch)
     K, P = values.shape[:2]
+    first = task.known.parameters(R).rotation(begin)
+    hair = _away(rotations, first)
+    if not task.known.angles:
+        rotations, values[..., -POSE:-3] = task.known.turned_to(rotations, R)
     flat = rotations.flatten(0, 1)
     blocks = task.evidence(task.known.parameters(flat), (K,), ()).residuals(values.flatten(0, 1))
+    off = (values - found.prior.mean).square() * found.prior.precision.diagonal(dim1=-2, dim2=-1)
     cost = blocks.square().sum(-1).log1p().sum(-1).reshape(K, P).nan_to_num(torch.inf, torch.inf)  # mild on outliers
-    first = task.known.parameters(R).rotation(begin)
-    rows = (cost + _away(rotations, first)).topk(min(count, K), dim=0, largest=False).indices
+    rows = (cost + off.log1p().sum(-1) + hair).topk(min(count, K), dim=0, largest=False).indices
     k, each = len(rows), torch.arange(P, device=rows.device)
     many = Prior(*(part.expand(k, *part.shape).flatten(0, 1) for part in found.prior[:2]))
     near = descended(task, rotations[rows, each].flatten(0, 1), values[rows, each].flatten(0, 1), many, (k,), FEW)
@@ -217,6 +247,8 @@ def _mirrored(task: Task, found: Found) -> tuple[Tensor, Tensor]:
     if task.known.angles:
         given = torch.tensor([task.known.given(name) for name in ANGLES], device=R.device)
         angles = torch.where(given, found.values[:, -POSE:-3], torch.stack(mounting_from_rotation(turn), dim=-1))
+    else:
+        turn, angles = task.known.turned_to(turn, task.camera.R.reshape(-1, 3, 3))
     values = [found.values[:, :-POSE], angles, torch.where(moving, mirrored_place, place)]
     return torch.cat(values, dim=-1), turn
 

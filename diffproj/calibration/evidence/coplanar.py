@@ -39,6 +39,7 @@ class Coplanar(Observed):
     """
 
     __slots__ = ("level", "pixel_sigma", "pixels", "places")
+    own_unknowns = 1  # the level
 
     def __init__(
         self,

@@ -2,8 +2,8 @@
 
 Where a camera is known to a few hundredths only, in natural units, as a focal length from four landmarks, the evidence
 is not straight within its deviations: slopes at the minimum tell too little of one side. So in the direction that is
-known worst the minimum is followed, with that direction held and all else free, to where it costs as much as two
-deviations should (the profile likelihood).
+known worst, of those that evidence tells anything of, the minimum is followed, with that direction held and all else
+free, to where it costs as much as two deviations should (the profile likelihood).
 """
 
 import torch
@@ -12,7 +12,9 @@ from torch import Tensor
 from diffproj.calibration.evidence.descent import Found, Task, profile
 
 WEAK = 0.02
-"""Deviation in natural units up to which evidence is straight enough."""
+"""Deviation in units of `decisive` up to which evidence is straight enough."""
+TOLD = 1e-6
+"""Part that the evidence has in what is known of a direction, beside priors, from which on it tells anything of it."""
 REACH = 2.0
 """Deviations after which the cost is looked at: it is the square of this over 2 where the evidence is straight."""
 TIMES = (1.0, 1.5, 2.25, 3.5, 5.0)
@@ -20,19 +22,28 @@ TIMES = (1.0, 1.5, 2.25, 3.5, 5.0)
 
 
 @torch.no_grad()
-def further(task: Task, found: Found, C: Tensor, unit: Tensor) -> Tensor:
+def further(task: Task, found: Found, C: Tensor, unit: Tensor, told: Tensor, precision: Tensor) -> Tensor:
     """How far the parameters may lie beyond their covariance, as one more error of deviation 1 `(P, q)`.
 
     Args:
         task: of the adjustment.
         found: where it ended.
         C: the covariance of the unknowns `(P, r, r)`, to first order.
-        unit: their natural units `(P, r)`.
+        unit: of the unknowns `(P, r)`: see `decisive`.
+        told: what the evidence tells of them, its normal matrix `(P, r, r)`.
+        precision: what priors do `(P, r, r)`.
     """
     none = torch.zeros_like(found.values)
     if C.shape[-1] == 0 or not task.pieces:
         return none
     variances, vectors = torch.linalg.eigh(C / unit.unsqueeze(-1) / unit.unsqueeze(-2))
+    steps = unit.unsqueeze(-1) * vectors
+    tells, known = ((steps * (part @ steps)).sum(-2) for part in (told, precision))
+    # What priors alone tell is straight, and would hide what else is known badly.
+    variances = torch.where(tells > TOLD * known, variances, 0.0)
+    order = variances.argsort(-1)
+    variances = variances.gather(-1, order)
+    vectors = vectors.gather(-1, order.unsqueeze(-2).expand_as(vectors))
     spread = variances[:, -1].clamp(min=0).sqrt()
     if not bool((spread > WEAK).any()):
         return none

@@ -242,9 +242,10 @@ def _cost(task: Task, parameters: PoseParameters, values: Tensor, prior: Prior, 
 
 
 def spare(task: Task, found: Found) -> Tensor:
-    """How many more residuals and priors there are than unknowns `(P,)`."""
+    """How many more residuals and priors there are than unknowns `(P,)`, those of observations among these."""
     blocks = task.evidence(found.parameters).blocks(found.values)
     seen = sum((block.detach() != 0).any(-1).sum(-1) * block.shape[-1] for block in blocks)
+    seen = seen - sum(getattr(piece, "own_unknowns", 0) for piece in task.pieces)
     known = (found.prior.precision.detach().diagonal(dim1=-2, dim2=-1) > 0).sum(-1)
     return seen + known - found.basis.shape[-1]
 

@@ -8,12 +8,14 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import called, words
+from diffproj._core.copying import ordinary
 from diffproj._core.numerics import check_tensor, in_float64
 from diffproj.calibration.evidence.pose_parameters import ANGLES, PLACE, TURNS, PoseParameters
 from diffproj.calibration.least_squares.solver import Prior
 from diffproj.calibration.problem.constraints import Priors, check_focal
 from diffproj.calibration.problem.parametrisation import POSE, Parametrisation
 from diffproj.geometry.camera import Camera
+from diffproj.geometry.cayley import turn_between
 from diffproj.geometry.mounting import mounting_of
 
 MOST_TILT = 180.0
@@ -108,6 +110,24 @@ class Knowledge:
         at = self._at(name)
         return at not in self.columns or any(at in known.where for known in self.priors)
 
+    @property
+    def turns_freely(self) -> bool:
+        """Whether the camera turns about its own axes, all of them, and nothing is known of how far from its start."""
+        return not self.angles and not any(self.given(name) for name in TURNS)
+
+    def turned_to(self, R: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
+        """How cameras that began at rotations `first (..., 3, 3)`, and that turns tell, come to look along R.
+
+        Returns:
+            The rotations that turns are about, and the turns `(..., 3)` in degrees: R itself and 0, unless something is
+            known of turns, which are about where the camera began then; those that are held are 0.
+        """
+        first = first.expand_as(R)
+        if self.turns_freely:
+            return R, torch.zeros_like(R[..., 0])
+        turn = turn_between(first, R).rad2deg().nan_to_num(0.0, 0.0, 0.0)
+        return first, turn * torch.tensor([self.moves(name) for name in TURNS], device=R.device).to(turn)
+
     def _at(self, name: str) -> int:
         return (*self.camera.names, *(ANGLES if self.angles else TURNS), *PLACE).index(name)
 
@@ -131,7 +151,7 @@ def knowledge(
         raise ValueError(f"priors: want tilt, roll and heading, or turns, got both {min(angles)!r} and {min(turns)!r}")
     shared = Parametrisation.of(camera)
     names = PoseParameters(shared, None if angles else torch.empty(0, dtype=torch.float64, device=camera.device))
-    known = tuple(_known(names, name, value, tied_focal) for name, value in said.items())
+    known = tuple(_known(names, name, value, tied_focal, camera.batch_shape) for name, value in said.items())
     taken: set[int] = set()
     for one in known:
         if taken & set(one.where):
@@ -162,7 +182,7 @@ def prior_shapes(known: Knowledge) -> list[torch.Size]:
     return shapes
 
 
-def _known(names: PoseParameters, name: str, value: Any, tied_focal: bool) -> Known:
+def _known(names: PoseParameters, name: str, value: Any, tied_focal: bool, batch: Sequence[int]) -> Known:
     where = names.positions("priors", name)
     if name == "focal" and tied_focal:
         where = where[:1]
@@ -172,6 +192,8 @@ def _known(names: PoseParameters, name: str, value: Any, tied_focal: bool) -> Kn
     mean, deviation = (
         None if one is None and at == 0 else _numbers(name, one, len(where)) for at, one in enumerate(pair)
     )
+    if deviation is not None:
+        _check_no_covariance(name, deviation.detach(), batch)
     if deviation is None or not bool((deviation.detach() > 0).all()):
         raise ValueError(f"priors: want a positive standard deviation for {name!r}, got {called(pair[1])}")
     if mean is not None and name == "height" and not bool((mean.detach() > 0).all()):
@@ -188,7 +210,7 @@ def _numbers(name: str, value: Any, count: int) -> Tensor:
     """`(*B, count)` of a number, `(*B,)` for a single parameter, or `(*B, count)`."""
     if value is None or isinstance(value, bool | str):
         raise TypeError(f"priors: want numbers for {name!r}, got {called(value)}")
-    tensor = in_float64(check_tensor(f"priors[{name!r}]", value))
+    tensor = ordinary(in_float64(check_tensor(f"priors[{name!r}]", value)))
     if not bool(tensor.detach().isfinite().all()):
         raise ValueError(f"priors: want finite numbers for {name!r}, got {called(value)}")
     if tensor.ndim == 0 or count == 1:
@@ -196,6 +218,19 @@ def _numbers(name: str, value: Any, count: int) -> Tensor:
     if tensor.shape[-1] not in (1, count):
         raise ValueError(f"priors: want {name!r} of shape (*B, {count}), got {tuple(tensor.shape)}")
     return tensor.expand(*tensor.shape[:-1], count)
+
+
+def _check_no_covariance(name: str, given: Tensor, batch: Sequence[int]) -> None:
+    """Refuse a covariance `(n, n)` of n parameters, which has the shape of deviations of n cameras."""
+    n = given.shape[-1]
+    if n < 2 or given.shape != (n, n) or (tuple(batch[-1:]) == (n,) and bool((given > 0).all())):
+        return
+    if bool((given == given.mT).all()) and bool((torch.linalg.eigvalsh(given) > 0).all()):
+        raise ValueError(
+            f"priors: want standard deviations for {name!r}, ({n},) or (*B, {n}), got what looks like a covariance "
+            f"({n}, {n}): what errs together is told by an observation of your own, as help(dp.Observation) shows; if "
+            f"it is the deviations of {n} cameras, give a camera of batch shape ({n},)"
+        )
 
 
 def _check_steep(camera: Camera, known: Knowledge) -> None:

@@ -22,7 +22,25 @@ Deviation = Float[Tensor, "..."] | Array | float
 class Observation(Protocol):
     """Interface of a piece of evidence; a class of your own needs this method alone.
 
-    It may have a `loss` as well, such as `dp.Huber(2.0)`, of scale in deviations, and pixels of batch shape `*B`.
+    It may have a `loss` as well, such as `dp.Huber(2.0)`, of scale in deviations, and pixels of batch shape `*B`; and
+    `own_unknowns`, how many numbers besides the camera's it finds from its residuals, as the level of `Coplanar`.
+
+    Example:
+        >>> import diffproj as dp
+        >>> class Gps:  # a place whose errors go together; priors know numbers one by one
+        ...     def __init__(self, place, covariance):
+        ...         covariance = torch.tensor(covariance, dtype=torch.float64)
+        ...         self.place = torch.tensor(place, dtype=torch.float64)
+        ...         self.whiten = torch.linalg.inv(torch.linalg.cholesky(covariance))
+        ...
+        ...     def residuals(self, camera):
+        ...         off = camera.center - self.place  # (*B, 3)
+        ...         return (self.whiten @ off.unsqueeze(-1)).mT  # (*B, 1, 3): one item of three components
+        >>> where = Gps([3.0, 4.0, 6.0], [[0.5, 0.3, 0.0], [0.3, 0.5, 0.0], [0.0, 0.0, 1.0]])
+        >>> mast = dp.Camera.mounted(5.0, 20.0, focal=900.0, size=(1280, 960))
+        >>> known = dp.adjust(mast, [where], priors={"tilt": 1.0, "roll": 1.0, "heading": 2.0})
+        >>> [round(float(x), 2) for x in known.mounting_covariance[3, 3:5]]
+        [0.5, 0.3]
     """
 
     def residuals(self, camera: Camera) -> Float[Tensor, "*batch m k"]:
@@ -39,6 +57,7 @@ class Observed(Copied, Shown):
     """The base of the observations of this package: a loss, and how they show themselves."""
 
     __slots__ = ("loss",)
+    own_unknowns = 0
 
     loss: Loss | None
 

@@ -26,6 +26,7 @@ from diffproj.geometry.back_projection import back_project
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.plane import Plane, as_plane
 from diffproj.lens.slopes import by_direction
+from diffproj.targets.landmarks import refuse_degrees
 from diffproj.targets.target import Target
 
 
@@ -64,7 +65,7 @@ class Seen(Observed):
 
         Raises:
             TypeError: not points, pixels or numbers.
-            ValueError: shapes do not fit, or a deviation that cannot be.
+            ValueError: shapes do not fit, latitude and longitude, or a deviation that cannot be.
         """
         super().__init__(loss)
         given = landmarks.points if isinstance(landmarks, Target) else tensor_of("landmarks", landmarks)
@@ -77,6 +78,8 @@ class Seen(Observed):
         lost = ~points.detach().isfinite().all(-1)
         if bool(lost.any()):
             raise ValueError(f"landmarks: want finite coordinates, got {first_of(points, lost)}")
+        if not isinstance(landmarks, Target):
+            refuse_degrees("landmarks", points.detach())
         pixels = valued("pixels", pixels, "N", 2)
         if pixels.shape[-2] != len(points):
             raise ValueError(f"pixels: want one for each of {len(points)} landmarks, got {pixels.shape[-2]}")

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from diffproj._core.arguments import called
+from diffproj._core.copying import ordinary
 from diffproj.calibration.evidence.observation import Observation
 from diffproj.calibration.evidence.pose_parameters import PoseParameters
 from diffproj.calibration.least_squares.losses import Loss
@@ -18,8 +19,8 @@ def jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, 
 
     The derivative of `v . J` by v, in reverse mode twice: forward mode has one state for the whole process.
     """
-    with torch.enable_grad():
-        at = at.detach().requires_grad_()
+    with torch.inference_mode(False), torch.enable_grad():
+        at = ordinary(at.detach()).requires_grad_()
         value = function(at)
         if value.grad_fn is None or value.numel() == 0:
             return value.detach(), value.detach().new_zeros(at.shape[-1], *value.shape)

@@ -13,6 +13,10 @@ from diffproj.geometry.mounting import mounting_from_rotation
 LARGEST = 10.0
 """Deviation in natural units (a radian, the focal length, the distance of what was seen) from which on a direction is
 not determined."""
+ANYWHERE = 1e3
+"""Natural units of x and y in which these are judged where no landmark was seen."""
+TIGHT = 1e4
+"""Deviations of a prior in which what it holds is judged: beyond them all else would be lost in rounding."""
 ROUNDING = 1e-14
 """The same of an eigenvalue of the normal matrix, relative to the largest."""
 PART = 0.05
@@ -49,11 +53,29 @@ def units(basis: Tensor, scale: Tensor) -> Tensor:
     return (basis * scale.unsqueeze(-1)).amax(-2)
 
 
+def decisive(basis: Tensor, scale: Tensor, precision: Tensor, placed: Tensor) -> Tensor:
+    """The unit of each unknown `(P, r)` in which a direction is judged to be known.
+
+    That of `units`, but smaller for what a prior holds tightly, beside which all else would look unknown, and larger
+    for x and y where no landmark was seen: however wide a prior on them is, it tells them, for all else is straight.
+
+    Args:
+        basis: `(P, q, r)`.
+        scale: natural units `(P, q)`.
+        precision: of the priors `(P, q)`, one over their variance.
+        placed: whether landmarks were seen `(P,)`.
+    """
+    anywhere = torch.where(placed, 1.0, ANYWHERE).to(scale)
+    wide = torch.cat([scale[:, :-3], scale[:, -3:-1] * anywhere.unsqueeze(-1), scale[:, -1:]], dim=-1)
+    known = (basis.square() * precision.unsqueeze(-1)).sum(-2).sqrt()
+    return units(basis, wide).minimum(torch.where(known > 0, TIGHT / torch.where(known > 0, known, 1.0), torch.inf))
+
+
 def inverse(H: Tensor, scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The (pseudo-)inverse of normal matrices `(P, r, r)` whose unknowns have these units `(P, r)`.
 
     Returns:
-        The inverse, which eigenvalues are lost `(P, r)`, and the eigenvectors in natural units `(P, r, r)`.
+        The inverse, which eigenvalues are lost `(P, r)`, and the eigenvectors in these units `(P, r, r)`.
     """
     sound = H.isfinite().all(-1).all(-1)
     scaled = torch.where(sound[:, None, None], H * scale.unsqueeze(-1) * scale.unsqueeze(-2), 0.0)
@@ -66,7 +88,13 @@ def inverse(H: Tensor, scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def undetermined(
-    parameters: PoseParameters, values: Tensor, basis: Tensor, scale: Tensor, lost: Tensor, vectors: Tensor
+    parameters: PoseParameters,
+    values: Tensor,
+    basis: Tensor,
+    scale: Tensor,
+    unit: Tensor,
+    lost: Tensor,
+    vectors: Tensor,
 ) -> tuple[Tensor, list[Lacking]]:
     """Which parameters nothing tells `(P, q)`, and their names for each camera.
 
@@ -75,9 +103,12 @@ def undetermined(
         values: where the solver ended `(P, q)`.
         basis: `(P, q, r)`.
         scale: natural units `(P, q)`.
+        unit: of the unknowns `(P, r)`.
         lost: which directions `(P, r)`.
-        vectors: the directions, in natural units of the unknowns `(P, r, r)`.
+        vectors: the directions, in these units `(P, r, r)`.
     """
+    vectors = (unit / units(basis, scale)).unsqueeze(-1) * vectors
+    vectors = vectors / vectors.norm(dim=-2, keepdim=True).clamp(min=1e-300)
     along = basis @ (units(basis, scale).unsqueeze(-1) * vectors) / scale.unsqueeze(-1)
     unknown = ((along * lost.unsqueeze(-2)).square().sum(-1) > PART**2).to(torch.bool)
     names = [Lacking()] * len(values)
