@@ -8,6 +8,7 @@ from torch import Tensor
 
 from diffproj._core.warn import warn_caller
 from diffproj.cli.spreadsheet import Spreadsheet
+from diffproj.geometry.geodesy import metres_from_degrees
 from diffproj.targets.landmarks import Landmarks
 
 TITLES = {
@@ -16,6 +17,8 @@ TITLES = {
     "v": ("v", "pixel_v", "image_y"),
     "x": ("x", "e", "east", "easting"),
     "y": ("y", "n", "north", "northing"),
+    "latitude": ("lat", "latitude"),
+    "longitude": ("lon", "long", "lng", "longitude"),
     "z": ("z", "h", "height", "elevation"),
     "sigma": ("sigma",),
     "sigma_x": ("sigma_x",),
@@ -28,10 +31,8 @@ TITLES = {
 WITHOUT_TITLES = ("name", "u", "v", "x", "y", "z")
 """The columns of a file that begins with numbers; z may be left out."""
 
-DEGREES = ("lat", "latitude", "lon", "long", "lng", "longitude")
-"""Titles, in small letters, of places that are not in metres yet."""
-
-FROM_DEGREES = "dp.metres_from_degrees makes x and y in metres of degrees, in Python"
+METRES, DEGREES = ("x", "y"), ("latitude", "longitude")
+"""Where a landmark is on the map: either of the two pairs; the latter where there is no other."""
 
 DEVIATIONS = ("sigma", "sigma_x", "sigma_y", "sigma_z", "pixel_sigma")
 WANT = "columns name, u, v, x, y, z"
@@ -44,24 +45,32 @@ class Surveyed(NamedTuple):
         landmarks: with their names, and their own deviations where the file has some.
         pixels: that show them `(N, 2)`; NaN where none does.
         pixel_sigma: standard deviations of these `(N,)`, NaN where the file says none; `None` without such a column.
+        crs: the map whose metres x and y are, where the file has latitudes and longitudes.
     """
 
     landmarks: Landmarks
     pixels: Tensor
     pixel_sigma: Tensor | None
+    crs: str | None = None
 
 
-def read_landmarks(path: Path) -> Surveyed:
+def read_landmarks(path: Path, crs: str | None = None) -> Surveyed:
     """Read the landmarks of a CSV file.
 
-    Its first line has the titles of the columns, in any order: u, v, x, y, and as far as they are known name, z (0 if
-    left out), sigma or sigma_x, sigma_y and sigma_z (deviations in world units, 0 where empty) and pixel_sigma. Other
-    columns are passed over, with a warning where z is left out and one of them may be it. A file without titles has
-    name,u,v,x,y,z or name,u,v,x,y. Landmarks without u and v are in the survey and not in the photograph.
+    Its first line has the titles of the columns, in any order: u, v, x, y, or lat and lon, in degrees, in place of x
+    and y; and as far as they are known name, z (0 if left out), sigma or sigma_x, sigma_y and sigma_z (deviations in
+    world units, 0 where empty) and pixel_sigma. Other columns are passed over, with a warning where z is left out and
+    one of them may be it. A file without titles has name,u,v,x,y,z or name,u,v,x,y. Landmarks without u and v are in
+    the survey and not in the photograph.
+
+    Args:
+        path: of the file.
+        crs: the map that degrees become metres of, such as "EPSG:32630"; the UTM zone of their middle if left out.
 
     Raises:
-        ValueError: a column is missing or there twice, a cell is no number, or a name stands twice; line and column are
-            named.
+        ValueError: a column is missing or there twice, a cell is no number, or a name stands twice, line and column
+            are named; degrees are none, or there are none for the map.
+        ModuleNotFoundError: there are degrees, and pyproj is not installed.
         OSError: the file cannot be read.
 
     Warns:
@@ -93,7 +102,9 @@ def read_landmarks(path: Path) -> Surveyed:
         raise ValueError(f"--landmarks: want lines with {WANT}, found none in {path}")
     if "z" not in rows[0]:
         _warn_of_heights(titles, aside, path)
-    return _surveyed(rows, names, path)
+    if crs is not None and DEGREES[0] not in rows[0]:
+        raise ValueError(f"--crs: want columns lat and lon, which it makes metres of, got x and y in {path}")
+    return _surveyed(rows, names, path, crs)
 
 
 def _warn_of_heights(titles: list[str], aside: list[list[float | None]], path: Path) -> None:
@@ -107,7 +118,12 @@ def _warn_of_heights(titles: list[str], aside: list[list[float | None]], path: P
     places = range(min(map(len, aside)))
     columns = {titles[place]: [numbers[place] for numbers in aside] for place in places if place < len(titles)}
     counting = list(range(1, len(aside) + 1))
-    found = [repr(title) for title, numbers in columns.items() if None not in numbers and numbers != counting]
+    degrees = [title for column in DEGREES for title in TITLES[column]]
+    found = [
+        repr(title)
+        for title, numbers in columns.items()
+        if None not in numbers and numbers != counting and title.lower() not in degrees
+    ]
     if found:
         them = "it is the height, call it z" if len(found) == 1 else "one is the height, call that z"
         warn_caller(
@@ -123,13 +139,16 @@ def _columns(cells: list[str], path: Path) -> list[str | None]:
     for column in TITLES:
         if columns.count(column) > 1:
             raise ValueError(f"--landmarks: want one column {column!r}, got {columns.count(column)} in {path}")
-    missing = [column for column in ("u", "v", "x", "y") if column not in columns]
+    if set(METRES) <= set(columns):
+        columns = [None if column in DEGREES else column for column in columns]
+    place = DEGREES if set(DEGREES) & set(columns) else METRES
+    missing = [column for column in ("u", "v", *place) if column not in columns]
     if missing:
-        degrees = any(cell.lower() in DEGREES for cell in cells)
         raise ValueError(
-            f"--landmarks: want {WANT} by their titles in the first line, got no {missing[0]!r} in {path}: it has "
-            f"{', '.join(map(repr, cells))}" + degrees * f"; {FROM_DEGREES}"
+            f"--landmarks: want {WANT} by their titles in the first line, or lat and lon in place of x and y, got no "
+            f"{missing[0]!r} in {path}: it has {', '.join(map(repr, cells))}"
         )
+    columns = [None if column in METRES and place == DEGREES else column for column in columns]
     if "sigma" in columns and any(f"sigma_{axis}" in columns for axis in "xyz"):
         raise ValueError(f"--landmarks: want either a column 'sigma' or sigma_x, sigma_y, sigma_z, got both in {path}")
     return columns
@@ -154,7 +173,7 @@ def _row(columns: list[str | None], cells: list[str], table: Spreadsheet, line: 
             continue
         value = table.number(cell) if cell else None
         least = column in DEVIATIONS and value is not None and (value < 0 or (column == "pixel_sigma" and value == 0))
-        if least or (value is None and (cell or column in ("x", "y", "z"))):
+        if least or (value is None and (cell or column in (*METRES, *DEGREES, "z"))):
             want = "a number" if column not in DEVIATIONS else "a standard deviation"
             got = repr(cell) if cell else "nothing"
             raise ValueError(f"--landmarks: want {want} in column {column!r}, got {got} in line {line} of {table.path}")
@@ -168,7 +187,7 @@ def _row(columns: list[str | None], cells: list[str], table: Spreadsheet, line: 
     return found
 
 
-def _surveyed(rows: list[dict[str, float | None]], names: list[str], path: Path) -> Surveyed:
+def _surveyed(rows: list[dict[str, float | None]], names: list[str], path: Path, crs: str | None) -> Surveyed:
     def numbers(columns: tuple[str, ...], empty: float) -> Tensor:
         cells = [[empty if (value := row.get(column)) is None else value for column in columns] for row in rows]
         return torch.tensor(cells, dtype=torch.float64, device="cpu")
@@ -177,8 +196,13 @@ def _surveyed(rows: list[dict[str, float | None]], names: list[str], path: Path)
     if any(column in rows[0] for column in DEVIATIONS[:4]):
         spread = numbers(("sigma",) * 3 if "sigma" in rows[0] else ("sigma_x", "sigma_y", "sigma_z"), 0.0)
     try:
-        landmarks = Landmarks(numbers(("x", "y", "z"), 0.0), names, spread)
+        if DEGREES[0] in rows[0]:
+            points, crs = metres_from_degrees(numbers((*DEGREES, "z"), 0.0), crs)
+        else:
+            points = numbers((*METRES, "z"), 0.0)
+        landmarks = Landmarks(points, names, spread)
     except ValueError as error:
-        raise ValueError(f"--landmarks: {path}: {error}") from None
+        option = "--crs" if str(error).startswith("crs") else "--landmarks"
+        raise ValueError(f"{option}: {path}: {error}") from None
     pixel_sigma = numbers(("pixel_sigma",), torch.nan)[:, 0] if "pixel_sigma" in rows[0] else None
-    return Surveyed(landmarks, numbers(("u", "v"), torch.nan), pixel_sigma)
+    return Surveyed(landmarks, numbers(("u", "v"), torch.nan), pixel_sigma, crs)

@@ -28,6 +28,8 @@ the landmarks:
            of the first pixel. Both empty: not in this photograph
   x, y, z  where it is, in any unit and as far from the origin as UTM is; x
            east or right, y north or ahead, z up. Without z all lie on z = 0
+  lat, lon in place of x and y: degrees of a GPS (WGS 84), which become metres
+           east and north on a map, the UTM zone that they lie in or --crs
   name, sigma or sigma_x,sigma_y,sigma_z, pixel_sigma
            may be there: its name, how well it is known (standard deviations in
            the unit of x), and how well the pixel is. Other columns are passed
@@ -75,7 +77,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         type=some_path,
         required=True,
         metavar="FILE",
-        help="a CSV file with columns name, u, v, x, y, z (required)",
+        help="a CSV file with columns name, u, v, x, y, z, or lat and lon in place of x and y (required)",
     )
     more = command.add_argument_group("how")
     more.add_argument(
@@ -114,6 +116,12 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "--reject-outliers",
         action="store_true",
         help="leave out landmarks that lie more than 5 standard deviations off, and name them",
+    )
+    more.add_argument(
+        "--crs",
+        metavar="MAP",
+        help="the map that columns lat and lon become metres of, such as EPSG:32630 (default: the UTM zone that they "
+        "lie in)",
     )
     more.add_argument(
         "--unit", choices=METRES, metavar="UNIT", help="unit of x, y and z, for tables and the file, such as m"

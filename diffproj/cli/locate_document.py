@@ -73,6 +73,7 @@ def document(
         "landmarks_file": str(options.landmarks),
         "view": found.views.names[0],
         "unit": found.unit,
+        "crs": surveyed.crs,
         "position": {axis: where[axis] for axis in "xyz"},
         "mounting": {name: where[name] for name in ANGLES},
         "intrinsics": intrinsics,
@@ -131,6 +132,12 @@ def say(told: dict[str, Any]) -> None:
     worst = next(row for row in told["landmarks"] if row["name"] == told["worst"])
     if worst["off"] > 0.0:
         result(f"\nFarthest off: {worst['name']}, {worst['off']:.3g} px")
+    if told["crs"] is not None:
+        said = (
+            f"x and y are metres east and north on the map {told['crs']}, which latitudes and longitudes became; in a "
+            "UTM zone lengths differ by up to 0.1 % from those on the ground."
+        )
+        result("\n" + textwrap.fill(said, 79))
     for remark in told["remarks"]:
         result("\n" + textwrap.fill(remark, 79))
     result("\n" + textwrap.fill(told["verdict"], 79))

@@ -53,7 +53,8 @@ def run(options: argparse.Namespace) -> int:
         check_no_photograph(options.draw, [options.photograph])
     camera, calibration = loaded(options.camera)
     check_together(options.prior, options.fixed, camera)
-    surveyed = read_landmarks(options.landmarks)
+    surveyed = read_landmarks(options.landmarks, options.crs)
+    unit = _unit(options.unit, surveyed)
     picture, size, told_by_file = None, camera.size, ()
     if options.photograph is not None:
         photograph = one_photograph(options.photograph, options.orientation)
@@ -65,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
     if size is None and options.draw is not None:
         raise ValueError(f"--draw: want PHOTO, or the image's size in {options.camera}, got neither")
     view = options.photograph.name if options.photograph is not None else options.landmarks.stem
-    found = _located(options, camera, calibration, surveyed, view, size, told_by_file)
+    found = replace(_located(options, camera, calibration, surveyed, view, size, told_by_file), unit=unit)
     for remark in found.findings[0]:
         if remark.kind == Kind.BELOW:
             warn_caller(f"{options.landmarks}: {remark.sentence}")
@@ -86,6 +87,19 @@ def run(options: argparse.Namespace) -> int:
         if path is not None:
             result(f"{verb} to {path}")
     return 0
+
+
+def _unit(said: str | None, surveyed: Surveyed) -> str | None:
+    """The unit of the world: metres where the landmarks were in degrees.
+
+    Raises:
+        ValueError: another is said.
+    """
+    if surveyed.crs is None:
+        return said
+    if said not in (None, "m"):
+        raise ValueError(f"--unit: want m where landmarks have latitudes and longitudes, got {said}")
+    return "m"
 
 
 def _located(
@@ -134,7 +148,7 @@ def _located(
     except (ValueError, CalibrationError) as error:
         text = _in_words(failure(error), surveyed)
         raise ValueError(text if text.startswith("--") else f"{path}: {text}") from error
-    return replace(found, unit=options.unit)
+    return found
 
 
 def _adjusted(

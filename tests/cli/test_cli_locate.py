@@ -519,3 +519,61 @@ def test_another_pose_of_three_landmarks_is_told(
         spread = adjusted.mounting_deviations
         told = [found["position"][axis]["deviation"] for axis in "xyz"]
         assert told == pytest.approx([*spread.position.tolist(), float(spread.height)], rel=1e-3)
+
+
+def in_degrees() -> str:
+    """The beach's landmarks by latitude and longitude, as a GPS has them; their map is that of North Carolina."""
+    rows = [line.split(",") for line in BEACH.splitlines()[1:]]
+    places = dp.degrees_from_metres([[float(row[3]), float(row[4])] for row in rows], "EPSG:32119").tolist()
+    lines = [f"{n},{u},{v},{lat!r},{lon!r},{z}" for (n, u, v, _, _, z), (lat, lon) in zip(rows, places, strict=True)]
+    return "\n".join(["name,u,v,Latitude,lon,z", *lines]) + "\n"
+
+
+def test_landmarks_in_degrees(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("degrees.csv").write_text(in_degrees())
+    wanted = parsed(capsys, *DRONE, *LANDMARKS, "--json")
+    found = parsed(capsys, *DRONE, "--landmarks", "degrees.csv", "--crs", "EPSG:32119", "--json")
+    assert (wanted["crs"], found["crs"], found["unit"]) == (None, "EPSG:32119", "m")
+    for axis in "xyz":
+        assert found["position"][axis]["value"] == pytest.approx(wanted["position"][axis]["value"], abs=1e-5)
+        assert found["position"][axis]["deviation"] == pytest.approx(wanted["position"][axis]["deviation"], rel=1e-5)
+    of_zone = parsed(capsys, *DRONE, "--landmarks", "degrees.csv", "--json")
+    assert of_zone["crs"] == "EPSG:32618"
+    place = [of_zone["position"][axis]["value"] for axis in "xy"]
+    there, here = (
+        dp.degrees_from_metres([[one["position"][axis]["value"] for axis in "xy"]], one["crs"])
+        for one in (of_zone, found)
+    )
+    assert 1e5 < place[0] < 9e5
+    torch.testing.assert_close(there, here, rtol=0, atol=1e-6)  # a tenth of a metre: the two maps' scales differ
+    code, out, _ = run(capsys, *DRONE, "--landmarks", "degrees.csv")
+    assert code == 0
+    assert "x and y are metres east and north on the map EPSG:32618" in " ".join(out.split())
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "message"),
+    [
+        (BEACH, ("--crs", "EPSG:32618"), "--crs: want columns lat and lon, which it makes metres of, got x and y in"),
+        ("n", ("--crs", "EPSG:4326"), "--crs: .*want a map in metres"),
+        ("n", ("--unit", "ft"), "--unit: want m where landmarks have latitudes and longitudes, got ft"),
+        ("name,u,v,lat,z\na,1,2,3,4\n", (), "in place of x and y, got no 'longitude'"),
+        ("name,u,v,lat,lon,z\na,1,2,95,4,1\nb,1,2,95,4,1\n", (), "--landmarks: .*want latitudes from -90 to 90"),
+        ("name,u,v,lat,lon,z\na,1,2,45,,1\n", (), "want a number in column 'longitude', got nothing in line 2"),
+    ],
+)
+def test_degrees_that_are_none(
+    capsys: pytest.CaptureFixture[str], text: str, more: tuple[str, ...], message: str
+) -> None:
+    Path("degrees.csv").write_text(in_degrees() if text == "n" else text)
+    code, _, err = run(capsys, *DRONE, "--landmarks", "degrees.csv", *more)
+    assert code == 1
+    assert re.search(message, " ".join(err.split())), err
+
+
+def test_metres_come_before_degrees(tmp_path: Path) -> None:
+    path = tmp_path / "both.csv"
+    path.write_text("name,u,v,x,y,lat,lon\na,1,2,3,4,45.1,7.1\nb,3,4,5,6,45.2,7.2\n")
+    found = read_landmarks(path)
+    assert found.crs is None
+    assert found.landmarks.points.tolist() == [[3, 4, 0], [5, 6, 0]]

@@ -1,4 +1,4 @@
-"""Files of landmarks as spreadsheets and surveys write them: which column is the height, degrees, other encodings."""
+"""Files of landmarks as spreadsheets and surveys write them: which column is the height, other encodings."""
 
 import re
 from pathlib import Path
@@ -48,13 +48,6 @@ def test_a_survey_on_the_ground_needs_no_heights(tmp_path: Path, text: str) -> N
     path = tmp_path / "survey.csv"
     path.write_text(text)
     assert len(read_landmarks(path).landmarks.points) == 2
-
-
-def test_degrees_have_a_remedy(tmp_path: Path) -> None:
-    path = tmp_path / "survey.csv"
-    path.write_text("name,u,v,lat,lon,z\na,1,2,48.1,11.5,7\n")
-    with pytest.raises(ValueError, match=r"got no 'x' in .*'lon', 'z'; dp.metres_from_degrees makes x and y in metres"):
-        read_landmarks(path)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-be"])
