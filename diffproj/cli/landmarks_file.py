@@ -69,8 +69,7 @@ def read_landmarks(path: Path, crs: str | None = None) -> Surveyed:
 
     Raises:
         ValueError: a column is missing or there twice, a cell is no number, or a name stands twice, line and column
-            are named; degrees are none, or there are none for the map.
-        ModuleNotFoundError: there are degrees, and pyproj is not installed.
+            are named; degrees are none, the map has none of them, or pyproj is not installed, which they need.
         OSError: the file cannot be read.
 
     Warns:
@@ -201,7 +200,7 @@ def _surveyed(rows: list[dict[str, float | None]], names: list[str], path: Path,
         else:
             points = numbers((*METRES, "z"), 0.0)
         landmarks = Landmarks(points, names, spread)
-    except ValueError as error:
+    except (ValueError, ModuleNotFoundError) as error:
         option = "--crs" if str(error).startswith("crs") else "--landmarks"
         raise ValueError(f"{option}: {path}: {error}") from None
     pixel_sigma = numbers(("pixel_sigma",), torch.nan)[:, 0] if "pixel_sigma" in rows[0] else None

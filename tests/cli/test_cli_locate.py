@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from pathlib import Path
 
 import cv2
@@ -577,3 +578,11 @@ def test_metres_come_before_degrees(tmp_path: Path) -> None:
     found = read_landmarks(path)
     assert found.crs is None
     assert found.landmarks.points.tolist() == [[3, 4, 0], [5, 6, 0]]
+
+
+def test_degrees_need_pyproj(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("degrees.csv").write_text(in_degrees())
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    code, _, err = run(capsys, *DRONE, "--landmarks", "degrees.csv")
+    assert code == 1
+    assert "pyproj: want it installed, to turn degrees into metres; pip install pyproj" in " ".join(err.split())
