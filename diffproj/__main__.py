@@ -14,7 +14,7 @@ def main() -> int:
         return 130
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
-        if missing not in ("matplotlib", "rich"):
+        if missing not in ("jinja2", "matplotlib", "rich"):
             raise
         print(
             f"diffproj: the command line needs {missing}: pip install {missing}, or, in the folder of diffproj's "

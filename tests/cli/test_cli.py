@@ -115,6 +115,16 @@ def test_missing_matplotlib_is_found_before_the_work(
     assert not (tmp_path / "folder").exists()
 
 
+def test_missing_jinja_is_found_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    asked = ["calibrate", "photo.png", "--board", "9x6", "--square", "25", "--report", str(tmp_path / "report.html")]
+    monkeypatch.setattr(sys, "argv", ["diffproj", *asked])
+    assert __main__.main() == 1
+    assert "the command line needs jinja2: pip install jinja2" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [
