@@ -8,7 +8,7 @@ from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.cli.inputs import check_not_the_same, check_writable
 from diffproj.cli.scene import posed_view
 from diffproj.cli.terminal import as_json, note, result
-from diffproj.files import own_json
+from diffproj.files import colmap, nerfstudio, own_json
 from diffproj.files.document import Document
 from diffproj.files.formats import format_to_write
 from diffproj.files.found import Found
@@ -54,8 +54,10 @@ def run(options: argparse.Namespace) -> int:
             f"{options.output} holds the camera{pose} alone: error bars, views and unit of {options.input} stay there, "
             "and what is measured with the camera alone has error bars that are too small"
             + (isinstance(found, Calibration) and not own)
-            * "; --view NAME takes the camera where it stood"
+            * "; --view NAME takes the camera where it stood, into a format that holds a pose"
         )
+    if options.view is not None and format_to_write(options.output, options.to) in (colmap, nerfstudio):
+        note(f"{options.output} calls the image 000000.png: put the name of the photograph there")
     if options.json:
         as_json(told)
     elif isinstance(found, RigCalibration):
@@ -110,7 +112,7 @@ def _at_view(options: argparse.Namespace, document: Document) -> Camera:
         ValueError: the file holds no calibration of one camera, or not that view.
     """
     one = options.camera
-    if one is not None and own_json.holds_fleet(document):
+    if one is not None:
         one = name_in(among := found_in(document, options.source), named(among, one))
     found = content_of(document, one) if options.source in (None, "json") else None
     if not isinstance(found, Calibration) or found.camera.batch_shape:

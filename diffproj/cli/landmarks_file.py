@@ -116,12 +116,11 @@ def _warn_of_heights(titles: list[str], aside: list[list[float | None]], path: P
     """
     places = range(min(map(len, aside)))
     columns = {titles[place]: [numbers[place] for numbers in aside] for place in places if place < len(titles)}
-    counting = list(range(1, len(aside) + 1))
     degrees = [title for column in DEGREES for title in TITLES[column]]
     found = [
         repr(title)
         for title, numbers in columns.items()
-        if None not in numbers and numbers != counting and title.lower() not in degrees
+        if None not in numbers and not _counts(numbers) and title.lower() not in degrees
     ]
     if found:
         them = "it is the height, call it z" if len(found) == 1 else "one is the height, call that z"
@@ -129,6 +128,12 @@ def _warn_of_heights(titles: list[str], aside: list[list[float | None]], path: P
             f"{path}: no column is called z, so that all landmarks are taken to lie on z = 0; {' and '.join(found)} "
             f"{'is' if len(found) == 1 else 'are'} passed over: if {them}"
         )
+
+
+def _counts(numbers: list[float | None]) -> bool:
+    """Whether they are whole numbers one after the other, as landmarks are numbered."""
+    first = numbers[0]
+    return first is not None and first == round(first) and numbers == [first + i for i in range(len(numbers))]
 
 
 def _columns(cells: list[str], path: Path) -> list[str | None]:

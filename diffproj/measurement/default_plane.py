@@ -30,8 +30,8 @@ class Heights(NamedTuple):
         """What is told where z = 0 was taken; the caller adds what to give instead."""
         return (
             "no plane is given, and z = 0, which is taken, is not where the landmarks are, from z = "
-            f"{self.low:.10g} to {self.high:.10g}{f' {unit}' if unit else ''}: points and lengths on the ground there "
-            "come out wrong"
+            f"{self.low:.10g} to {self.high:.10g}{f' {unit}' if unit else ''}: if they stand on the ground, points and "
+            "lengths on it come out wrong"
         )
 
 
@@ -39,7 +39,7 @@ def far_from_landmarks(calibration: Calibration, view: int) -> Heights | None:
     """The heights of a view's landmarks, where z = 0 is far from them; `None` where it is not, and for a board.
 
     That is farther from the nearest than half of what they differ in height, and so far that lengths differ by more
-    than `OFF`.
+    than `OFF`. Landmarks above a camera that is itself above z = 0, as on a façade, say nothing of the ground.
     """
     if calibration.landmarks is None:
         return None
@@ -49,7 +49,7 @@ def far_from_landmarks(calibration: Calibration, view: int) -> Heights | None:
     low, high = float(heights.min()), float(heights.max())
     nearest = low if low > 0 else high
     camera = float(calibration.cameras[view].center[2])
-    if low <= 0 <= high or abs(nearest) <= max(OFF * abs(camera - nearest), (high - low) / 2):
+    if low <= 0 <= high or 0 < camera < low or abs(nearest) <= max(OFF * abs(camera - nearest), (high - low) / 2):
         return None
     return Heights(low, high, nearest)
 

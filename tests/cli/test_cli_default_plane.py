@@ -14,9 +14,9 @@ from diffproj import cli
 MAST = dp.Camera.mounted(9.0, 20.0, focal=700.0, size=(640, 480))
 GROUND = torch.tensor([[-8.0, 20, 0], [9, 22, 0.1], [-6, 35, 0.3], [7, 30, -0.1], [0, 26, 0]], dtype=torch.float64)
 TOLD = (
-    "no plane is given, and z = 0, which is taken, is not where the landmarks are, from z = 511.9 to 512.3 m: points "
-    "and lengths on the ground there come out wrong; give its height, such as --height 511.9, or --height 0 if z = 0 "
-    "is meant"
+    "no plane is given, and z = 0, which is taken, is not where the landmarks are, from z = 511.9 to 512.3 m: if they "
+    "stand on the ground, points and lengths on it come out wrong; give its height, such as --height 511.9, or "
+    "--height 0 if z = 0 is meant"
 )
 
 

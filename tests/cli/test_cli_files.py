@@ -77,12 +77,14 @@ def test_a_camera_is_converted_where_it_stood(folder: Path, capsys: pytest.Captu
     (folder / "stood").mkdir()
     for out, options in {"images.txt": [], "a.json": [], "a.npz": [], "t.json": ["--to", "nerfstudio"]}.items():
         command = ["convert", str(source), str(folder / "stood" / out), *options]
-        assert main([*command, "--view", name]) == 0
-        assert f"{out} holds the camera at {name} alone: error bars, views and unit" in capsys.readouterr().err
+        assert main([*command, "--view", name, "--camera", "0"]) == 0
+        told = capsys.readouterr().err
+        assert f"{out} holds the camera at {name} alone: error bars, views and unit" in told
+        assert (f"{out} calls the image 000000.png: put the name" in told) is (out in ("images.txt", "t.json"))
         found = dp.load_camera(folder / "stood" / out)
         assert torch.allclose(found.project(point)[0], want, atol=1e-6, rtol=0)
     assert main(["convert", str(source), str(folder / "stood" / "images.txt")]) == 0
-    assert "error bars that are too small; --view NAME takes the camera where it stood" in capsys.readouterr().err
+    assert "--view NAME takes the camera where it stood, into a format that holds a pose" in capsys.readouterr().err
     assert torch.equal(dp.load_camera(folder / "stood" / "images.txt").t, torch.zeros(3, dtype=torch.float64))
 
 

@@ -38,11 +38,12 @@ def test_several_columns_that_may_be_the_height_are_told(tmp_path: Path) -> None
     [
         "name,u,v,x,y\na,1,2,3,4\nb,3,4,5,6\n",
         "nr,u,v,x,y,by\n1,1,2,3,4,me\n2,3,4,5,6,you\n",
+        "code,u,v,x,y\n101,1,2,3,4\n102,3,4,5,6\n",
         "name,u,v,x,y,z,alt\na,1,2,3,4,5,6\nb,3,4,5,6,5,6\n",
         "name,u,v,x,y,alt\na,1,2,3,4,5\nb,3,4,5,6,\n",
         "a,1,2,3,4\nb,3,4,5,6\n",
     ],
-    ids=["no other", "a running number", "with z", "not of all", "no titles"],
+    ids=["no other", "a running number", "one that begins elsewhere", "with z", "not of all", "no titles"],
 )
 def test_a_survey_on_the_ground_needs_no_heights(tmp_path: Path, text: str) -> None:
     path = tmp_path / "survey.csv"

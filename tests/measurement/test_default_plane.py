@@ -63,6 +63,15 @@ def test_landmarks_of_many_heights_tell_no_ground() -> None:
     assert far_from_landmarks(located(0.0, facade), 0) is None
 
 
+def test_landmarks_on_a_wall_above_the_camera_tell_no_ground() -> None:
+    """Marks from 3 to 5 m on a wall, seen from 1.6 m over the ground z = 0."""
+    camera = dp.Camera.mounted(1.6, 0.0, focal=900.0, size=(1280, 960))
+    wall = torch.tensor([[-5.0, 20, 3], [5, 20, 3], [-5, 20, 5], [5, 20, 5], [0, 20, 4], [-2, 20, 4.5]], dtype=D)
+    views = dp.Views([camera.project(wall)[0]], size=camera.size)
+    found = dp.locate(views, dp.Landmarks(wall), dp.Camera(camera.K, size=camera.size), pixel_sigma=0.5)
+    assert far_from_landmarks(found, 0) is None
+
+
 def test_a_board_lies_where_it_says() -> None:
     calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
     assert far_from_landmarks(calibration, 0) is None

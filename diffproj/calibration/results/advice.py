@@ -156,7 +156,7 @@ def judged(seen: Evidence) -> Judgement:
     if Kind.FOCUS in seen.kinds:
         remedies.insert(0, "the photographs once more with focus and zoom held")
     if Kind.STEADIED in seen.kinds:
-        remedies.insert(0, "the photographs once more with image stabilisation switched off")
+        remedies.insert(0, "the photographs once more at rest and with image stabilisation switched off")
     if Kind.SPACING in seen.kinds:
         remedies.insert(0, "no other photograph yet, but the side and the distance of the tags measured")
     if Kind.WRONG_PRIOR in seen.kinds:

@@ -28,7 +28,7 @@ class Kind(StrEnum):
     FOCUS = "focus"
     """The focal length differs from view to view."""
     STEADIED = "steadied"
-    """The principal point differs from view to view."""
+    """The principal point differs from view to view, or seems to."""
     BENT = "bent board"
     """The board is bent."""
     FLEXING = "flexing board"

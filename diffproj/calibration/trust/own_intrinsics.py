@@ -1,9 +1,9 @@
 """Focal lengths or principal points that differ from view to view, and what that does to those that are found.
 
-A camera that focuses anew for each photograph changes its focal length by one or two per cent as it does; a shutter
-that reads row after row of a moving image, or a detector misled by a slanted board, looks as if it had. One whose lens
-or sensor moves against the hand's tremor shifts its principal point, by up to two per cent of the focal length; and a
-recording that is steadied afterwards is cropped in every frame elsewhere. Each view then wants intrinsics of its own.
+A camera that focuses anew for each photograph changes its focal length by one or two per cent as it does. One whose
+lens or sensor moves against the hand's tremor shifts its principal point, by up to two per cent of the focal length,
+and a recording that is steadied afterwards is cropped in every frame elsewhere. A shutter that reads row after row of a
+moving image, or a detector misled by a slanted board, looks like either. Each view then wants intrinsics of its own.
 Its pose takes nearly all of that, so that the residuals hardly grow. But the views that tell the focal length are the
 few that are tilted most, and the one that is found is off by as much as theirs are.
 

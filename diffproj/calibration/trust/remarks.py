@@ -338,11 +338,12 @@ def _of_own_intrinsics(own: OwnIntrinsics, p: int, knows_noise: bool) -> Remark 
     if bool(own.point_told[p]):
         part = f"{float(own.point.spread[p]):.2g} px"
         return Remark(
-            f"the principal point differs by about {part} from view to view, as of a lens, a sensor or a recording "
-            "that is steadied against shaking: switch that off, for calibrating and for measuring; the deviations are "
+            f"the principal point seems to differ by about {part} from view to view, as of a lens, a sensor or a "
+            "recording that is steadied against shaking, or of a shutter that reads row after row of what moves: "
+            "switch steadying off and photograph at rest, for calibrating and for measuring; the deviations are "
             f"{held}, and in one photograph it may be off by {part}",
             Kind.STEADIED,
-            "its principal point differs from view to view",
+            "its principal point seems to differ from view to view",
         )
     return None
 
