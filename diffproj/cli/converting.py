@@ -111,9 +111,11 @@ def _at_view(options: argparse.Namespace, document: Document) -> Camera:
     Raises:
         ValueError: the file holds no calibration of one camera, or not that view.
     """
-    one = options.camera
-    if one is not None:
-        one = name_in(among := found_in(document, options.source), named(among, one))
+    one = None
+    if options.camera is not None:
+        among = found_in(document, options.source)
+        among.chosen(which := named(among, options.camera))
+        one = name_in(among, which) if own_json.holds_fleet(document) else None
     found = content_of(document, one) if options.source in (None, "json") else None
     if not isinstance(found, Calibration) or found.camera.batch_shape:
         raise ValueError(
