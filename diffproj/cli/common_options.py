@@ -39,15 +39,15 @@ def add_said(command: argparse.ArgumentParser) -> argparse._MutuallyExclusiveGro
     return forms
 
 
-def add_camera(command: argparse.ArgumentParser) -> None:
-    """Give a command the camera file that it works with."""
+def add_camera(command: argparse._ActionsContainer, otherwise: str = "") -> None:
+    """Give a command the camera file that it works with; `otherwise` is the option that may take its place."""
     command.add_argument(
         "--camera",
         type=some_path,
-        required=True,
+        required=not otherwise,
         metavar="FILE",
         help="the camera file, in any format that 'diffproj info' reads. A .json from 'diffproj calibrate' brings the "
-        "camera's own uncertainty along; other programs' files do not (required)",
+        f"camera's own uncertainty along; other programs' files do not (required{otherwise and f', or {otherwise}'})",
     )
 
 

@@ -15,6 +15,11 @@ FOCAL = ("focal", "f_x", "f_y")
 SPOKEN = {"z": "height", "f": "focal", "focal_length": "focal", "pitch": "tilt"}
 """Other names that people use."""
 
+PLUS_MINUS = r"\+/?-|±"
+
+NARROWEST, WIDEST = 0.5, 110.0
+"""Fields of view in degrees: wider lenses bend in ways that no guess holds."""
+
 
 class Known(NamedTuple):
     """One number that is known, for certain where the deviation is 0."""
@@ -28,10 +33,45 @@ class Known(NamedTuple):
         return f"{self.name}={self.value:g}" + f"+-{self.deviation:g}" * (self.deviation > 0)
 
 
+class FieldOfView(NamedTuple):
+    """A horizontal field of view in degrees.
+
+    Attributes:
+        degrees: from the left edge of the image to the right one; `None` where EXIF data are to tell it.
+        deviation: `None` where nothing is said of how far that may be off.
+    """
+
+    degrees: float | None
+    deviation: float | None
+
+    def __str__(self) -> str:
+        """As people write it."""
+        degrees = "exif" if self.degrees is None else f"{self.degrees:g}"
+        return degrees if self.deviation is None else f"{degrees} ± {self.deviation:g}"
+
+
+def field_of_view(text: str) -> FieldOfView:
+    """Read a field of view such as `70+-5`, `70`, or `exif`."""
+    if text.strip().lower() == "exif":
+        return FieldOfView(None, None)
+    values = [_number(part) for part in re.split(PLUS_MINUS, text)]
+    if len(values) > 2 or None in values:
+        raise argparse.ArgumentTypeError(f"want degrees, such as 70+-5, or exif, got {text!r}")
+    degrees, deviation = (*values, None)[:2]
+    if degrees is None or not NARROWEST <= degrees <= WIDEST:
+        raise argparse.ArgumentTypeError(
+            f"want {NARROWEST:g} to {WIDEST:g} degrees from the left to the right edge of the image, got {text!r}; "
+            "lenses that see more have to be calibrated"
+        )
+    if deviation is not None and deviation <= 0:
+        raise argparse.ArgumentTypeError(f"want a standard deviation above 0, got {text!r}")
+    return FieldOfView(degrees, deviation)
+
+
 def prior(text: str) -> Known:
     """Read what is known with a deviation, such as `height=12+-0.02`."""
     name, _, rest = text.partition("=")
-    parts = re.split(r"\+/?-|±", rest)
+    parts = re.split(PLUS_MINUS, rest)
     if len(parts) == 1 and name.strip() and (value := _number(rest)) is not None:
         said = f"{name.strip()}={value:g}"
         raise argparse.ArgumentTypeError(

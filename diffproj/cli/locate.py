@@ -6,7 +6,7 @@ from pathlib import Path
 from diffproj.cli.common_options import add_camera, add_photograph, add_said, describe, pixel_noise
 from diffproj.cli.drawing import drawing
 from diffproj.cli.inputs import add_orientation, some_path
-from diffproj.cli.known_beforehand import fixed, prior
+from diffproj.cli.known_beforehand import field_of_view, fixed, prior
 from diffproj.cli.units import METRES
 
 DESCRIPTION = """\
@@ -49,6 +49,15 @@ what is known beforehand:
   Priors weigh against the pixels: give --pixel-sigma along. Both may be given
   several times, and with them fewer than four landmarks may be enough.
 
+without a camera file:
+  --fov 70+-5 takes its place, along with PHOTO, whose size counts: square
+  pixels, the principal point in the middle of the image, and a lens that may
+  bend. How far each may be off is printed, and counts in all deviations;
+  --prior takes the place of each, as k1=-0.3+-0.05 or c_x=960+-10. Few
+  landmarks, or ones on a plane, leave large deviations. --fov 70 alone is a
+  start: --free focal then finds what the landmarks tell. Give --pixel-sigma
+  along. To calibrate the camera is better, where one can.
+
 examples:
   diffproj locate beach.jpg --camera drone.yaml --landmarks survey.csv \\
       -o located.json --draw located.png
@@ -57,6 +66,8 @@ examples:
   diffproj locate mast.jpg --camera camera.yaml --landmarks marks.csv \\
       --prior height=12.30+-0.02 --prior focal=1550+-50 --fixed roll=0 \\
       --pixel-sigma 1
+  diffproj locate yard.jpg --fov 70+-5 --landmarks marks.csv --pixel-sigma 1 \\
+      -o located.json
   diffproj measure --camera located.json --view beach.jpg --points 2000,1000
 
 The file that -o writes is the camera at its place, with its error bars, for
@@ -66,12 +77,21 @@ The file that -o writes is the camera at its place, with its error bars, for
 
 def add_options(command: argparse.ArgumentParser) -> None:
     """Give the command its description and its options."""
-    describe(command, DESCRIPTION, EPILOG, "%(prog)s [PHOTO] --camera FILE --landmarks FILE [options]")
+    describe(command, DESCRIPTION, EPILOG, "%(prog)s [PHOTO] (--camera FILE | --fov DEG) --landmarks FILE ...")
     add_photograph(
         command,
-        "the photograph: its size is compared with the camera's, and --draw draws into it; not needed otherwise",
+        "the photograph: its size is compared with the camera's, or --fov is of it, and --draw draws into it; not "
+        "needed otherwise",
     )
-    add_camera(command)
+    either = command.add_mutually_exclusive_group()
+    add_camera(either, "--fov")
+    either.add_argument(
+        "--fov",
+        type=field_of_view,
+        metavar="DEG+-S",
+        help="where there is no camera file, what PHOTO shows from its left edge to its right one, in degrees, with a "
+        "standard deviation, such as 70+-5; or exif, where its EXIF data tell a focal length of 35 mm film",
+    )
     command.add_argument(
         "--landmarks",
         type=some_path,

@@ -11,6 +11,7 @@ from rich.table import Table
 from diffproj._core.shown import plain
 from diffproj.calibration.evidence.adjustment import mounting_covariance
 from diffproj.calibration.results.calibration import Calibration
+from diffproj.cli.assumed_camera import Assumed
 from diffproj.cli.landmarks_file import Surveyed
 from diffproj.cli.terminal import RESULTS, aligned, counted, in_words, known, result, rounded
 from diffproj.cli.units import heading
@@ -37,7 +38,12 @@ IN_WORDS = {
 
 
 def document(
-    options: argparse.Namespace, found: Calibration, surveyed: Surveyed, free: tuple[str, ...], calibrated: bool
+    options: argparse.Namespace,
+    found: Calibration,
+    surveyed: Surveyed,
+    free: tuple[str, ...],
+    calibrated: bool,
+    assumed: Assumed | None,
 ) -> dict[str, Any]:
     """Everything that was found.
 
@@ -47,6 +53,7 @@ def document(
         surveyed: the landmarks.
         free: names of the intrinsics that were found along.
         calibrated: whether the camera file holds a calibration.
+        assumed: of the camera, where there is no file.
     """
     camera = found.cameras[0]
     mounting = camera.mounting()
@@ -68,7 +75,8 @@ def document(
     includes = ["pixels", "landmarks"] if surveyed.landmarks.covariances is not None else ["pixels"]
     includes += ["priors"] if options.prior else []
     return {
-        "camera": str(options.camera),
+        "camera": None if options.camera is None else str(options.camera),
+        "assumed": None if assumed is None else assumed.told(),
         "photograph": None if options.photograph is None else str(options.photograph),
         "landmarks_file": str(options.landmarks),
         "view": found.views.names[0],
@@ -141,6 +149,8 @@ def say(told: dict[str, Any]) -> None:
     for remark in told["remarks"]:
         result("\n" + textwrap.fill(remark, 79))
     result("\n" + textwrap.fill(told["verdict"], 79))
+    if told["assumed"] is not None:
+        result(textwrap.fill(told["assumed"]["text"], 79))
     result(textwrap.fill(_about_deviations(told), 79))
 
 
@@ -193,7 +203,13 @@ def _about_deviations(told: dict[str, Any]) -> str:
             f" from {counted(round(freedom), 'degree')} of freedom only" if freedom < FEW else ""
         )
     survey = ", the landmarks' own deviations" if "landmarks" in told["deviations_include"] else ""
-    survey += ", what --prior says" if told["priors"] else ""
+    priors = told["priors"].keys() - (told["assumed"] or {"priors": ()})["priors"]
+    survey += ", what --prior says" if priors else ""
+    if told["assumed"] is not None:
+        return (
+            f"The deviations hold the noise of the pixels ({noise}){survey} and how far what is assumed may be off as "
+            "said, but NOT pixels that are not square, or a lens that bends otherwise."
+        )
     if "camera" in told["deviations_include"]:
         return f"The deviations hold the noise of the pixels ({noise}){survey} and how surely the camera is known."
     return (

@@ -19,6 +19,7 @@ from diffproj.calibration.results.ambiguity import AmbiguousPoseWarning
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
 from diffproj.calibration.results.mismatch import CameraMismatchWarning
 from diffproj.calibration.results.remark import Kind
+from diffproj.cli.assumed_camera import Assumed, assumed_camera, contradicted
 from diffproj.cli.drawing import check_drawing, check_no_photograph, write_drawing
 from diffproj.cli.inputs import check_not_the_same, check_writable, writing
 from diffproj.cli.known_beforehand import FOCAL, POSE
@@ -27,10 +28,10 @@ from diffproj.cli.landmarks_file import Surveyed, read_landmarks
 from diffproj.cli.locate_document import document, say
 from diffproj.cli.photographs import one_photograph, warn_if_shown_turned
 from diffproj.cli.scene import check_size, loaded
-from diffproj.cli.terminal import as_json, failure, result
+from diffproj.cli.terminal import as_json, failure, result, sentence
 from diffproj.files.save import save_camera
 from diffproj.geometry.camera import Camera
-from diffproj.targets.exif import Told
+from diffproj.targets.exif import Exif, Told
 from diffproj.targets.images import grey
 from diffproj.targets.one_camera import told_of
 from diffproj.targets.views import Views
@@ -45,24 +46,29 @@ TOLD = {Kind.TOLD_APART: CameraMismatchWarning, Kind.RIVAL: AmbiguousPoseWarning
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
+    if options.camera is None and options.fov is None:
+        options.command_line.error("the following arguments are required: --camera, or --fov where there is no file")
     check_drawing(options.draw)
     if options.output is not None:
         check_writable("--output", options.output)
-        check_not_the_same("--output", options.output, [options.camera, options.landmarks])
+        read = [options.landmarks] if options.camera is None else [options.camera, options.landmarks]
+        check_not_the_same("--output", options.output, read)
     if options.photograph is not None:
         check_no_photograph(options.draw, [options.photograph])
-    camera, calibration = loaded(options.camera)
-    check_together(options.prior, options.fixed, camera)
-    surveyed = read_landmarks(options.landmarks, options.crs)
-    unit = _unit(options.unit, surveyed)
-    picture, size, told_by_file = None, camera.size, ()
+    picture, size, told_by_file, exif = None, None, (), Exif()
     if options.photograph is not None:
         photograph = one_photograph(options.photograph, options.orientation)
-        picture, told_by_file = grey(photograph), (told_of(photograph.exif, options.orientation == "upright"),)
+        picture, exif = grey(photograph), photograph.exif or exif
+        told_by_file = (told_of(exif, options.orientation == "upright"),)
         size = picture.shape[1], picture.shape[0]
+    camera, calibration, assumed = _camera(options, size, exif)
+    surveyed = read_landmarks(options.landmarks, options.crs)
+    unit = _unit(options.unit, surveyed)
+    if options.photograph is not None:
         check_size(camera, size, options)
         pixels = f"the pixels in {options.landmarks}"
-        warn_if_shown_turned(options.photograph, options.orientation, pixels, photograph.exif)
+        warn_if_shown_turned(options.photograph, options.orientation, pixels, exif)
+    size = size or camera.size
     if size is None and options.draw is not None:
         raise ValueError(f"--draw: want PHOTO, or the image's size in {options.camera}, got neither")
     view = options.photograph.name if options.photograph is not None else options.landmarks.stem
@@ -70,7 +76,11 @@ def run(options: argparse.Namespace) -> int:
     for remark in found.findings[0]:
         if remark.kind == Kind.BELOW:
             warn_caller(f"{options.landmarks}: {remark.sentence}")
-    told = document(options, found, surveyed, _free(options, camera), calibration is not None)
+    against = [] if assumed is None else contradicted(assumed, found)
+    for one in against:
+        warn_caller(f"{options.landmarks}: {one}")
+    told = document(options, found, surveyed, _free(options, camera), calibration is not None, assumed)
+    told["remarks"] += [f"{sentence(one)}." for one in against]
     told["warnings"] = options.warned
     if options.draw is not None:
         from diffproj import figures  # here, for it loads matplotlib
@@ -102,6 +112,26 @@ def _unit(said: str | None, surveyed: Surveyed) -> str | None:
     return "m"
 
 
+def _camera(
+    options: argparse.Namespace, size: tuple[int, int] | None, exif: Exif
+) -> tuple[Camera, Calibration | None, Assumed | None]:
+    """The camera of the file, or of `--fov`: what is assumed of that one goes along with the priors.
+
+    Raises:
+        ValueError: options that do not go together.
+    """
+    if options.camera is not None:
+        camera, calibration = loaded(options.camera)
+        check_together(options.prior, options.fixed, camera)
+        return camera, calibration, None
+    if size is None:
+        raise ValueError("--fov: want PHOTO beside it, whose size tells the focal length in px, got none")
+    assumed = assumed_camera(options.fov, size, options.prior, options.free, exif)
+    check_together(options.prior, options.fixed, assumed.camera)
+    options.prior = [*options.prior, *assumed.priors]
+    return assumed.camera, None, assumed
+
+
 def _located(
     options: argparse.Namespace,
     camera: Camera,
@@ -122,8 +152,10 @@ def _located(
     _check_count(options, count)
     sigma = _noise(options, surveyed)
     if options.prior and sigma is None:
+        option = "--prior" if options.fov is None else "--fov"
         raise ValueError(
-            "--prior: want --pixel-sigma beside it, or a column 'pixel_sigma', for it weighs against the pixels' noise"
+            f"{option}: want --pixel-sigma beside it, or a column 'pixel_sigma', for it weighs against the pixels' "
+            "noise"
         )
     steps: dict[str, Any] = {"reject_outliers": options.reject_outliers, "pixel_sigma": sigma}
     free = _free(options, camera)
@@ -133,7 +165,8 @@ def _located(
     target = surveyed.landmarks
     try:
         views = Views(surveyed.pixels.unsqueeze(0), visible.unsqueeze(0), [view], size, told_by_file)
-        if of_pose and (free or count < FEWEST):
+        # Few landmarks and so many unknowns have minima that `refine` may end in; `adjust` looks for the lowest.
+        if (of_pose and (free or count < FEWEST)) or (options.fov is not None and not options.reject_outliers):
             found = _adjusted(options, camera, calibration, surveyed, views, sigma, free, tied)
         elif of_pose:
             held = tuple(one.name for one in options.fixed)
@@ -206,9 +239,9 @@ def _check_count(options: argparse.Namespace, count: int) -> None:
     Raises:
         ValueError: there are not.
     """
-    least = 1 if options.prior or options.fixed else FEWEST
+    least = 1 if any(one.name in POSE for one in (*options.prior, *options.fixed)) else FEWEST
     if count < least:
-        fewer = "; fewer are enough with --prior or --fixed" * (least > 1)
+        fewer = "; fewer are enough with --prior or --fixed, such as height=6+-0.1" * (least > 1)
         raise ValueError(f"--landmarks: want at least {least} with a pixel, got {count} in {options.landmarks}{fewer}")
 
 
@@ -218,6 +251,8 @@ def _in_words(text: str, surveyed: Surveyed) -> str:
     text = re.sub("^(priors|fixed|pixel_sigma): ", lambda m: f"{OPTIONS[m[1]]}: ", text)
     text = re.sub(r"; fix (\w+|some of them) or give a prior, as .*$", r"; tell \1 by --fixed or --prior", text)
     text = re.sub(r"; fixed=\(.*$", "; or less in --free", text)
+    text = re.sub(r": start closer, or ", ": check the camera, or ", text)
+    text = re.sub(r": fit --distortion .*$", ": tell more of the lens, as by --prior k1=-0.1+-0.05", text)
     names = surveyed.landmarks.names
     return re.sub(
         r"with (\d+) and (\d+) alike", lambda m: f"with {names[int(m[1])]!r} and {names[int(m[2])]!r} alike", text
