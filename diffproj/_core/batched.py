@@ -42,18 +42,26 @@ class Batched(Copied, Shown):
     _parts: ClassVar[tuple[str, ...]]
     """What has batch axes of its own, or is `None`."""
     _constants: ClassVar[tuple[str, ...]]
+    _remedies: ClassVar[dict[str, str]]
+    """What to do with items that cannot be stacked, for their parts or constants of a name differ."""
 
     def __init_subclass__(
         cls,
         tensors: dict[str, int] | None = None,
         parts: Sequence[str] = (),
         constants: Sequence[str] = (),
+        remedies: dict[str, str] | None = None,
         **options: Any,
     ) -> None:
         super().__init_subclass__(**options)
         if tensors is None:  # a base of others
             return
-        cls._tensors, cls._parts, cls._constants = tensors, tuple(parts), tuple(constants)
+        cls._tensors, cls._parts, cls._constants, cls._remedies = (
+            tensors,
+            tuple(parts),
+            tuple(constants),
+            remedies or {},
+        )
         register_pytree(cls, children=(*tensors, *parts), constants=constants)
 
     @classmethod
@@ -193,7 +201,7 @@ class Batched(Copied, Shown):
         axes = len(batch) + 1
         dim = whole_number("dim", dim, f"an axis from {-axes} to {axes - 1}", least=-axes, most=axes - 1) % axes
         fields = {name: torch.stack([getattr(item, name) for item in items], dim) for name in cls._tensors}
-        fields |= {name: _stacked(name, [getattr(item, name) for item in items], dim) for name in cls._parts}
+        fields |= {name: cls._stacked(name, [getattr(item, name) for item in items], dim) for name in cls._parts}
         return cls.unchecked(**fields, **{name: cls._agreed(name, items) for name in cls._constants})
 
     @classmethod
@@ -210,8 +218,34 @@ class Batched(Copied, Shown):
         """
         first, *others = (getattr(item, name) for item in items)
         if any(other != first for other in others):
-            raise ValueError(f"items: want the same {name}, got {[first, *others]}")
+            raise ValueError(f"items: want the same {name}, got {[first, *others]}{cls._remedy(name)}")
         return first
+
+    @classmethod
+    def _stacked(cls, name: str, parts: list[Any], dim: int) -> Any:
+        """The parts of that name joined.
+
+        Raises:
+            TypeError: they are of different kinds.
+            ValueError: they are of one kind, and still do not fit together.
+        """
+        kinds, remedy = {type(part) for part in parts}, cls._remedy(name)
+        if len(kinds) > 1:
+            got = ", ".join(sorted(kind.__name__ for kind in kinds))
+            raise TypeError(f"items: want one kind of {name}, got {got}{remedy}")
+        if parts[0] is None:
+            return None
+        leaves = [torch_pytree.tree_flatten(part) for part in parts]
+        if any(len(flat) != len(leaves[0][0]) or structure != leaves[0][1] for flat, structure in leaves):
+            raise ValueError(f"items: want {name}s that are alike, got different ones{remedy}")
+        if any(a.shape != b.shape for flat, _ in leaves for a, b in zip(flat, leaves[0][0], strict=True)):
+            raise ValueError(f"items: want {name}s of one size, got different ones{remedy}")
+        stacked = [torch.stack(tensors, dim) for tensors in zip(*(flat for flat, _ in leaves), strict=True)]
+        return torch_pytree.tree_unflatten(stacked, leaves[0][1])
+
+    @classmethod
+    def _remedy(cls, name: str) -> str:
+        return f"; {cls._remedies[name]}" if name in cls._remedies else ""
 
     def __len__(self) -> int:
         """The length of the first batch axis.
@@ -244,21 +278,6 @@ class Batched(Copied, Shown):
             value = getattr(self, name)
             fields[name] = None if value is None else part(value)
         return self.unchecked(**fields, **{name: getattr(self, name) for name in self._constants})
-
-
-def _stacked(name: str, parts: list[Any], dim: int) -> Any:
-    kinds = {type(part) for part in parts}
-    if len(kinds) > 1:
-        raise TypeError(f"items: want one kind of {name}, got {', '.join(sorted(kind.__name__ for kind in kinds))}")
-    if parts[0] is None:
-        return None
-    leaves = [torch_pytree.tree_flatten(part) for part in parts]
-    if any(len(flat) != len(leaves[0][0]) or structure != leaves[0][1] for flat, structure in leaves):
-        raise ValueError(f"items: want {name}s that are alike, got different ones")
-    if any(a.shape != b.shape for flat, _ in leaves for a, b in zip(flat, leaves[0][0], strict=True)):
-        raise ValueError(f"items: want {name}s of one size, got different ones")
-    stacked = [torch.stack(tensors, dim) for tensors in zip(*(flat for flat, _ in leaves), strict=True)]
-    return torch_pytree.tree_unflatten(stacked, leaves[0][1])
 
 
 # -------------------------------------------------------------------------------------------------------- indexing

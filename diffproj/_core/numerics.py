@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from diffproj._core.arguments import Kind, tensor_of
 from diffproj._core.torch_private import (
@@ -26,6 +27,7 @@ from diffproj._core.torch_private import (
     in_forward_mode,
     in_functional_transform,
     in_recording,
+    stands_for_a_batch,
     traced_beside,
 )
 from diffproj._core.warn import warn_caller
@@ -141,6 +143,23 @@ def check_untransformed(who: str, remedy: str) -> None:
             f"{who}: want a call outside of torch.func's transforms, for it reads values, got one under vmap, grad, "
             f"jvp or another; {remedy}"
         )
+
+
+def check_not_mapped(who: str, remedy: str, *given: Any) -> None:
+    """Check that values can be read under the transforms of `torch.func`: under `grad` and `jvp`, but not `vmap`.
+
+    Args:
+        who: the call that reads them.
+        remedy: what to do.
+        given: tensors and trees of them; all else has no say.
+
+    Raises:
+        ValueError: some stand for a batch.
+    """
+    if not in_functional_transform():
+        return
+    if any(isinstance(leaf, Tensor) and stands_for_a_batch(leaf) for leaf in tree_leaves(given)):
+        raise ValueError(f"{who}: want a call outside of vmap, for it reads values, got one under it; {remedy}")
 
 
 def gradient_only(step: Tensor) -> Tensor:

@@ -20,6 +20,19 @@ def in_functional_transform() -> bool:
     return torch._C._functorch.peek_interpreter_stack() is not None  # type: ignore[attr-defined]
 
 
+def stands_for_a_batch(tensor: torch.Tensor) -> bool:
+    """Whether it is one of many under `vmap`, on whatever level: its value cannot be read, as under `grad` and `jvp`.
+
+    Under `jacfwd` and `hessian` the derivatives are a batch, and the value is not.
+    """
+    functorch = torch._C._functorch  # type: ignore[attr-defined]
+    while functorch.is_functorch_wrapped_tensor(tensor):
+        if functorch.is_batchedtensor(tensor):
+            return True
+        tensor = functorch.get_unwrapped(tensor)
+    return False
+
+
 def in_recording() -> bool:
     """Whether the code runs in order to be recorded, as by `torch.jit.trace`, ONNX's older exporter or `make_fx`.
 

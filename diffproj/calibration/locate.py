@@ -148,7 +148,7 @@ def located(
     calibration = camera if isinstance(camera, Calibration) else None
     if isinstance(camera, Calibration):
         camera = camera.camera
-    camera = as_camera(camera)
+    camera = as_camera(camera).detach()
     skew = calibration is not None and calibration.skew
     shared, _, parameters = start.from_camera(camera, data, bow=False, skew=skew, with_poses=False)
     if isinstance(shaped, Calibration):

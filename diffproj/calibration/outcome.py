@@ -80,7 +80,8 @@ def begun(
     """What is to be minimised from that start.
 
     Skew that is not to be fitted is held. `reference (P, s)` is what fixed parameters keep and priors without a mean
-    are about; NaN where nothing is known. With `rows (n,)`, only of these cameras, which the start is then of.
+    are about, by the graph that it carries; NaN where nothing is known. With `rows (n,)`, only of these cameras, which
+    the start is then of.
     """
     fixed = tuple(name for name in options.fixed if not of_points(name))
     fixed = fixed if options.skew or not parameters.skew else (*fixed, SKEW)
@@ -90,7 +91,7 @@ def begun(
     if rows is not None:
         reference, task = reference[rows], task.part(rows)
         prior = None if prior is None else prior.part(rows)
-    shared = held_at(reference, shared, parameters, fixed)
+    shared = held_at(reference.detach(), shared, parameters, fixed)
     task = replace(
         task,
         prior=None if prior is None else Prior(prior.mean.detach(), prior.precision.detach()),

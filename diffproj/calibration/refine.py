@@ -39,7 +39,10 @@ def refine(
             pixels, the target's points, the weights and tensors among the priors are those of the minimiser (implicit
             function theorem, exact Hessian). To first order, and `create_graph=True` is warned of. What is known of
             points, by priors or as the sigma of landmarks, needs `pixel_sigma` then, so that the minimum is that of one
-            cost. Not by the camera's own values, which are a start, nor by a landmark's sigma.
+            cost. Gradients by the camera's own values, too, where these hold or weigh: what `fixed` keeps, the ratio of
+            tied focal lengths, skew that is not fitted, and what priors without a mean are about; elsewhere they are
+            only a start, and have none. Skew of 0 that is not fitted stays 0, and has none either. Not by a landmark's
+            sigma.
         options: as in `calibrate`: see `CalibrationOptions`.
 
     Returns:
@@ -68,19 +71,19 @@ def refine(
         )
     differentiable = flag("differentiable", differentiable)
     chosen = calibration_options("refine", options)
-    beginning = as_camera(camera)
+    beginning = as_camera(camera) if differentiable else as_camera(camera).detach()
 
     def fit(views: Views) -> Calibration:
         data = Data(views, target, chosen.weights, chosen.pixel_sigma)
         data.check_options(chosen.objective, chosen.shape, (*chosen.fixed, *(chosen.priors or ())))
         if differentiable:
             check_differentiable(data, chosen)
-        shared, local, parameters = start.from_camera(beginning, data, chosen.bow, chosen.skew)
-        begin = begun(data, chosen, parameters, shared, local, shared)
+        own, local, parameters = start.from_camera(beginning, data, chosen.bow, chosen.skew)
+        begin = begun(data, chosen, parameters, own.detach(), local, own)
         found, prior = begin.minimum(chosen), begin.prior
         found, prior = with_free_points(found, data, chosen, prior)
         if differentiable:
-            found = differentiated(found, data, prior, chosen)
+            found = differentiated(found, data, prior, chosen, own)
         return outcome("refine", data, found, beginning.size or views.size, chosen.throw)
 
     return with_true_centres(fit, views, target)

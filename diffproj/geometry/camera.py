@@ -54,6 +54,11 @@ class Camera(
     tensors={"K": 2, "R": 2, "t": 1},
     parts=("distortion",),
     constants=("size",),
+    remedies={
+        "distortion": "dp.ProjectorBank takes cameras with different lenses; a batch wants one lens model for all, a "
+        "shorter one with 0 as its other coefficients",
+        "size": "dp.ProjectorBank takes cameras of different sizes; a batch wants one for all, see resized()",
+    },
 ):
     """A calibrated camera, or a batch of them with batch shape `*B`; the parts broadcast to it.
 

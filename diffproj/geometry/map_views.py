@@ -105,6 +105,10 @@ class MapViews:
         from the plane's coordinates to a top view's pixels in front, it is what `cv2.warpPerspective` and Kornia's
         `warp_perspective` take.
 
+        The factor follows camera and plane, and gradients leave out how it changes: those of the entries as they are
+        mean as little as their size. A loss on entries normalises them first: `H / H[..., 2:, 2:]` has the right
+        gradients, as has all that the factor cancels from. (Its divisor is positive where pixel (0, 0) sees the plane.)
+
         Args:
             axes: `(origin, axis_s, axis_t)` of the plane, each `(*B, 3)`, as `plane_axes(plane)` gives them; the
                 world's x and y if left out, for a plane of constant z.

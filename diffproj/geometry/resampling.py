@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from diffproj._core.numerics import block_points
-from diffproj._core.torch_private import has_no_values, in_recording
+from diffproj._core.torch_private import has_no_values, in_recording, stands_for_a_batch
 from diffproj.geometry.grid import pixel_grid
 
 LookUp = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
@@ -29,6 +29,8 @@ BAND = 0.25
 """By how much a footprint goes beyond n pixels until there are n + 1 samples alone."""
 MOST_STEPS = 100_000
 """Of the target's pixels of an image, whose footprints are compared."""
+UNKNOWN = "samples: want how many a pixel takes, got None where no values say it; samples=1 is fastest"
+"""What is said where the number of samples depends on values that cannot be read."""
 
 
 def resampled(
@@ -57,9 +59,11 @@ def resampled(
         return (total, share > 0) if samples == (1, 1) else _finished(total, share)
     recording = not torch.compiler.is_compiling() and in_recording()  # whose numbers would be those of its example
     if recording or has_no_values(like) or has_no_values(source):
-        raise ValueError("samples: want how many a pixel takes, got None where no values say it; samples=1 is fastest")
+        raise ValueError(UNKNOWN)
     with torch.no_grad():
         u, v, valid = look_up_of(None)(*_apart(corners + 0.5))
+        if stands_for_a_batch(u):
+            raise ValueError(UNKNOWN)
         if 0 in (*source.shape[:-3], *valid.shape[:-1], *u.shape[:-1]):  # of no images
             return _finished(*_mean(source, look_up_of(None), corners, (1, 1)))
         shown = (valid & _inside(u, v, _size(source))).unflatten(-1, shape)

@@ -27,7 +27,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from diffproj._core.arguments import Array
-from diffproj._core.numerics import broadcast_batches, check_tensor, in_float64, inverse2, transform
+from diffproj._core.numerics import broadcast_batches, check_not_mapped, check_tensor, in_float64, inverse2, transform
 from diffproj.calibration.evidence.adjustment import Adjustment
 from diffproj.calibration.evidence.observations import Seen
 from diffproj.calibration.problem.parametrisation import POSE, Parametrisation
@@ -87,7 +87,7 @@ def measure(
         TypeError: not pixels, a calibration or a camera, and a plane in this order, or another argument is of the wrong
             kind.
         ValueError: no such view, none said of several, a camera without `pixel_sigma`, or shapes, devices or values
-            that cannot be.
+            that cannot be, or cannot be read under `torch.func.vmap`.
 
     Example:
         >>> import diffproj as dp
@@ -97,6 +97,8 @@ def measure(
         >>> print(f"{length.value[0]:.1f} ± {length.deviation[0]:.1f} mm")
         199.9 ± 0.2 mm
     """
+    given = pixels, calibration, plane, pixel_sigma, plane_covariance
+    check_not_mapped("measure", "pixels, cameras and planes take batch axes (*B), which one call measures", *given)
     pixels, plane = in_float64(check_tensor("pixels", pixels, "N", 2)), as_plane(plane)
     known, middle, doubtful, number, posed = None, None, "", 0, None
     if isinstance(calibration, Calibration):

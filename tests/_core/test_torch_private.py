@@ -13,6 +13,7 @@ from diffproj._core.torch_private import (
     in_forward_mode,
     in_functional_transform,
     in_recording,
+    stands_for_a_batch,
 )
 
 
@@ -30,6 +31,30 @@ def test_functional_transforms_are_seen() -> None:
     torch.func.jvp(function, (x,), (x,))
     function(x)
     assert seen == [False, True, True, True, False]
+
+
+def test_what_stands_for_a_batch_is_seen_on_every_level() -> None:
+    seen = []
+
+    def function(x: torch.Tensor) -> torch.Tensor:
+        seen.append(stands_for_a_batch(x))
+        return (x * x).sum()
+
+    x = torch.ones(2, 2)
+    for one in (function, torch.func.grad(function), torch.func.jacfwd(function), torch.func.hessian(function)):
+        one(x)
+    torch.func.jvp(function, (x,), (x,))
+    torch.func.functionalize(function)(x)
+    torch.func.vmap(lambda _: function(torch.ones(2)))(x)
+    assert not any(seen)
+    seen.clear()
+    torch.func.vmap(function)(x)
+    torch.func.vmap(torch.func.vmap(function))(x)
+    torch.func.vmap(torch.func.grad(function))(x)
+    torch.func.grad(lambda x: torch.func.vmap(function)(x).sum())(x)
+    torch.func.vmap(torch.func.hessian(function))(x)
+    assert len(seen) == 5
+    assert all(seen)
 
 
 def test_what_stands_for_a_batch_has_no_storage() -> None:

@@ -105,6 +105,37 @@ def test_the_homography_is_the_map(camera: dp.Camera, pixels: torch.Tensor) -> N
     torch.testing.assert_close(torch.stack([s / w, t / w], dim=-1), points[:, :2], rtol=1e-10, atol=1e-8)
 
 
+@pytest.mark.parametrize("tilted", [False, True])
+def test_the_normalised_homography_has_the_derivatives_of_the_formula(tilted: bool) -> None:
+    """By camera and plane. Those of the entries as they come leave out how the factor changes, which is documented."""
+    upper, angles, t, abcd = parts = [
+        torch.tensor(values, dtype=D, requires_grad=True)
+        for values in (
+            [[500.0, 2, 320], [0, 510, 240]],
+            [0.5, 0.1, 0.05],
+            [10.0, 20, 800],
+            [0.1, -0.2, 2.0, 30.0] if tilted else [0.0, 0, 2, 14],
+        )
+    ]
+    K = torch.cat([upper, torch.tensor([[0.0, 0, 1]], dtype=D)])
+    R, plane = dp.rotation_from_euler(*angles), dp.Plane(abcd[:3], abcd[3])
+    axes = dp.plane_axes(plane) if tilted else None
+    H = dp.PlaneMap(dp.Camera(K, R, t), plane).homography(axes)
+    if axes is None:  # z of the plane at (0, 0), and its slopes
+        x, y, z = torch.eye(3, dtype=D)
+        axes = abcd[3] / abcd[2] * z, x - abcd[0] / abcd[2] * z, y - abcd[1] / abcd[2] * z
+    origin, along_s, along_t = axes
+    want = torch.linalg.inv(K @ torch.stack([R @ along_s, R @ along_t, R @ origin + t], dim=-1))
+    weights = torch.randn(3, 3, dtype=D) * torch.tensor([1.0, 1, 1e3], dtype=D).unsqueeze(-1)
+
+    def gradients(H: torch.Tensor) -> list[torch.Tensor]:
+        return list(torch.autograd.grad((weights * H).sum(), parts, retain_graph=True))
+
+    ours, theirs = gradients(H / H[2:, 2:]), gradients(want / want[2:, 2:])
+    for mine, other in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-9, atol=1e-9 * float(other.abs().amax()))
+
+
 def test_cv2_and_kornia_warp_by_it_as_rectify_does(camera: dp.Camera) -> None:
     """To the top view's pixels: column (s - s_min) / step - 1/2."""
     rows, columns = torch.meshgrid(torch.arange(480.0, dtype=D), torch.arange(640.0, dtype=D), indexing="ij")

@@ -1,7 +1,7 @@
 """Many cameras in one projector, chosen by index; parts of a pose; and batches of cameras from a `DataLoader`."""
 
 from collections import OrderedDict, UserDict, defaultdict
-from collections.abc import Iterator, MutableMapping
+from collections.abc import Callable, Iterator, MutableMapping
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -175,6 +175,25 @@ def test_a_loader_joins_cameras(cameras: dp.Camera) -> None:
         ValueError, match=r"samples: want .* got Tensor of shape \(2, 2\), Tensor of shape \(3, 2\): stack"
     ):
         dp.collate([(torch.zeros(2, 2), 1), (torch.zeros(3, 2), 2)])
+
+
+@pytest.mark.parametrize("join", [dp.stack, dp.collate, dp.Camera.stack])
+def test_cameras_that_cannot_be_joined_are_for_a_bank(join: Callable[..., Any], cameras: dp.Camera) -> None:
+    """Nothing said what to do."""
+    first = cameras[0]
+    K, zeros, plane = first.K, torch.zeros(12, dtype=first.dtype), dp.Plane.z(0.0)
+    lenses = [None, dp.KannalaBrandt(zeros[:4]), dp.BrownConrady(zeros[:4]), dp.BrownConrady(zeros)]
+    several = [dp.Camera(K, t=first.t, distortion=lens, size=first.size) for lens in lenses]
+    for number, one in enumerate(several):
+        for other in several[:number]:
+            with pytest.raises((TypeError, ValueError), match=r"; dp\.ProjectorBank takes .* one lens model for all"):
+                join([one, other])
+    larger = dp.Camera(K, t=first.t, size=(800, 600))
+    with pytest.raises(ValueError, match=r"the same size, got .*; dp\.ProjectorBank takes .*resized"):
+        join([several[0], larger])
+    points, valid = dp.ProjectorBank([*several, larger], plane)(K.new_full((5, 1, 2), 200.0), camera=range(5))
+    assert valid.all()
+    torch.testing.assert_close(points[2:], points[:1].expand(3, 1, 3))
 
 
 class Sample(MutableMapping[str, Any]):

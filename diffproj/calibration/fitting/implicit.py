@@ -7,6 +7,9 @@ At the minimum the gradient of the cost by the parameters theta is zero for any 
 This is the first derivative of `theta - H^-1 gradient(theta, d)` with theta and H detached from the autograd graph. H
 has the block structure of the normal equations and is solved by the same Schur complement.
 
+Parameters that are held at the camera's own values, and the ratio of focal lengths that are tied, are data as well:
+theta and the directions in which it is free to move then follow them, and the cost with these.
+
 That takes a cost which is the same function of parameters and data all the way. Where what is known of the target is
 weighed against the noise that the residuals tell, the cost follows its own minimum, and what it would be for other data
 is not in its derivatives: `check_differentiable` refuses that.
@@ -55,13 +58,17 @@ def check_differentiable(data: Data, options: Options) -> None:
         )
 
 
-def differentiated(found: Fit, data: Data, prior: Prior | None, options: Options) -> Fit:
-    """The same fit, with shared parameters and poses differentiable by pixels, points, weights and priors."""
+def differentiated(found: Fit, data: Data, prior: Prior | None, options: Options, own: Tensor) -> Fit:
+    """The same fit, with shared parameters and poses differentiable by pixels, points, weights and priors.
+
+    And by the camera's own values `(P, s)`, without points, where parameters are held at these or tied by them.
+    """
     printed = None if data.surveyed(options.shape) else printing_precision(options.priors, data.batch, data.points)
-    sources = [data.given_pixels, data.given_points, data.given_weights, printed, *(prior or ())]
+    task, solution = found.task, found.solution
+    base, basis = _following(task.basis, solution.shared, own, options.tied_focal)
+    sources = [data.given_pixels, data.given_points, data.given_weights, printed, base, *(prior or ())]
     if not any(source is not None and source.requires_grad for source in sources):
         return found
-    task, solution = found.task, found.solution
     P, V = task.pixels.shape[:2]
     s = len(task.names)
     pixels = data.given_pixels.reshape(task.pixels.shape)
@@ -71,7 +78,7 @@ def differentiated(found: Fit, data: Data, prior: Prior | None, options: Options
         few, count = task.parameters.few, task.parameters.points
         theta = solution.shared.new_zeros(P, V, few + POSE, requires_grad=True)
         moves = solution.shared.new_zeros(P, V, count, 3, requires_grad=True)
-        shared = solution.shared.unsqueeze(1) + torch.cat([theta[..., :few], moves.flatten(2)], dim=-1)
+        shared = base.unsqueeze(1) + torch.cat([theta[..., :few], moves.flatten(2)], dim=-1)
         cost = _costs(task, shared, theta[..., few:], pixels, data, weights, found)
         gradient, pulls = torch.autograd.grad(
             cost.sum(), (theta, moves), create_graph=True, allow_unused=True, materialize_grads=True
@@ -83,15 +90,15 @@ def differentiated(found: Fit, data: Data, prior: Prior | None, options: Options
         U[:, few:, few:] = block_diagonal((share.unsqueeze(-1) * own).sum(1))
         if prior is not None:
             U = U + prior.precision.detach()
-            g = g + (prior.precision @ (solution.shared - prior.mean).unsqueeze(-1)).squeeze(-1)
+            g = g + (prior.precision @ (base - prior.mean).unsqueeze(-1)).squeeze(-1)
         if task.restraint is not None:
             U = U + torch.nn.functional.pad(task.restraint.precision, (few, 0, few, 0))
             held = task if printed is None else replace(task, printed=printed)
             g = g + torch.nn.functional.pad(_restraining(held, data.given_points - data.middle, found), (few, 0))
         E, W, h = H[..., :s, s:], H[..., s:, s:], gradient[..., s:]
-        if task.basis is not None:
+        if task.basis is not None and basis is not None:
             T = task.basis.mT
-            U, E, g = T @ U @ task.basis, T.unsqueeze(1) @ E, (T @ g.unsqueeze(-1)).squeeze(-1)
+            U, E, g = T @ U @ task.basis, T.unsqueeze(1) @ E, (basis.mT @ g.unsqueeze(-1)).squeeze(-1)
         # An unused view has W = 0 and h = 0: its pose has no gradient.
         unused = ~task.used.any(-1)[..., None, None] * torch.eye(POSE, dtype=W.dtype, device=W.device)
         F = torch.linalg.solve_ex((W + unused).mT, E.mT)[0].mT
@@ -101,9 +108,30 @@ def differentiated(found: Fit, data: Data, prior: Prior | None, options: Options
         dz = -torch.linalg.solve_ex(W + unused, h.unsqueeze(-1) + E.mT @ dx.unsqueeze(1))[0].squeeze(-1)
         if task.basis is not None:
             dx = task.basis @ dx
-        shared = solution.shared + gradient_only(dx.squeeze(-1))
+        shared = base + gradient_only(dx.squeeze(-1))
         local = moved(solution.local, gradient_only(dz))
     return Fit(task, solution._replace(shared=shared, local=local), found.rejected)
+
+
+def _following(basis: Tensor | None, shared: Tensor, own: Tensor, tied: bool) -> tuple[Tensor, Tensor | None]:
+    """The values `(P, s)` and the basis of their free directions, as they follow the camera's own values `(P, few)`.
+
+    To first order: what no direction moves follows its own value, a tied f_y the ratio of both.
+    """
+    if basis is None or not own.requires_grad:
+        return shared, basis
+    few = own.shape[-1]
+    held = (basis[:, :few] == 0).all(-1).all(0)
+    step = torch.where(held, own - own.detach(), 0.0)
+    if tied and not bool(held[:2].any()):
+        ratio = own[:, 1] / own[:, 0]
+        slope = torch.zeros_like(basis[:1])
+        slope[0, 1, 0] = 1.0  # f_x is the first direction: see `free_basis`
+        turned = slope * (ratio - ratio.detach())[:, None, None]
+        basis, step = basis + turned, step + turned[:, :few, 0] * shared[:, :1]
+    elif not bool(held.any()):
+        return shared, basis
+    return shared + torch.nn.functional.pad(step, (0, shared.shape[-1] - few)), basis
 
 
 def _second(gradient: Tensor, pulls: Tensor, theta: Tensor, moves: Tensor) -> tuple[Tensor, Tensor]:

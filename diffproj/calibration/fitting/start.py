@@ -23,7 +23,8 @@ def from_camera(
 ) -> tuple[Tensor, Pose, Parametrisation]:
     """Shared parameters and poses to start from, and which parameters they are.
 
-    A camera whose image is turned is replaced by the one that is turned itself, and sees the same.
+    A camera whose image is turned is replaced by the one that is turned itself, and sees the same. Gradients flow from
+    the shared parameters to the camera; poses carry none.
 
     Args:
         camera: where its batch shape broadcasts to the views' `*B`, it gives intrinsics alone; where it broadcasts to
@@ -42,7 +43,7 @@ def from_camera(
     if camera.K.is_meta:
         raise ValueError("camera: want one with values, got one on the meta device")
     given.check_size(camera.size, data.views.size)
-    camera = camera.detach().to(data.points.device, data.points.dtype)
+    camera = camera.to(data.points.device, data.points.dtype)
     batch, V = tuple(data.batch), len(data.views)
     posed = not _broadcasts(camera.batch_shape, batch)
     if posed and not (with_poses and _broadcasts(camera.batch_shape, (*batch, V))):
@@ -58,8 +59,8 @@ def from_camera(
         intrinsics = camera[..., 0] if posed else camera
     parameters = Parametrisation.of(intrinsics, bow, skew)
     shared = parameters.pack(intrinsics).expand(*batch, -1).reshape(-1, parameters.size)
-    centers = intrinsics.K[..., :2, 2].expand(*batch, 2).reshape(-1, 2)
-    given.check_resolution(centers, data.pixels, data.used, camera.size, data.views.size)
+    camera, held = camera.detach(), shared.detach()
+    given.check_resolution(held[:, 2:4], data.pixels, data.used, camera.size, data.views.size)
     if posed:
         R, t = camera.R.expand(*batch, V, 3, 3), camera.t.expand(*batch, V, 3)
         # A view without enough corners takes no part: its pose may be anything.
@@ -70,8 +71,8 @@ def from_camera(
         R, t = R.reshape(-1, V, 3, 3), t.reshape(-1, V, 3)
         return shared, data.frame.pose(R, t), parameters
     task = data.task(parameters.lens, bow=parameters.bow, skew=parameters.skew)
-    poses = candidate_poses(task, shared)
-    return shared, poses[0] if len(poses) == 1 else best_pose(task, shared, poses), parameters
+    poses = candidate_poses(task, held)
+    return shared, poses[0] if len(poses) == 1 else best_pose(task, held, poses), parameters
 
 
 def poses_from_camera(task: Task, shared: Tensor) -> list[Pose]:

@@ -62,7 +62,7 @@ def held_at(reference: Tensor, shared: Tensor, parameters: Parametrisation, fixe
 def make_prior(
     priors: Priors | None, shared: Tensor, parameters: Parametrisation, batch: Sequence[int], tied_focal: bool
 ) -> Prior | None:
-    """The prior on the shared parameters; gradients flow to tensors among its values.
+    """The prior on the shared parameters; gradients flow to tensors among its values, and to those it is about.
 
     Focal lengths that are tied are one number: a prior on `focal` then is one measurement, of `f_x`.
 
@@ -71,7 +71,11 @@ def make_prior(
     """
     if not priors:
         return None
-    mean = shared.detach().clone()
+    told = [name for name, value in priors.items() if not isinstance(value, tuple)]
+    about = sorted({position for name in told for position in parameters.positions("priors", name)})
+    mean = shared.detach()
+    if about:
+        mean = mean.index_copy(1, torch.tensor(about, device=shared.device), shared[:, about])
     precision = torch.zeros_like(mean)
     for name, value in priors.items():
         where = parameters.positions("priors", name)
