@@ -150,8 +150,18 @@ def test_a_covariance_is_no_prior() -> None:
         dp.adjust(TRUE, LANDMARKS, priors={"position": ([2.0, -1.0], covariance)})
     with pytest.raises(ValueError, match="covariance"):
         dp.adjust(TRUE, LANDMARKS, priors={"position": [[0.1, -0.05], [-0.05, 0.1]]})
+    with pytest.raises(ValueError, match="covariance"):  # what errs together entirely
+        dp.adjust(TRUE, LANDMARKS, priors={"position": [[0.49, 0.07], [0.07, 0.01]]})
     two = dp.adjust(TRUE.expand(2), LANDMARKS, priors={"position": covariance})
     assert two.mounting.height.shape == (2,)
+
+
+@pytest.mark.parametrize("deviation", [0.3, 0.87, 1.74])
+def test_one_deviation_for_as_many_cameras_is_no_covariance(deviation: float) -> None:
+    """It was refused as one, or not, as its eigenvalues of 0 were rounded."""
+    several = dp.Seen(LANDMARKS.points, LANDMARKS.pixels.expand(3, -1, 2))
+    found = dp.adjust(TRUE, several, priors={"turn": torch.full((3, 3), deviation, dtype=D)})
+    assert found.mounting.height.shape == (3,)
 
 
 def test_the_level_of_a_shore_is_no_spare_residual() -> None:
