@@ -157,7 +157,7 @@ def _batch(camera: Camera, pieces: Sequence[Observation], known: Knowledge) -> t
                 raise ValueError(
                     f"{name}.residuals: want numbers that follow from the camera by PyTorch's functions, got a tensor "
                     "without a gradient, which tells nothing of the camera: no NumPy, float(), .item() or .detach() on "
-                    "the way"
+                    "the way, torch.where in the place of if, and 0 where there is no observation"
                 )
             shapes.append(found.shape[:-2])
     try:

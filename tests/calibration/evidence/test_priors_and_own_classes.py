@@ -136,8 +136,23 @@ def test_an_observation_without_a_gradient_is_refused() -> None:
         def residuals(self, camera: dp.Camera) -> torch.Tensor:
             return torch.zeros(*camera.batch_shape, 2, 1, dtype=D)
 
+    class Within:
+        def __init__(self, branch: bool) -> None:
+            self.branch = branch
+
+        def residuals(self, camera: dp.Camera) -> torch.Tensor:
+            off = (camera.center[..., 2:] - 9.0).unsqueeze(-1)
+            if self.branch:
+                return torch.full_like(off.detach(), 0.5) if bool((off < -1).all()) else off
+            return torch.where(off < -1, 0.5, off)
+
     with pytest.raises(ValueError, match=r"Cut.residuals: want numbers that follow from the camera"):
         dp.adjust(TRUE, [LANDMARKS, Cut([2.0, -1.0, 6.1], torch.eye(3).tolist())])
+    with pytest.raises(
+        ValueError, match=r"Within.residuals: want .*, torch.where in the place of if, and 0 where there"
+    ):
+        dp.adjust(TRUE, [LANDMARKS, Within(branch=True)])
+    assert bool(dp.adjust(TRUE, [LANDMARKS, Within(branch=False)]).converged)
     assert bool(dp.adjust(TRUE, [LANDMARKS, Nothing()]).converged)
     with torch.no_grad():
         assert bool(dp.adjust(TRUE, [LANDMARKS, Place([2.0, -1.0, 6.1], torch.eye(3).tolist())]).converged)
