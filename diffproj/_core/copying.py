@@ -36,8 +36,8 @@ def ordinary(tree: T) -> T:
 
 
 def with_ordinary(thing: T) -> T:
-    """A thing, or a copy of it, whose attributes are `ordinary`."""
-    new = thing
+    """A thing, or a copy of it, that is `ordinary` where it is a tree, and whose attributes are."""
+    new = thing = ordinary(thing)
     for name, value in list(_state(thing)):
         kept = ordinary(value)
         if kept is not value:

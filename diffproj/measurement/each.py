@@ -36,7 +36,8 @@ def checked_number(given: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tens
     """A function of a caller's from points to a number, which names what is wrong with it.
 
     Raises:
-        ValueError: it gives something else, or does what PyTorch cannot do for many points at once or differentiate.
+        ValueError: it gives something else, fails, or does what PyTorch cannot do for many points at once or
+            differentiate.
     """
 
     def checked(points: Tensor) -> Tensor:
@@ -45,7 +46,10 @@ def checked_number(given: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tens
         except torch.cuda.OutOfMemoryError:
             raise
         except RuntimeError as error:
-            reason = str(error)[:SHOWN].partition("\n")[0]
+            if failure := _failure(given, points):
+                k = points.shape[-2]
+                raise ValueError(f"function: want one of points ({k}, 3), got one that fails: {failure}") from error
+            reason = _short(error)
             raise ValueError(
                 "function: want one written in PyTorch's functions of the points, with torch.where in the place of if, "
                 f"and without .item(), float(), NumPy or writing to them; got one that fails: {reason}"
@@ -58,3 +62,17 @@ def checked_number(given: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tens
         return found
 
     return checked
+
+
+def _failure(given: Callable[[Tensor], Any], points: Tensor) -> str:
+    """Why a function fails on points that are neither differentiated nor batched; empty if it does not."""
+    numbers = torch.arange(1.0, 1 + points.shape[-2] * points.shape[-1], dtype=points.dtype, device=points.device)
+    try:
+        given(numbers.reshape(points.shape[-2:]).sqrt())  # no two alike, and no three on a line
+    except RuntimeError as error:
+        return "" if "data pointer" in str(error) else _short(error)  # NumPy's, which vmap refuses for any tensor
+    return ""
+
+
+def _short(error: Exception) -> str:
+    return str(error)[:SHOWN].partition("\n")[0]

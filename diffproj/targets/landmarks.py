@@ -18,6 +18,9 @@ FINEST = 1e-5
 DEGREES_SPREAD, DEGREES_PART = 0.05, 1e-3
 """Spread of coordinates, on both axes, below which they may be degrees (0.05 degrees are some kilometres), and relative
 to their size: metres of a place this far from their origin spread further."""
+POLE_PART, WHOLE = 0.1, 1e-6
+"""How far off one line marks on a pole may be, as a part of how far it leans; and their x and y off whole thousandths,
+beside rounding."""
 
 
 class Landmarks(Copied, Shown):
@@ -128,11 +131,12 @@ def refuse_degrees(name: str, points: Tensor) -> None:
     """
     along = points[:, :2].to(torch.float64)
     middle, spread = along.abs().mean(0), points.amax(0) - points.amin(0)
-    turned = along % 360  # on both sides of the date line they are neighbours
-    across = torch.minimum(spread[:2].to(torch.float64), turned.amax(0) - turned.amin(0))
+    turned, line = along % 360, along.abs() - 180
+    beside = (line.abs() < DEGREES_SPREAD).all(0) & (line != 0).any(0)  # the date line; lengths may be 180 themselves
+    across = torch.where(beside, turned.amax(0) - turned.amin(0), spread[:2].to(torch.float64))
     angles = bool((middle <= middle.new_tensor([180.0, 180.0])).all()) and bool((middle <= 90).any())
     small = (across < DEGREES_SPREAD).all() & (across < DEGREES_PART * middle.amax()).all()
-    upright = len(points) < 4 and bool(spread[2] > spread[:2].amax())  # the foot and the top of a mast
+    upright = bool(spread[2] > spread[:2].amax()) and (len(points) < 4 or _is_pole(points))
     apart = float(spread[:2].amax()) > 0  # not several places up one mast
     if angles and bool(small) and not upright and apart and float(middle.amax()) > 1 and float(middle.amin()) > 0:
         raise ValueError(
@@ -140,6 +144,21 @@ def refuse_degrees(name: str, points: Tensor) -> None:
             f"({along[0, 0]:.5f}, {along[0, 1]:.5f}): dp.metres_from_degrees converts them, latitude first; if they "
             "are lengths, subtract an origin"
         )
+
+
+def _is_pole(points: Tensor) -> bool:
+    """Whether points `(N, 3)`, higher than wide, are marks on a pole or a staff, be it one that leans.
+
+    They are where they lie on one line, or where x and y are whole millimetres: in degrees that would be 100 m.
+    """
+    rounding = torch.finfo(points.dtype).eps * float(points[:, :2].abs().amax())
+    points = points.to(torch.float64)
+    along = points[:, :2]
+    off = points - points.mean(0)
+    slope = (off[:, 2:] * off).sum(0) / off[:, 2].square().sum()
+    aside = (off - off[:, 2:] * slope).abs().amax()
+    on_line = aside < POLE_PART * (along.amax(0) - along.amin(0)).amax()
+    return bool(on_line) or bool(((along - along.round(decimals=3)).abs() < WHOLE + rounding).all())
 
 
 def _checked_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:

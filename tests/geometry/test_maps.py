@@ -168,6 +168,14 @@ def test_east_and_north_exchanged_are_refused_on_the_way_back() -> None:
     assert dp.degrees_from_metres([[0.0, 8399737.9]], "EPSG:3857").tolist()[0] == pytest.approx([60, 0], abs=1e-6)
 
 
+def test_within_a_maps_area_the_way_back_asks_for_no_lengths(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They took three times as long as the places themselves."""
+    pyproj = pytest.importorskip("pyproj")
+    monkeypatch.setattr(pyproj, "Proj", lambda *_: pytest.fail("lengths"))
+    found = dp.degrees_from_metres([[440291.53, 4474254.98], [440300.0, 4474300.0]], "EPSG:32630")
+    assert found[0].tolist() == pytest.approx([40.41678, -3.70379], abs=1e-5)
+
+
 def test_a_map_that_is_none_is_refused_and_a_gradient_is_no_warning() -> None:
     pytest.importorskip("pyproj")
     with pytest.raises(ValueError, match="crs: want a map that pyproj can work out, got WGS 84 / UTM grid system"):

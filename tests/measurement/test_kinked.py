@@ -128,3 +128,19 @@ def test_a_function_that_is_not_pytorchs_is_refused_by_name(function: Callable[.
     measured = dp.measure(torch.tensor([[300.0, 200], [200, 210]], dtype=D), FRONTAL, dp.Plane.z(0.0), pixel_sigma=0.5)
     with pytest.raises(ValueError, match=f"function: want one written in PyTorch's functions.*{reason}"):
         measured.quantity(function, [[0, 1]])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("function", "reason"),
+    [
+        (lambda p: p[0] @ torch.ones(2, dtype=D), "size mismatch|inconsistent tensor size"),
+        (lambda p: p[0] @ torch.ones(3), "dtype|same"),
+        (lambda p: p.reshape(7).sum(), "invalid for input of size 6"),
+    ],
+    ids=["shape", "dtype", "reshape"],
+)
+def test_a_function_that_fails_on_points_is_told_why(function: Callable[..., object], reason: str) -> None:
+    """It was told to be written in PyTorch's functions, as it is."""
+    measured = dp.measure(torch.tensor([[300.0, 200], [200, 210]], dtype=D), FRONTAL, dp.Plane.z(0.0), pixel_sigma=0.5)
+    with pytest.raises(ValueError, match=rf"function: want one of points \(2, 3\), got one that fails: .*({reason})"):
+        measured.quantity(function, [[0, 1]])  # type: ignore[arg-type]

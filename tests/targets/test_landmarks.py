@@ -7,6 +7,10 @@ import torch
 import diffproj as dp
 
 SQUARE = [[0.0, 0.0], [1.8, 0.0], [1.8, 4.6], [0.0, 4.6]]
+# Marks on a levelling staff that leans by 2 cm, in metres, as measured and as computed.
+STAFF = np.array([[20, 30, 0], [20.004, 30.002, 0.5], [20.008, 30.005, 1], [20.013, 30.008, 1.5], [20.018, 30.01, 2]])
+LEANING = np.array([20.0, 30.0, 0.0]) + np.outer(np.linspace(0, 2, 6), [0.004321, -0.0012347, 1])
+FACADE = np.array([[-180.0, 50, 0], [180, 50, 0], [180, 50, 200], [-180, 50, 200]])  # 360 cm wide
 
 
 def test_lists_arrays_and_tensors_are_taken_alike() -> None:
@@ -63,6 +67,11 @@ def test_the_line_is_short() -> None:
         ([[54.1753, 12.0812], [54.1755, 12.0815], [54.1751, 12.0817], [54.1750, 12.0811]], "latitude and longitude"),
         ([[-17.0, 179.9995], [-17.0001, -179.9995], [-17.0002, 179.9999], [-17.0001, -179.9999]], "latitude"),
         ([[-79.382, 43.653, 80], [-79.381, 43.652, 95], [-79.380, 43.654, 90], [-79.3815, 43.655, 81]], "latitude"),
+        (
+            [[-79.3820, 43.65301, 80], [-79.3821, 43.65302, 81], [-79.382, 43.65304, 82.5], [-79.3822, 43.653, 84]],
+            "lat",
+        ),
+        ([[180.0, -17, 0], [-179.9995, -17.0001, 2], [180.0, -17.0002, 0], [-179.9999, -17.0001, 0]], "latitude"),
     ],
 )
 def test_points_that_cannot_be(points: object, message: str) -> None:
@@ -79,11 +88,21 @@ def test_points_that_cannot_be(points: object, message: str) -> None:
         np.array(SQUARE) * 0.01 + [150.0, 300.0],
         np.array(SQUARE) + np.array([43.6, 79.4]),  # a hall
         np.column_stack([SQUARE, [1.0, 2, 3, 4]]) + np.array([3.78e6, 9.0e5, 5.04e6]),  # earth-centred
+        STAFF,
+        STAFF[:, [1, 0, 2]].astype(np.float32),
+        LEANING,
+        np.array([[20.0, 30.001, 0], [20.001, 30, 0.5], [20, 30.001, 1], [20.001, 30, 1.5]]),  # off by rounding
+        np.array([[80.0, 30.001, 0], [80.001, 30, 1], [80, 30.001, 2], [80.001, 30, 3]], dtype=np.float32),
+        FACADE,
+        FACADE[:, [1, 0, 2]],
+        np.array([[0.0, 50, 0], [360, 50, 0], [360, 50, 200], [0, 50, 200]]),
     ],
 )
 def test_lengths_are_not_taken_for_degrees(points: np.ndarray) -> None:
     """Nor refused for being far away."""
-    assert dp.Landmarks(points).points.shape == (4, 3)
+    assert dp.Landmarks(points).points.shape == (len(points), 3)
+    pixels = torch.zeros(len(points), 2)
+    assert len(dp.Seen(torch.as_tensor(points), pixels, pixel_sigma=1.0)) == len(points)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])

@@ -150,14 +150,14 @@ def _batch(camera: Camera, pieces: Sequence[Observation], known: Knowledge) -> t
         values = parameters.pack(camera.detach()).reshape(-1, len(parameters.names)).requires_grad_()
         moving = parameters.unpack(values, camera.batch_shape, camera.size)
         for piece in pieces:
-            found, name = piece.residuals(moving), type(piece).__name__
+            found, name = _residuals(piece, moving), type(piece).__name__
             if not isinstance(found, Tensor) or found.ndim < 2 or not found.is_floating_point():
                 raise ValueError(f"{name}.residuals: want a tensor (*B, M, k) of numbers, got {called(found)}")
             if moving.K.requires_grad and not found.requires_grad and bool((found != 0).any()):
                 raise ValueError(
                     f"{name}.residuals: want numbers that follow from the camera by PyTorch's functions, got a tensor "
                     "without a gradient, which tells nothing of the camera: no NumPy, float(), .item() or .detach() on "
-                    "the way"
+                    "the way, torch.where in the place of if, and 0 where there is no observation"
                 )
             shapes.append(found.shape[:-2])
     try:
@@ -168,6 +168,18 @@ def _batch(camera: Camera, pieces: Sequence[Observation], known: Knowledge) -> t
     if 0 in batch:
         raise ValueError(f"priors, observations: want them of at least one camera, got batch shape {batch}")
     return batch
+
+
+def _residuals(piece: Observation, camera: Camera) -> Tensor:
+    try:
+        return piece.residuals(camera)
+    except RuntimeError as error:
+        if "nference tensor" not in str(error):
+            raise
+        raise ValueError(
+            f"{type(piece).__name__}.residuals: want tensors with derivatives, got some made in inference_mode, "
+            "which have none: make its tensors outside of inference_mode, or clone() them in residuals"
+        ) from error
 
 
 def _outcome(

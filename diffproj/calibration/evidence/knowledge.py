@@ -225,7 +225,9 @@ def _check_no_covariance(name: str, given: Tensor, batch: Sequence[int]) -> None
     n = given.shape[-1]
     if n < 2 or given.shape != (n, n) or (tuple(batch[-1:]) == (n,) and bool((given > 0).all())):
         return
-    if bool((given == given.mT).all()) and bool((torch.linalg.eigvalsh(given) > 0).all()):
+    if bool((given == given[0, 0]).all()):  # one deviation for all of n cameras
+        return
+    if bool((given == given.mT).all()) and bool((torch.linalg.eigvalsh(given) >= -1e-9 * given.abs().amax()).all()):
         raise ValueError(
             f"priors: want standard deviations for {name!r}, ({n},) or (*B, {n}), got what looks like a covariance "
             f"({n}, {n}): what errs together is told by an observation of your own, as help(dp.Observation) shows; if "

@@ -1,5 +1,8 @@
 """What is found from evidence in `torch.inference_mode`, which takes no derivatives, is what is found outside of it."""
 
+from types import SimpleNamespace
+from typing import NamedTuple
+
 import pytest
 import torch
 
@@ -76,3 +79,43 @@ def test_inference_mode_changes_nothing(find: object) -> None:
         told_outside, given_outside, all_inside = figures(outside), figures(find(GIVEN)), figures(find(scene()))  # type: ignore[operator]
     for got in (told_outside, given_outside, all_inside):
         torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-12)
+
+
+class Told(NamedTuple):
+    """The same as a tuple."""
+
+    place: torch.Tensor
+    weight: torch.Tensor
+
+    def residuals(self, camera: dp.Camera) -> torch.Tensor:
+        return ((camera.center - self.place) * self.weight).unsqueeze(-2)
+
+
+class Deep:
+    """The same with its tensors where they are not looked for."""
+
+    def __init__(self, place: torch.Tensor, weight: torch.Tensor, clone: bool = False) -> None:
+        self.inner, self.clone = SimpleNamespace(place=place, weight=weight), clone
+
+    def residuals(self, camera: dp.Camera) -> torch.Tensor:
+        weight = self.inner.weight.clone() if self.clone else self.inner.weight
+        return ((camera.center - self.inner.place) * weight).unsqueeze(-2)
+
+
+def test_tensors_of_an_observation_of_ones_own_are_told_of_or_copied() -> None:
+    """PyTorch spoke of saving them for backward."""
+
+    def spread(observation: dp.Observation) -> torch.Tensor:
+        known = {"tilt": 1.0, "roll": 1.0, "heading": 1.0}
+        return dp.adjust(GIVEN[0], [observation], priors=known).mounting_covariance
+
+    place, weight = torch.tensor([2.0, -1.0, 6.0], dtype=D), torch.full((3,), 2.0, dtype=D)
+    want = spread(Deep(place, weight))
+    with torch.inference_mode():
+        place, weight = place + 0, weight + 0
+        for each in (Told(place, weight), Deep(place, weight, clone=True)):
+            torch.testing.assert_close(spread(each), want)
+        with pytest.raises(
+            ValueError, match=r"Deep.residuals: want .*make its tensors outside of inference_mode, or cl"
+        ):
+            spread(Deep(place, weight))

@@ -136,8 +136,23 @@ def test_an_observation_without_a_gradient_is_refused() -> None:
         def residuals(self, camera: dp.Camera) -> torch.Tensor:
             return torch.zeros(*camera.batch_shape, 2, 1, dtype=D)
 
+    class Within:
+        def __init__(self, branch: bool) -> None:
+            self.branch = branch
+
+        def residuals(self, camera: dp.Camera) -> torch.Tensor:
+            off = (camera.center[..., 2:] - 9.0).unsqueeze(-1)
+            if self.branch:
+                return torch.full_like(off.detach(), 0.5) if bool((off < -1).all()) else off
+            return torch.where(off < -1, 0.5, off)
+
     with pytest.raises(ValueError, match=r"Cut.residuals: want numbers that follow from the camera"):
         dp.adjust(TRUE, [LANDMARKS, Cut([2.0, -1.0, 6.1], torch.eye(3).tolist())])
+    with pytest.raises(
+        ValueError, match=r"Within.residuals: want .*, torch.where in the place of if, and 0 where there"
+    ):
+        dp.adjust(TRUE, [LANDMARKS, Within(branch=True)])
+    assert bool(dp.adjust(TRUE, [LANDMARKS, Within(branch=False)]).converged)
     assert bool(dp.adjust(TRUE, [LANDMARKS, Nothing()]).converged)
     with torch.no_grad():
         assert bool(dp.adjust(TRUE, [LANDMARKS, Place([2.0, -1.0, 6.1], torch.eye(3).tolist())]).converged)
@@ -150,8 +165,18 @@ def test_a_covariance_is_no_prior() -> None:
         dp.adjust(TRUE, LANDMARKS, priors={"position": ([2.0, -1.0], covariance)})
     with pytest.raises(ValueError, match="covariance"):
         dp.adjust(TRUE, LANDMARKS, priors={"position": [[0.1, -0.05], [-0.05, 0.1]]})
+    with pytest.raises(ValueError, match="covariance"):  # what errs together entirely
+        dp.adjust(TRUE, LANDMARKS, priors={"position": [[0.49, 0.07], [0.07, 0.01]]})
     two = dp.adjust(TRUE.expand(2), LANDMARKS, priors={"position": covariance})
     assert two.mounting.height.shape == (2,)
+
+
+@pytest.mark.parametrize("deviation", [0.3, 0.87, 1.74])
+def test_one_deviation_for_as_many_cameras_is_no_covariance(deviation: float) -> None:
+    """It was refused as one, or not, as its eigenvalues of 0 were rounded."""
+    several = dp.Seen(LANDMARKS.points, LANDMARKS.pixels.expand(3, -1, 2))
+    found = dp.adjust(TRUE, several, priors={"turn": torch.full((3, 3), deviation, dtype=D)})
+    assert found.mounting.height.shape == (3,)
 
 
 def test_the_level_of_a_shore_is_no_spare_residual() -> None:
