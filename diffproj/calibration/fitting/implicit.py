@@ -58,14 +58,14 @@ def check_differentiable(data: Data, options: Options) -> None:
         )
 
 
-def differentiated(found: Fit, data: Data, prior: Prior | None, options: Options, own: Tensor) -> Fit:
+def differentiated(found: Fit, data: Data, prior: Prior | None, options: Options, given: Tensor) -> Fit:
     """The same fit, with shared parameters and poses differentiable by pixels, points, weights and priors.
 
-    And by the camera's own values `(P, s)`, without points, where parameters are held at these or tied by them.
+    And by those that the camera was given with `(P, few)`, where parameters are held at these or tied by them.
     """
     printed = None if data.surveyed(options.shape) else printing_precision(options.priors, data.batch, data.points)
     task, solution = found.task, found.solution
-    base, basis = _following(task.basis, solution.shared, own, options.tied_focal)
+    base, basis = _following(task.basis, solution.shared, given, options.tied_focal)
     sources = [data.given_pixels, data.given_points, data.given_weights, printed, base, *(prior or ())]
     if not any(source is not None and source.requires_grad for source in sources):
         return found
