@@ -148,9 +148,10 @@ def located(
     calibration = camera if isinstance(camera, Calibration) else None
     if isinstance(camera, Calibration):
         camera = camera.camera
-    camera = as_camera(camera).detach()
+    camera = as_camera(camera)
     skew = calibration is not None and calibration.skew
     shared, _, parameters = start.from_camera(camera, data, bow=False, skew=skew, with_poses=False)
+    shared = shared.detach()
     if isinstance(shaped, Calibration):
         shared, parameters = _with_shape(shared, parameters, data, shaped)
     model: dict[str, Any] = {"bow": parameters.bow, "skew": parameters.skew, "free": parameters.points > 0}

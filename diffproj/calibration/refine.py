@@ -71,7 +71,7 @@ def refine(
         )
     differentiable = flag("differentiable", differentiable)
     chosen = calibration_options("refine", options)
-    beginning = as_camera(camera) if differentiable else as_camera(camera).detach()
+    beginning = as_camera(camera)
 
     def fit(views: Views) -> Calibration:
         data = Data(views, target, chosen.weights, chosen.pixel_sigma)
@@ -79,6 +79,7 @@ def refine(
         if differentiable:
             check_differentiable(data, chosen)
         own, local, parameters = start.from_camera(beginning, data, chosen.bow, chosen.skew)
+        own = own if differentiable else own.detach()
         begin = begun(data, chosen, parameters, own.detach(), local, own)
         found, prior = begin.minimum(chosen), begin.prior
         found, prior = with_free_points(found, data, chosen, prior)

@@ -890,6 +890,7 @@ def test_bad_input_is_refused_by_name() -> None:
         (ValueError, "camera: want a batch shape that broadcasts", lambda: dp.refine(views, board, truth[:3])),
         (ValueError, "K: want an image that is not turned against", lambda: dp.refine(views, board, turned)),
         (TypeError, "camera: want a pinhole", lambda: dp.refine(views, board, dp.Camera(K, distortion=other()))),
+        (TypeError, "camera: want a pinhole", lambda: dp.locate(views, board, dp.Camera(K, distortion=other()))),
         (
             ValueError,
             r"camera: want the size of the photographs, \(640, 480\)",
