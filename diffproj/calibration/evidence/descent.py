@@ -15,6 +15,7 @@ from diffproj.calibration.evidence.pose_parameters import PoseParameters
 from diffproj.calibration.evidence.problem import Evidence, Losses
 from diffproj.calibration.evidence.undetermined import natural
 from diffproj.calibration.least_squares.solver import Prior, Status, solve
+from diffproj.calibration.problem.constraints import ratio_only
 from diffproj.geometry.camera import Camera
 
 NEGLIGIBLE = 1e-18
@@ -209,11 +210,8 @@ def differentiated(task: Task, found: Found) -> Tensor:
         moving = torch.zeros(own.shape[-1], dtype=torch.bool, device=own.device)
         moving[list(task.known.columns)] = True
         base = torch.where(moving, found.values.detach(), own)
-        if task.known.tied:  # f_y follows f_x by the camera's own ratio, along the first direction
-            ratio = own[:, 1] / own[:, 0]
-            slope = torch.zeros_like(T[:1])
-            slope[0, 1, 0] = 1.0
-            turned = slope * (ratio - ratio.detach())[:, None, None]
+        if task.known.tied:  # f_y follows f_x by the camera's own ratio
+            turned = ratio_only(own, T)
             base, T = base + turned[..., 0] * found.values[:, :1].detach(), T + turned
         _, gradient, H = _second_order(task, found.parameters, T, base, task.known.prior(own, task.batch))
         step = -torch.linalg.solve_ex(H, gradient.unsqueeze(-1))[0]

@@ -27,7 +27,7 @@ from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.least_squares.solver import Prior
 from diffproj.calibration.problem.bow import bowed
-from diffproj.calibration.problem.constraints import of_points, printing_precision
+from diffproj.calibration.problem.constraints import of_points, printing_precision, ratio_only
 from diffproj.calibration.problem.parametrisation import POSE, moved
 from diffproj.calibration.problem.shape import block_diagonal
 from diffproj.targets.residuals import projected_minus_seen, put_back_minus_known
@@ -124,10 +124,7 @@ def _following(basis: Tensor | None, shared: Tensor, own: Tensor, tied: bool) ->
     held = (basis[:, :few] == 0).all(-1).all(0)
     step = torch.where(held, own - own.detach(), 0.0)
     if tied and not bool(held[:2].any()):
-        ratio = own[:, 1] / own[:, 0]
-        slope = torch.zeros_like(basis[:1])
-        slope[0, 1, 0] = 1.0  # f_x is the first direction: see `free_basis`
-        turned = slope * (ratio - ratio.detach())[:, None, None]
+        turned = ratio_only(own, basis)
         basis, step = basis + turned, step + turned[:, :few, 0] * shared[:, :1]
     elif not bool(held.any()):
         return shared, basis

@@ -45,6 +45,17 @@ def free_basis(shared: Tensor, parameters: Parametrisation, fixed: Sequence[str]
     return basis
 
 
+def ratio_only(own: Tensor, basis: Tensor) -> Tensor:
+    """Zero, shaped as the basis, with the first derivative of one of tied focal lengths by those of `own (P, s)`.
+
+    f_x is the first direction of the basis, and f_y follows it.
+    """
+    ratio = own[:, 1] / own[:, 0]
+    place = torch.zeros_like(basis[:1])
+    place[0, 1, 0] = 1.0
+    return place * (ratio - ratio.detach())[:, None, None]
+
+
 def held_at(reference: Tensor, shared: Tensor, parameters: Parametrisation, fixed: Sequence[str]) -> Tensor:
     """The start `(P, s)` with fixed parameters at the values that they keep.
 
