@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import diffproj as dp
+from tests.nn.processes import one_of
 
 D = torch.float64
 EVERY = ("focal", "principal_point", "distortion", "pose", "plane")
@@ -141,14 +142,13 @@ def _gradients(device: str) -> tuple[torch.nn.Module, torch.Tensor]:
 
 
 def _worker(rank: int, backend: str, world: int, address: str, result: str) -> None:
-    torch.distributed.init_process_group(backend, init_method=f"file://{address}", rank=rank, world_size=world)
-    projector, pixels = _gradients("cpu" if backend == "gloo" else f"cuda:{rank}")
-    parallel = torch.nn.parallel.DistributedDataParallel(projector)
-    points, valid = parallel(pixels[rank] if world == 2 else pixels)
-    dp.PlaneLoss()(points, torch.zeros_like(points), valid).backward()
-    if rank == 0:
-        torch.save([p.grad.cpu() for p in projector.parameters()], result)
-    torch.distributed.destroy_process_group()
+    with one_of(world, rank, address, backend):
+        projector, pixels = _gradients("cpu" if backend == "gloo" else f"cuda:{rank}")
+        parallel = torch.nn.parallel.DistributedDataParallel(projector)
+        points, valid = parallel(pixels[rank] if world == 2 else pixels)
+        dp.PlaneLoss()(points, torch.zeros_like(points), valid).backward()
+        if rank == 0:
+            torch.save([p.grad.cpu() for p in projector.parameters()], result)
 
 
 @pytest.mark.plain

@@ -8,6 +8,7 @@ import torch
 
 import diffproj as dp
 from diffproj.geometry.cayley import turned
+from tests.nn.processes import one_of
 
 D = torch.float64
 BOARD = dp.Chessboard(4, 3, 30.0)
@@ -200,13 +201,12 @@ def _pixels() -> torch.Tensor:
 
 
 def _worker(rank: int, address: str, result: str) -> None:
-    torch.distributed.init_process_group("gloo", init_method=f"file://{address}", rank=rank, world_size=2)
-    torch.manual_seed(0)
-    parallel = torch.nn.parallel.DistributedDataParallel(Errors())
-    parallel(_pixels()[rank]).backward()
-    if rank == 0:
-        torch.save([parameter.grad for parameter in parallel.parameters()], result)
-    torch.distributed.destroy_process_group()
+    with one_of(2, rank, address):
+        torch.manual_seed(0)
+        parallel = torch.nn.parallel.DistributedDataParallel(Errors())
+        parallel(_pixels()[rank]).backward()
+        if rank == 0:
+            torch.save([parameter.grad for parameter in parallel.parameters()], result)
 
 
 @pytest.mark.slow
