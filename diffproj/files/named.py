@@ -100,6 +100,12 @@ def holds_lens(mapping: dict[str, Any]) -> bool:
     return any(_parted(key)[1] in LENSES and hasattr(value, "__len__") for key, value in mapping.items())
 
 
+def names_lens(key: str) -> bool:
+    """Whether a key, or the stem of a file's name, is that of a lens."""
+    plain = re.sub(r"[^a-z0-9]", "", key.lower())
+    return _parted(key)[1] in LENSES or re.search("dist|coef|lens", plain) is not None
+
+
 def misfit(mapping: dict[str, Any]) -> str:
     """What stands under a name of K and is none, in words; empty where there is nothing of the kind."""
     for key, value in mapping.items():

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 import diffproj as dp
+from tests.files.samples import SAMPLES, npy
 from tests.files.test_readers import load, numbers, poses
 
 K = [[600.0, 0.0, 320.0], [0.0, 610.0, 240.0], [0.0, 0.0, 1.0]]
@@ -136,3 +137,24 @@ def test_k_of_nuscenes_name_without_a_pose_is_a_plain_one(tmp_path: Path) -> Non
 def test_calibdb_s_rectilinear_lens_is_opencvs(tmp_path: Path) -> None:
     tree = {"camera_matrix": K, "distortion_coefficients": D, "distortion_model": "rectilinear", "img_size": [640, 480]}
     assert numbers(load(tmp_path, "plain.json", json.dumps(tree)))[1] == D
+
+
+@pytest.mark.parametrize("beside", ["D", "d", "kc", "lens", "dst"])
+def test_a_lens_in_an_array_beside_that_of_k_is_not_dropped(tmp_path: Path, beside: str) -> None:
+    np.save(tmp_path / f"{beside}.npy", np.array([D]))
+    with pytest.raises(ValueError, match=rf"want the lens with its camera matrix, got it in {beside}\.npy beside it"):
+        load(tmp_path, "K.npy", npy(np.array(K)))
+    (tmp_path / f"{beside}.npy").unlink()
+    np.save(tmp_path / "boxes.npy", np.array([10.0, 20.0, 30.0, 40.0]))
+    np.save(tmp_path / "labels.npy", np.arange(5))
+    assert numbers(load(tmp_path, "K.npy", npy(np.array(K))))[0] == [600.0, 610.0, 320.0, 240.0]
+
+
+def test_a_second_camera_in_a_document_of_its_own_is_not_dropped(tmp_path: Path) -> None:
+    text = SAMPLES["ost.yaml"].decode()
+    want = load(tmp_path, "ost.yaml").K
+    for again in ("", text, "header: {seq: 2}\n" + text, "camera_matrix: {rows: 3, co"):
+        assert (want == load(tmp_path, "ost.yaml", f"{text}---\n{again}").K).all()
+    other = text.replace("camera_name: ", "camera_name: other_")
+    with pytest.raises(ValueError, match="camera_name: want one document, got another behind '---'; split the file"):
+        load(tmp_path, "ost.yaml", f"{text}---\n{other}")
