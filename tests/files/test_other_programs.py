@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 import diffproj as dp
+from diffproj.files.names import FormatName
 from tests.files.samples import SAMPLES, npy
 from tests.files.test_readers import load, numbers, poses
 
@@ -158,3 +159,19 @@ def test_a_second_camera_in_a_document_of_its_own_is_not_dropped(tmp_path: Path)
     other = text.replace("camera_name: ", "camera_name: other_")
     with pytest.raises(ValueError, match="camera_name: want one document, got another behind '---'; split the file"):
         load(tmp_path, "ost.yaml", f"{text}---\n{other}")
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [("a.yml", "opencv"), ("a.xml", "opencv"), ("a.yaml", "kalibr"), ("a.yaml", "ros"), ("a.npz", "numpy")],
+)
+def test_a_mirrored_camera_is_not_written_where_no_reader_takes_it(
+    tmp_path: Path, name: str, known: FormatName
+) -> None:
+    """The file was written, and refused when it was to be loaded."""
+    flip = np.array([[-1.0, 0, 639], [0, 1, 0], [0, 0, 1]])
+    camera = dp.Camera(np.array(K), size=(640, 480)).warped(flip)
+    with pytest.raises(ValueError, match=r"K: want positive focal lengths, which .* got a mirrored image; use \.json"):
+        dp.save_camera(tmp_path / name, camera, format=known)
+    dp.save_camera(tmp_path / "a.json", camera)
+    assert dp.load_camera(tmp_path / "a.json").K[0, 0] == -600
