@@ -2,7 +2,8 @@
 
 `pinhole` with `radtan` (k1 k2 p1 p2) or `equidistant` (Kannala-Brandt); integer pixel centres; `resolution` is width,
 height. `T_cam_imu` takes IMU to camera, so the world is the IMU; without it, `T_cn_cnm1` takes the camera before to
-this one, and the world is the first camera. `T_imu_cam`, `T_BS` and `body_T_cam0` run the other way.
+this one, and the world is the first camera. `T_imu_cam`, `T_BS` and `body_T_cam0` run the other way. Cameras are in
+the order of their numbers; Kalibr writes them in that of the alphabet, cam10 before cam2.
 """
 
 import re
@@ -15,13 +16,16 @@ from diffproj.calibration.results.calibration import Calibration
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import coefficients, first_brown, is_fisheye, kind_of, lens_of
+from diffproj.files.named import check_no_lens_key
 from diffproj.files.numbers import camera_of, focal_lengths, image_size, inverse, matrix, rigid, vector
+from diffproj.files.poses_beside import unread as unread_poses
 from diffproj.files.writing import cameras_of, number_text, numbers_text
 from diffproj.geometry.camera import Camera
 
 Pose = tuple[np.ndarray, np.ndarray]
 INTO_CAMERA = ("T_cam_imu",)
 FROM_CAMERA = ("T_imu_cam", "T_BS")
+_NUMBERED = re.compile(r"cam(\d+)").fullmatch
 
 
 def recognises(document: Document) -> bool:
@@ -37,10 +41,14 @@ def read(document: Document) -> Found:
     """
     cameras = _cameras(document.mapping)
     for name, fields in document.mapping.items():
-        if isinstance(fields, dict) and re.fullmatch(r"cam\d+", str(name)) and name not in cameras:
+        if isinstance(fields, dict) and _NUMBERED(str(name)) and name not in cameras:
             raise ValueError(f"{name}: want intrinsics, with a camera_model or distortion_model, got none")
     poses = _poses(cameras)
-    return Found({name: _camera(name, fields, poses.get(name)) for name, fields in cameras.items()})
+    found = {name: _camera(name, fields, poses.get(name)) for name, fields in cameras.items()}
+    unread = [
+        f"{name}.{key}" for name, fields in cameras.items() if name not in poses for key in unread_poses(fields, set())
+    ]
+    return Found(found, unread=tuple(unread))
 
 
 def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
@@ -88,7 +96,14 @@ def _cameras(tree: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
     if fits(tree):
         return {"cam0": tree}
-    return {name: fields for name, fields in tree.items() if fits(fields)}
+    held = {name: fields for name, fields in tree.items() if fits(fields)}
+    return dict(sorted(held.items(), key=lambda item: _number(item[0]) or 0)) if all(map(_NUMBERED, held)) else held
+
+
+def _number(name: str) -> int | None:
+    """The number of a camera that is called `cam10` or the like."""
+    found = _NUMBERED(name)
+    return None if found is None else int(found[1])
 
 
 def _camera(name: str, fields: dict[str, Any], pose: Pose | None) -> Camera:
@@ -102,6 +117,9 @@ def _camera(name: str, fields: dict[str, Any], pose: Pose | None) -> Camera:
         raise ValueError(f"{name}: want a distortion_model, got none")
     kind = kind_of(f"{name}, distortion_model", fields["distortion_model"])
     key = "distortion_coeffs" if "distortion_coeffs" in fields else "distortion_coefficients"
+    for other, value in fields.items():
+        if other not in (key, "distortion_model"):
+            check_no_lens_key(other, value)
     if key not in fields and kind != "none":
         raise ValueError(f"{name}: want distortion_coeffs, got none")
     lens = matrix(f"{name}, {key}", fields.get(key, [])).ravel().tolist()
@@ -119,11 +137,15 @@ def _poses(cameras: dict[str, dict[str, Any]]) -> dict[str, Pose]:
     """The poses by name; empty where the file has none."""
     poses: dict[str, Pose] = {}
     before: Pose | None = None
+    names = list(cameras)
     for i, (name, fields) in enumerate(cameras.items()):
         own = _own_pose(name, fields)
         if own is None and fields.get("T_cn_cnm1") is not None:
             if i == 0:
                 raise ValueError(f"{name}, T_cn_cnm1: want a camera before the first one, got none")
+            number = _number(name)
+            if number is not None and _number(names[i - 1]) not in (None, number - 1):
+                raise ValueError(f"{name}, T_cn_cnm1: want cam{number - 1}, from which it leads, got none")
             R, t = rigid(f"{name}, T_cn_cnm1", fields["T_cn_cnm1"])
             R_before, t_before = (np.eye(3), np.zeros(3)) if before is None else before
             if before is None and i > 1:

@@ -3,8 +3,9 @@
 Equal to Brown-Conrady or to Kannala-Brandt are only those named here: under other names stand other equations.
 """
 
-from collections.abc import Sequence
-from typing import Literal
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal
 
 from diffproj.files.numbers import as_tensor, number
 from diffproj.geometry.camera import Camera
@@ -16,6 +17,7 @@ Kind = Literal["none", "brown", "fisheye"]
 _BROWN = (
     *("plumb_bob", "radtan", "radial_tangential", "brown", "brown_conrady", "rational_polynomial", "rational"),
     *("brown4", "brown5", "brown8", "brown12", "brown14", "opencv", "opencv4", "opencv5", "opencv8", "full_opencv"),
+    "rectilinear",  # of calibdb.net, beside OpenCV's five
 )
 _FISHEYE = (
     "equidistant",
@@ -41,6 +43,25 @@ PERSPECTIVE = ("pinhole", "perspective", "standard", "frame", "normal", "monocul
 COUNTS = BrownConrady.counts
 
 
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+MODELS = _words(
+    "distortionmodel cameramodel modeltype lensmodel fisheyemodel fisheye isfisheye distortiontype cameratype"
+)
+"""Keys that tell the lens, in lower case without what stands between words."""
+
+LOOSE = _words("cameratype model type lenstype projection projectiontype projectionmodel")
+"""Keys that may tell the lens, or what the camera is called or for: heeded where they name a lens, of whatever kind."""
+
+_LENS = re.compile(
+    r"fish ?eye|\bomni(?!vision)|\bequi(dist|rect|sol|$)|spherical|panoram|orthograph|stereograph|eucm|inverse"
+    r"|\bf ?theta|double sphere|division|^(mei|fov\d?|ds)$"
+)
+"""What names a lens; no maker or name of a camera is meant."""
+
+
 def kind_of(name: str, value: object) -> Kind | None:
     """Which lens a file's model is; `None` where it says no more than that the camera is perspective.
 
@@ -53,7 +74,7 @@ def kind_of(name: str, value: object) -> Kind | None:
     """
     if isinstance(value, bool | int | float) and value in (0, 1):  # fisheye_model: 0
         return "fisheye" if value else "brown"
-    model = str(value).strip().lower().replace("-", "_").replace(" ", "_")
+    model = _plain(value)
     if model in PERSPECTIVE:
         return None
     if model not in KINDS_BY_NAME:
@@ -62,6 +83,42 @@ def kind_of(name: str, value: object) -> Kind | None:
             "calibrate again with one of them"
         )
     return KINDS_BY_NAME[model]
+
+
+def told(fields: dict[str, Any], read: Iterable[str] = ()) -> dict[Kind, str]:
+    """Which lenses the keys of a mapping name, with the key that does so; see `MODELS` and `LOOSE`.
+
+    Args:
+        fields: the mapping.
+        read: keys that are read otherwise.
+
+    Raises:
+        ValueError: a model that is none of this package's.
+    """
+    kinds: dict[Kind, str] = {}
+    for key, value in fields.items():
+        plain = re.sub(r"[^a-z0-9]", "", key.lower())
+        if key in read or plain not in MODELS | LOOSE or value is None or value == "":
+            continue
+        if plain in LOOSE and not _names_lens(value, numbers=plain in MODELS):
+            continue
+        kind = kind_of(key, value)
+        if kind is not None:
+            kinds[kind] = key
+    return kinds
+
+
+def _names_lens(value: object, numbers: bool) -> bool:
+    """Whether a value under a loose key is the name of a lens, or its number where the key may have one."""
+    if not isinstance(value, str):
+        return numbers
+    model = _plain(value)
+    return model != "none" and (model in KINDS_BY_NAME or _LENS.search(model.replace("_", " ")) is not None)
+
+
+def _plain(value: object) -> str:
+    """The name of a model in lower case, with `_` between words."""
+    return str(value).strip().lower().replace("-", "_").replace(" ", "_")
 
 
 def brown(coefficients: Sequence[float]) -> BrownConrady:

@@ -5,13 +5,14 @@ A key that looks as if it held a lens and is not understood is an error: a lens 
 """
 
 import re
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from diffproj.files import poses_beside
 from diffproj.files.found import Found
-from diffproj.files.lenses import Kind, brown, kind_of, lens_of
+from diffproj.files.lenses import MODELS, Kind, brown, lens_of, told
 from diffproj.files.numbers import camera_of, described, image_size, intrinsics, matrix, shape_of
 from diffproj.geometry.camera import Camera
 from diffproj.lens.brown_conrady import BrownConrady
@@ -34,11 +35,8 @@ LENSES = _words(
 )
 SIZES = _words("cameraresolution imagesize imgsize resolution size framesize imageresolution")
 SIDES = (("imagewidth", "imageheight"), ("imgwidth", "imgheight"), ("width", "height"))
-MODELS = _words(
-    "distortionmodel cameramodel modeltype lensmodel fisheyemodel fisheye isfisheye distortiontype cameratype"
-)
 OMNIDIRECTIONAL = _words("xi mirrorparameters alpha gamma1 gamma2")
-COEFFICIENTS = _words("k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4 taux tauy r1 r2 t1 t2")
+COEFFICIENTS = _words("k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4 taux tauy r1 r2 t1 t2 d0 d1 d2 d3 d4 d5 d6 d7")
 
 _LABEL = re.compile(
     r"(?:(?P<front>left|right|cam\d*|camera\d+|proj|projector|rgb|colou?r|depth|ir|l|r)_)?"
@@ -99,7 +97,13 @@ def holds_matrix(mapping: dict[str, Any]) -> bool:
 
 def holds_lens(mapping: dict[str, Any]) -> bool:
     """Whether a lens stands in a mapping under one of the names."""
-    return any(_parted(key)[1] in LENSES for key in mapping)
+    return any(_parted(key)[1] in LENSES and hasattr(value, "__len__") for key, value in mapping.items())
+
+
+def names_lens(key: str) -> bool:
+    """Whether a key, or the stem of a file's name, is that of a lens."""
+    plain = re.sub(r"[^a-z0-9]", "", key.lower())
+    return _parted(key)[1] in LENSES or re.search("dist|coef|lens", plain) is not None
 
 
 def misfit(mapping: dict[str, Any]) -> str:
@@ -140,6 +144,31 @@ def check_no_lens(tree: Any, read_elsewhere: list[Any]) -> None:
             check_no_lens(item, read_elsewhere)
 
 
+def check_without_lens(fields: dict[str, Any], read: Iterable[str], what: str) -> None:
+    """Refuse a lens beside a camera of a format that has none, or has it elsewhere; one of zeros may be there.
+
+    Args:
+        fields: the mapping of the camera.
+        read: the keys that are read.
+        what: the format.
+
+    Raises:
+        ValueError: there is one, or the name of one that is not perspective.
+    """
+    others = {key: value for key, value in fields.items() if key not in read}
+    for kind, key in told(others).items():
+        if kind == "fisheye":
+            raise ValueError(f"{key}: want a camera without a fisheye lens, as {what} has it, got {others[key]!r}")
+    for key, value in others.items():
+        if isinstance(value, list) and not np.any(value):
+            continue
+        if _parted(key)[1] in LENSES and isinstance(value, list | dict):
+            raise ValueError(
+                f"{key}: want no lens, as {what} has it, got {described(value)}; build dp.Camera.from_opencv(K, dist)"
+            )
+        check_no_lens_key(key, value)
+
+
 def _parted(key: str) -> tuple[str, str]:
     """The label of a key, and its name in lower case without what stands between words."""
     words = re.sub(r"(?<=[a-z])([LR])$", r"_\1", key.strip())  # cameraMatrixL
@@ -167,6 +196,11 @@ def check_no_lens_key(key: str, value: Any) -> None:
         raise ValueError(
             f"{key}: want a perspective or fisheye lens of OpenCV, got the parameters of an omnidirectional model; "
             "calibrate again with one of them"
+        )
+    if plain in ("skew", "cameraskew") and isinstance(value, int | float | np.number) and value != 0:
+        raise ValueError(
+            f"{key}: want 0, or the skew in the camera matrix, got {value} beside one without; "
+            "dp.Camera(K, ...) takes it"
         )
     looks = re.search("dist|coef|radial|tangential|lens", plain) or plain == "kc"
     if (looks and isinstance(value, list | dict | np.ndarray | float)) or (
@@ -197,12 +231,7 @@ def _check_no_vector(key: str, value: Any) -> None:
 
 def _kind(mapping: dict[str, Any]) -> Kind | None:
     """The lens that the file names; `None` where it names none."""
-    kinds: dict[Kind, str] = {}
-    for key, value in mapping.items():
-        if re.sub(r"[^a-z0-9]", "", key.lower()) in MODELS and value is not None and value != "":
-            kind = kind_of(key, value)
-            if kind is not None:
-                kinds[kind] = key
+    kinds = told(mapping)
     if len(kinds) > 1:
         raise ValueError(f"{' and '.join(kinds.values())}: want one lens model, got {' and '.join(kinds)}")
     return next(iter(kinds), None)

@@ -16,7 +16,7 @@ import numpy as np
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.files.document import Document
 from diffproj.files.found import Found
-from diffproj.files.lenses import brown, coefficients, first_brown, fisheye, is_fisheye, unused
+from diffproj.files.lenses import brown, coefficients, first_brown, fisheye, is_fisheye, told, unused
 from diffproj.files.named import check_no_lens_key
 from diffproj.files.numbers import camera_of, focal_lengths, image_size, inverse, number, rigid
 from diffproj.files.writing import cameras_of
@@ -147,7 +147,11 @@ def _lens(fields: dict[str, Any]) -> Lens | None:
         value = fields.get(key)
         if value is not None and not (value == 0 or (isinstance(value, list) and not any(value))):
             raise ValueError(f"{key}: want 0 or none, got {value}: no camera of this package has it")
-    if model == "OPENCV_FISHEYE" or fields.get("is_fisheye") is True:
+    own = model == "OPENCV_FISHEYE" or fields.get("is_fisheye") in (True, 1)
+    elsewhere = told(fields, ("camera_model", "is_fisheye")).get("fisheye")
+    if elsewhere and not own:
+        raise ValueError(f"{elsewhere}: want OPENCV_FISHEYE as camera_model of a fisheye lens, got {model!r}")
+    if own:
         for key in ("p1", "p2"):
             unused(key, given.get(key), "OpenCV's fisheye lens has no tangential part")
         missing = [key for key in ("k1", "k2", "k3", "k4") if key not in given]

@@ -22,7 +22,7 @@ from diffproj.calibration.results.calibration import Calibration
 from diffproj.files import named
 from diffproj.files.document import Document
 from diffproj.files.found import Found
-from diffproj.files.lenses import coefficients, is_fisheye
+from diffproj.files.lenses import COUNTS, coefficients, is_fisheye
 from diffproj.files.numbers import camera_of, intrinsics, shape_of
 from diffproj.files.writing import has_pose, one_camera
 from diffproj.geometry.camera import Camera
@@ -30,6 +30,8 @@ from diffproj.geometry.camera import Camera
 NPY, NPZ = b"\x93NUMPY", b"PK\x03\x04"
 MOST_BYTES = 2**26
 """Of one array; larger ones hold photographs or corners, and are not looked at."""
+MOST_BYTES_OF_A_LENS = 1024
+"""With the header before its numbers."""
 
 HEADER_DAMAGE = (KeyError, TypeError, SyntaxError, ValueError, tokenize.TokenError, MemoryError, RecursionError)
 """What numpy raises where the header of an array, a Python literal, is none."""
@@ -83,12 +85,28 @@ def _alone(document: Document) -> Found:
         llff = ", the poses of LLFF" if isinstance(array, np.ndarray) and array.shape[1:] == (17,) else ""
         raise ValueError(f"want a camera matrix of 3 x 3, got {shape}{llff}; name the file of the camera matrix")
     for neighbour in sorted(document.path.parent.glob("*.npy")):
-        if neighbour.name != document.path.name and re.search("dist|coef", neighbour.stem.lower()):
+        if neighbour.name != document.path.name and (named.names_lens(neighbour.stem) or _holds_lens(neighbour)):
             raise ValueError(
                 f"want the lens with its camera matrix, got it in {neighbour.name} beside it, as it seems; "
                 "build dp.Camera.from_opencv(np.load(...), np.load(...))"
             )
     return Found({"camera": camera_of(intrinsics("camera matrix", array), None, None)})
+
+
+def _holds_lens(path: Path) -> bool:
+    """Whether a file holds as many numbers as a lens has; 4 may be anything, as a rectangle."""
+    try:
+        if path.stat().st_size > MOST_BYTES_OF_A_LENS:
+            return False
+        array = _array(path.name, path.read_bytes())
+    except (OSError, ValueError):
+        return False
+    return (
+        isinstance(array, np.ndarray)
+        and array.dtype.kind == "f"
+        and array.size == max(array.shape)
+        and array.size in COUNTS[1:]
+    )
 
 
 def _arrays(data: bytes) -> dict[str, Any]:

@@ -13,12 +13,13 @@ import numpy as np
 from diffproj.files.document import Document
 from diffproj.files.found import Found, one_or_more
 from diffproj.files.lenses import brown, unused
+from diffproj.files.named import check_without_lens
 from diffproj.files.numbers import camera_of, focal_lengths, from_quaternion, intrinsics, inverse, vector
 from diffproj.geometry.camera import Camera
 
 
 def recognises(document: Document) -> bool:
-    """Whether it is a list of sensors with `camera_intrinsic`, or has Argoverse's `camera_data_`."""
+    """Whether it is a list of sensors with `camera_intrinsic`, or one at its pose, or Argoverse's `camera_data_`."""
     try:
         tree = document.tree
     except ValueError:
@@ -46,7 +47,8 @@ def read(document: Document) -> Found:
 
 
 def _sensors(tree: Any) -> list[dict[str, Any]]:
-    items = [tree] if isinstance(tree, dict) else tree if isinstance(tree, list) else []
+    alone = isinstance(tree, dict) and ("rotation" in tree or "translation" in tree)
+    items = [tree] if alone else tree if isinstance(tree, list) else []
     fits = [item for item in items if isinstance(item, dict) and "camera_intrinsic" in item]
     return fits if len(fits) == len(items) else []
 
@@ -56,6 +58,7 @@ def _nuscenes(name: str, fields: dict[str, Any]) -> Camera:
         if key not in fields:
             raise ValueError(f"{name}: want {key}, got none")
     pose = _pose(fields["rotation"], fields["translation"])
+    check_without_lens(fields, ("camera_intrinsic", "camera_distortion"), "nuScenes")
     lens = None
     if fields.get("camera_distortion"):
         found = vector("camera_distortion", fields["camera_distortion"], (5, 6))

@@ -10,8 +10,11 @@ import numpy as np
 
 from diffproj.files.document import Document
 from diffproj.files.found import Found, one_or_more
+from diffproj.files.named import check_without_lens
 from diffproj.files.numbers import camera_of, image_size, intrinsics, rigid, vector
 from diffproj.geometry.camera import Camera
+
+KEYS = ("width", "height", "intrinsic_matrix", "class_name")
 
 
 def recognises(document: Document) -> bool:
@@ -42,6 +45,7 @@ def _is_intrinsic(fields: Any) -> bool:
 
 
 def _camera(fields: dict[str, Any], extrinsic: Any) -> Camera:
+    check_without_lens(fields, KEYS, "Open3D")
     K = np.array(vector("intrinsic_matrix", fields["intrinsic_matrix"], (9,))).reshape(3, 3).T
     pose = None
     if extrinsic is not None:

@@ -15,6 +15,7 @@ from diffproj.calibration.results.calibration import Calibration
 from diffproj.files import named, poses_beside
 from diffproj.files.document import Document
 from diffproj.files.found import Found
+from diffproj.files.writing import check_not_mirrored
 from diffproj.geometry.camera import Camera
 from diffproj.lens.kannala_brandt import KannalaBrandt
 
@@ -92,6 +93,7 @@ def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:
         if not np.array_equal(K, camera.K.numpy(force=True)):  # of a turned image: OpenCV's camera is turned instead
             remedy = "camera.upright().without_pose(), whose axes are those of the turned image"
         raise ValueError(f"OpenCV's formats hold no pose; use .json, or save {remedy}")
+    check_not_mirrored(camera.detach().upright(), "OpenCV")
     suffix = path.suffix.lower() if path.suffix.lower() in (".xml", ".json") else ".yml"
     storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     if camera.size is not None:

@@ -16,8 +16,9 @@ import numpy as np
 from diffproj.files import poses_beside
 from diffproj.files.document import Document
 from diffproj.files.found import Found
-from diffproj.files.lenses import brown, fisheye, kind_of
-from diffproj.files.named import check_no_lens, check_no_lens_key, holds_matrix
+from diffproj.files.lenses import brown, fisheye, kind_of, told
+from diffproj.files.named import check_no_lens, check_no_lens_key, holds_lens, holds_matrix
+from diffproj.files.named import read as read_named
 from diffproj.files.numbers import camera_of, focal_lengths, image_size, inverse, number, rigid
 from diffproj.files.stereo_rectifier import raw_cameras, raw_sides
 from diffproj.geometry.camera import Camera
@@ -57,6 +58,9 @@ def read(document: Document) -> Found:
     """
     tree = document.mapping
     fields = _cameras(tree)
+    plain = list(fields) == ["camera"] and fields["camera"] is tree
+    if plain and _is_whole(tree) and holds_lens(tree):
+        return _with_vector(tree)
     common = _common(fields)
     cameras = {name: _camera(common | own, None) for name, own in fields.items()}
     if raw_sides(tree) and len(cameras) == 1:
@@ -67,7 +71,6 @@ def read(document: Document) -> Found:
         second = list(cameras)[1]
         pose = inverse(rigid(poses[0], tree[poses[0]])) if poses else (np.eye(3), _along_x(tree[BASELINE]))
         cameras[second] = _camera(common | fields[second], pose)
-    plain = list(fields) == ["camera"] and fields["camera"] is tree
     return Found(cameras, unread=tuple(poses_beside.unread(tree, set())) if plain else ())
 
 
@@ -85,6 +88,13 @@ def _cameras(tree: dict[str, Any]) -> dict[str, dict[str, Any]]:
     if isinstance(tree.get("projection_parameters"), dict) and "model_type" in tree:
         return {"camera": tree}
     return {"camera": tree} if _is_whole(tree) else {}
+
+
+def _with_vector(tree: dict[str, Any]) -> Found:
+    """The camera of focal lengths one by one, and its lens as a vector under one of the names of `named`."""
+    K = focal_lengths(*(tree[key] for key in FOCAL))
+    rest = {key: value for key, value in tree.items() if key not in FOCAL}
+    return read_named({**rest, "camera_matrix": K}, four_is_brown=False)
 
 
 def _along_x(baseline: Any) -> np.ndarray:
@@ -131,6 +141,9 @@ def _camera(fields: dict[str, Any], pose: Any) -> Camera:
 
 def _lens(fields: dict[str, Any]) -> Lens | None:
     kinds = {kind_of(key, fields[key]) for key in TYPES if key in fields and not _is_perspective(fields[key])}
+    kinds |= told(fields, TYPES).keys()
+    if {"brown", "fisheye"} <= kinds:
+        raise ValueError("want one lens model, got the names of a fisheye and of another one")
     given = {key: number(key, fields[key]) for key in ORDER if key in fields}
     for key, value in fields.items():
         if key not in (*ORDER, *TYPES):

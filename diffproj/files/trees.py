@@ -71,7 +71,9 @@ def yaml_tree(text: str) -> Any:
     try:
         for event in events:
             if isinstance(event, yaml.DocumentStartEvent):
-                return _yaml_node(next(events), events, 0)
+                tree = _yaml_node(next(events), events, 0)
+                _check_alike(tree, events)
+                return tree
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark is not None else ""
@@ -139,6 +141,21 @@ def _yaml_node(event: Any, events: Iterator[Any], depth: int) -> Any:
     if tag and tag.rpartition(":")[2] != "map":
         pairs.append(("type_id", tag.rpartition(":")[2]))
     return _without_doubles(pairs)
+
+
+def _check_alike(tree: Any, events: Iterator[Any]) -> None:
+    """Refuse documents behind the first that say something else: another camera would be dropped.
+
+    The messages of one camera, as `rostopic echo` prints them, differ in their headers alone; one that was cut off, or
+    is of another kind, is not looked at.
+    """
+    with suppress(yaml.YAMLError):
+        for event in events:
+            other = _yaml_node(next(events), events, 0) if isinstance(event, yaml.DocumentStartEvent) else None
+            if isinstance(tree, dict) and isinstance(other, dict):
+                differ = [key for key in other if key != "header" and key in tree and str(other[key]) != str(tree[key])]
+                if differ:
+                    raise ValueError(f"{differ[0]}: want one document, got another behind '---'; split the file there")
 
 
 def _yaml_scalar(text: str) -> Any:

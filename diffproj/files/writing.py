@@ -19,12 +19,23 @@ def cameras_of(item: Camera | Calibration, what: str) -> list[Camera]:
         raise ValueError(
             f"K: want no skew, which {what} does not hold, got {float(skew.abs().max()):.3g} px; use .json"
         )
+    check_not_mirrored(camera, what)
     if camera.batch_shape.numel() == 0:
         raise ValueError(f"want at least one camera for {what}, got batch shape {tuple(camera.batch_shape)}")
     if not camera.batch_shape:
         return [camera]
     rows = torch.arange(camera.batch_shape.numel(), device="cpu").reshape(camera.batch_shape)
     return [camera[tuple((rows == i).nonzero()[0].tolist())] for i in range(rows.numel())]
+
+
+def check_not_mirrored(camera: Camera, what: str) -> None:
+    """Refuse the camera of a mirrored image, whose file no reader takes, this package's own neither.
+
+    Raises:
+        ValueError: a focal length is negative.
+    """
+    if bool((camera.K.diagonal(dim1=-2, dim2=-1)[..., :2] < 0).any()):
+        raise ValueError(f"K: want positive focal lengths, which {what} needs, got a mirrored image; use .json")
 
 
 def one_camera(item: Camera | Calibration, what: str) -> Camera:
