@@ -9,6 +9,8 @@ from diffproj.geometry.image_sides import exchanged, principal_point
 
 LARGER, SMALLER, ALIKE = 1.4, 0.65, 0.1
 """Relative to the middle, from where on along both sides K is that of another image, if both are alike to a part."""
+LONGEST = 30.0
+"""Focal length in sides of the image up to which a centre within the first pixel says that K is in such parts."""
 
 
 def exchanged_sides(camera: Camera) -> str:
@@ -28,6 +30,21 @@ def other_image(camera: Camera) -> str:
         f"the principal point {_principal_point(camera)} is the middle of an image {(low + high) / 2:.2g} times as "
         f"large as {camera.size}: is K that of photographs of another resolution? Camera(..., size=...) with theirs, "
         "and resized() from there, mends it; of an image that was cut out of a larger one all may be well"
+    )
+
+
+def parts_of_the_image(camera: Camera) -> str:
+    """What makes K look normalised, in parts of the image instead of pixels, in words; empty where nothing does."""
+    if camera.K.numel() == 0:
+        return ""
+    K = camera.K.reshape(-1, 3, 3)[0]
+    centre, focal = K[:2, 2], K.diagonal()[:2].abs()
+    if not (bool(((centre > 0) & (centre < 1)).all()) and bool((focal < LONGEST).all())):
+        return ""
+    return (
+        f"K: want pixels, got focal lengths ({focal[0]:g}, {focal[1]:g}) and the principal point "
+        f"{_principal_point(camera)}, as in parts of the image: its first row times the width and its second times "
+        "the height, less half a pixel of the principal point where (0, 0) is the image's corner, mend it"
     )
 
 

@@ -14,7 +14,7 @@ from diffproj.files import own_json, poses_beside
 from diffproj.files.document import Document
 from diffproj.files.formats import FormatName, PathLike, format_of
 from diffproj.files.found import Found, NotOneCameraError
-from diffproj.files.image_sizes import exchanged_sides, other_image
+from diffproj.files.image_sizes import exchanged_sides, other_image, parts_of_the_image
 from diffproj.geometry.camera import Camera
 
 T = TypeVar("T")
@@ -83,15 +83,20 @@ def found_in(document: Document, format: FormatName | None = None) -> Found:  # 
 
 
 def _check_size(camera: Camera, own: bool) -> None:
-    """Refuse sides in the wrong order, and warn of a K of another image; of the own file, which keeps all, warn.
+    """Refuse sides in the wrong order and a normalised K, and warn of that of another image; of the own file, warn.
+
+    The own file keeps all that a camera holds.
 
     Raises:
-        ValueError: the size looks like height and width.
+        ValueError: the size looks like height and width, or K like parts of the image.
     """
     exchanged = exchanged_sides(camera)
     if exchanged and not own:
         raise ValueError(f"size: want width and height, got {camera.size}, {exchanged}; exchange them in the file")
-    doubt = f"size: {camera.size}, {exchanged}" if exchanged else other_image(camera)
+    normalised = parts_of_the_image(camera)
+    if normalised and not own:
+        raise ValueError(normalised)
+    doubt = f"size: {camera.size}, {exchanged}" if exchanged else normalised or other_image(camera)
     if doubt:
         warn_caller(doubt)
 

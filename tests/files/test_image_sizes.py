@@ -75,3 +75,21 @@ def test_a_calibration_of_another_size_than_its_photographs_is_refused(tmp_path:
     (tmp_path / "a.json").write_text(json.dumps(fields))
     with pytest.raises(ValueError, match=r"size: want that of the camera, \(480, 640\), got \(640, 480\)"):
         dp.load(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("size", [None, (640, 480)])
+def test_a_k_in_parts_of_the_image_is_refused(tmp_path: Path, size):
+    """As some programs write it; and a tiny image's K, whose centre is beyond its first pixel, is not."""
+    K = [[1.2, 0, 0.5], [0, 1.6, 0.5], [0, 0, 1]]
+    path = tmp_path / "a.json"
+    content = {"camera_matrix": K, "dist_coeffs": [-0.3, 0.1, 0, 0, 0]} | ({"image_size": size} if size else {})
+    path.write_text(json.dumps(content))
+    with pytest.raises(
+        ValueError, match=r"K: want pixels, got focal lengths \(1.2, 1.6\).* its first row times the wi"
+    ):
+        dp.load_camera(path)
+    assert dp.load_camera(_file(tmp_path / "b.json", (4, 3), (1.5, 1.0), 4.0)).size == (4, 3)
+    own = dp.Camera(torch.tensor(K, dtype=torch.float64), size=(640, 480))
+    dp.save_camera(tmp_path / "own.json", own)
+    with pytest.warns(UserWarning, match="K: want pixels"):
+        assert torch.equal(dp.load_camera(tmp_path / "own.json").K, own.K)
