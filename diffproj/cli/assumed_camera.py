@@ -29,6 +29,10 @@ FILM = math.hypot(36.0, 24.0)
 TOLD = 0.05
 """Relative deviation of a focal length that they tell: in whole mm, and of the width or of the diagonal."""
 
+OTHER_SHAPE = 0.02
+"""Logarithm of the ratio of two ratios of sides from which on a photograph was cropped: some files tell the sensor's
+sides, with some columns and rows more."""
+
 SECOND = 0.5
 """How far k2 may move the corners, as a part of how far k1 may."""
 
@@ -166,7 +170,18 @@ def _focal_in_file(exif: Exif, size: tuple[int, int]) -> float:
     if exif.focal_35 is None or (exif.zoom is not None and exif.zoom > 1):
         why = "digital zoom" if exif.focal_35 is not None else "no focal length of 35 mm film"
         raise ValueError(f"--fov: want PHOTO with a focal length in its EXIF data, got {why}; say degrees, as 70+-5")
+    if exif.size is not None and abs(math.log(_ratio(exif.size) / _ratio(size))) > OTHER_SHAPE:
+        (width, height), (before, above) = size, exif.size
+        raise ValueError(
+            f"--fov: want PHOTO as a whole, whose EXIF data tell its focal length, got {width} x {height} px of what "
+            f"they tell as {before} x {above}; say degrees from its left to its right edge, as 70+-5"
+        )
     return exif.focal_35 / FILM * math.hypot(*size)
+
+
+def _ratio(size: tuple[int, int]) -> float:
+    """Of the longer side to the shorter one: programs turn photographs and leave their sides as they were told."""
+    return max(size) / min(size)
 
 
 def _source(view: FieldOfView, exif: Exif, size: tuple[int, int]) -> str:

@@ -32,6 +32,7 @@ WHOLE = {1: "B", SHORT: "H", 4: "I", 16: "Q"}
 """Types of whole numbers."""
 ORIENTATION, KIND, MAKER, MODEL, EXIF_PART = 0x0112, 0x00FE, 0x010F, 0x0110, 0x8769
 FOCAL, ZOOM, FOCAL_35, SERIAL, LENS = 0x920A, 0xA404, 0xA405, 0xA431, 0xA434
+SIDES = 0xA002, 0xA003
 
 Told = tuple[tuple[str, str | float], ...]
 """What a file tells of its photograph: a name and a value each."""
@@ -50,6 +51,7 @@ class Exif(NamedTuple):
         focal_35: focal length in mm of a 35 mm film camera that sees as much.
         pictures: how many pictures a TIFF holds, smaller copies left out, or an animation.
         turned_at: where in a TIFF the entry of its orientation begins.
+        size: `(width, height)` in px as the camera wrote it, which programs that crop often leave as it was.
     """
 
     orientation: int | None = None
@@ -61,6 +63,7 @@ class Exif(NamedTuple):
     focal_35: float | None = None
     pictures: int = 1
     turned_at: int | None = None
+    size: tuple[int, int] | None = None
 
 
 def exif_of(content: bytes) -> Exif:
@@ -143,6 +146,7 @@ class _Reader:
             with suppress(*DAMAGE):
                 part = self.number(self.place, entries[EXIF_PART] + self.at)
                 entries = {**self.entries(part)[0], **entries}
+        width, height = (self.value(entries, side) or 0.0 for side in SIDES)
         names = [name for name in (self.text(entries, MAKER), self.text(entries, MODEL)) if name]
         return Exif(
             orientation=int(orientation) if orientation is not None and 1 <= orientation <= 8 else None,
@@ -154,6 +158,7 @@ class _Reader:
             focal_35=self.value(entries, FOCAL_35) or None,
             pictures=self.pictures(following, entries) if self.start == 0 else 1,
             turned_at=entries[ORIENTATION] if turned else None,
+            size=(int(width), int(height)) if width >= 1 and height >= 1 else None,
         )
 
     def number(self, form: str, place: int) -> int:

@@ -11,7 +11,7 @@ from diffproj.calibration.evidence.curved import further
 from diffproj.calibration.evidence.descent import Found, Task, reach, surveyed
 from diffproj.calibration.evidence.problem import jacobian
 from diffproj.calibration.evidence.undetermined import Lacking, decisive, inverse, natural, undetermined
-from diffproj.calibration.least_squares.robust import robust_factors
+from diffproj.calibration.least_squares.robust import robust_matrices
 from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.results.calibration import Calibration
@@ -124,10 +124,9 @@ def _normal_matrices(task: Task, found: Found, columns: Sequence[int]) -> tuple[
     rows[:, list(columns)] = slopes.movedim(0, 1)
     M, start = H, 0
     for piece, block in zip(task.pieces, evidence.blocks(found.values), strict=True):
-        count = block.shape[1]
-        part = rows[:, :, start : start + count].flatten(-2)
-        a, b = robust_factors(getattr(piece, "loss", None), block)
-        gram = part @ part.mT
-        H, M, start = H + a[:, None, None] * gram, M + b[:, None, None] * gram, start + count
+        count, k = block.shape[1:]
+        part = rows[:, :, start : start + count, :k]
+        here = robust_matrices(getattr(piece, "loss", None), block, part)
+        H, M, start = H + here[0], M + here[1], start + count
     sound = H.isfinite().all(-1).all(-1)[:, None, None]
     return torch.where(sound, H, 0.0), torch.where(sound, M, 0.0)

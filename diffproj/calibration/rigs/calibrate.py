@@ -65,8 +65,9 @@ def calibrate_rig(
         moments: by camera, the name or number of each view's moment. Left out, the views' names are the moments', with
             the camera's own name taken out where they would share none: `left03.jpg` and `right03.jpg` are `03.jpg`.
         cameras: known beforehand, by name: cameras, calibrations, or a rig that was calibrated before. Their intrinsics
-            are what is started from, or held; their poses count where the rig is held, `fixed=("rig",)`. For a list of
-            rigs, moments, cameras and weights may be lists of as many.
+            are what is started from, or held; their poses count where the rig is held, `fixed=("rig",)`. What is held
+            of a calibration or a rig errs as it says; give its `camera` or `cameras` where it is to count as exact. For
+            a list of rigs, moments, cameras and weights may be lists of as many.
         options: `fixed`, `shape`, `priors`, `weights`, `loss`, `reject_outliers`, `max_iterations`, `tolerance`,
             `progress` and `throw`: see `RigOptions`.
 

@@ -6,7 +6,8 @@ the target eliminated, g its gradient, and F what is free, held numbers h would,
     -V^-1 g_h      with the covariance s^2 V^-1      V = S_hh - S_hF S_FF^-1 S_Fh
 
 A wrong number that is held bends all others to it, and they are as sure as ever. Numbers that go together are let go
-together: with one focal length held, the other hardly moves.
+together: with one focal length held, the other hardly moves. Where what is held has errors of its own that are known
+(`held_errors.py`), it may change by as much as these explain.
 """
 
 import math
@@ -31,17 +32,19 @@ class Held(NamedTuple):
         change: how far it would move.
         deviation: of that, of corners that err independently.
         saved: which part of the sum of squares would be gone.
+        own: deviation of the change by the errors of all that is held, where these are known.
     """
 
     position: int
     change: float
     deviation: float
     saved: float
+    own: float = 0.0
 
     def remark(self, found: RigFit, dispersion: float) -> str:
         """A remark; '' where moments contradict each other as much as they do what is held."""
         deviation = self.deviation * max(1.0, dispersion * (1 - self.saved)) ** 0.5
-        far = abs(self.change) / deviation
+        far = abs(self.change) / math.hypot(deviation, self.own)
         if not far > DEVIATIONS:
             return ""
         camera, _, name = found.parameters.names[self.position].rpartition(".")
@@ -77,6 +80,11 @@ def contradicted_held(found: RigFit, noise: CameraNoise) -> Held | None:
     inner = S[free][:, free]
     known = inverse(inner.unsqueeze(0), inner.diagonal().unsqueeze(0))[0][0]
     squares, most, worst = variance * float(noise.freedom.clamp(min=0).sum()), DEVIATIONS, None
+    errors = torch.zeros_like(S)
+    if found.held_errors is not None:
+        own = found.held_errors.covariance.to(S)
+        errors[: len(own), : len(own)] = own
+    by_held = S - S[:, free] @ known @ S[free]  # how pulls follow what is held, and what is free that
     for rows in _groups(found):
         across = S[rows][:, free] @ known
         V, g = S[rows][:, rows] - across @ S[free][:, rows], pull[rows] - across @ pull[free]
@@ -84,10 +92,13 @@ def contradicted_held(found: RigFit, noise: CameraNoise) -> Held | None:
         change = -inverse_V[0] @ g
         saved = min(float(-change @ g) / max(squares, 1e-300), 1 - LEAST)
         deviation = (variance * (1 - saved) * inverse_V[0].diagonal().clamp(min=0)).sqrt()
-        far = torch.where((deviation > 0) & ~unknown[0], change.abs() / deviation, 0.0).nan_to_num(0.0)
+        slope = inverse_V[0] @ by_held[rows]
+        own = (slope @ errors @ slope.mT).diagonal().nan_to_num(torch.inf).clamp(min=0).sqrt()
+        whole = torch.hypot(deviation, own)
+        far = torch.where((deviation > 0) & ~unknown[0], change.abs() / whole, 0.0).nan_to_num(0.0)
         i = int(far.argmax())
         if float(far[i]) > most:
-            most, worst = float(far[i]), Held(rows[i], float(change[i]), float(deviation[i]), saved)
+            most, worst = float(far[i]), Held(rows[i], float(change[i]), float(deviation[i]), saved, float(own[i]))
     return worst
 
 

@@ -1,7 +1,7 @@
 """One rig: each camera on its own, the best-connected pairs chained, all refined together, and the target's shape."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import Tensor
@@ -10,9 +10,10 @@ from diffproj._core.numerics import check_untransformed
 from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.least_squares.solver import Status
 from diffproj.calibration.problem.parametrisation import Parametrisation
-from diffproj.calibration.results.calibration import CalibrationError
+from diffproj.calibration.results.calibration import Calibration, CalibrationError
 from diffproj.calibration.rigs.alone import Alone, Asked, alone, checked_cameras, lenses
 from diffproj.calibration.rigs.fit import rig_fit
+from diffproj.calibration.rigs.held_errors import HeldErrors, held_errors
 from diffproj.calibration.rigs.knowledge import RigKnowledge
 from diffproj.calibration.rigs.options import held, held_places, held_points
 from diffproj.calibration.rigs.outcome import rig_outcome
@@ -40,6 +41,7 @@ class RigTask:
         held_points: coordinates of free points that are, numbers from 0.
         known: what is known of them beforehand, if anything is.
         moved: how far the target's points are known to lie from where it has them `(N, 3)`, if they do.
+        held_errors: how what is held errs; `None` where it counts as exact.
     """
 
     asked: Asked
@@ -48,6 +50,7 @@ class RigTask:
     held_points: list[int]
     known: RigKnowledge | None = None
     moved: Tensor | None = None
+    held_errors: HeldErrors | None = None
 
 
 def rig_calibrated(task: RigTask) -> RigCalibration:
@@ -76,6 +79,7 @@ def rig_task(
     check_untransformed(who, "a list of rigs is calibrated side by side")
     views = rig_views(views_by_camera, target, moments, chosen.weights, who)
     known = checked_cameras(cameras, views.names)
+    placed = {name: known[name] for name in known if not _is_without_place(cameras, name)}
     lens = lenses(distortion, views.names)
     # What is held has to be known by camera before each is calibrated on its own; a known camera brings its lens.
     kinds = {name: Parametrisation.of(known[name]) if name in known else Parametrisation(lens[name]) for name in lens}
@@ -84,12 +88,19 @@ def rig_task(
     fixed, points = held_points(chosen.fixed, len(views.points))
     names, positions = held(parameters, fixed)
     priors = own_priors(parameters, chosen.priors)
-    knowledge = rig_knowledge(parameters, priors, known, views, positions)
+    knowledge = rig_knowledge(parameters, priors, known, placed, views, positions)
     alone = {name: {what: value for what, value in own.items() if what not in PLACES} for name, own in priors.items()}
     # On its own, each camera takes landmarks for exact: their errors are unknowns that all views of the rig share.
     bare = Landmarks(target.points, target.names) if isinstance(target, Landmarks) else target
+    held_places(parameters, positions, placed)
     asked = Asked(views, bare, lens, known, names, alone, chosen, who)
-    return RigTask(asked, parameters, positions, points, knowledge, moved)
+    errors = held_errors(cameras, parameters, positions)
+    return RigTask(asked, parameters, positions, points, knowledge, moved, errors)
+
+
+def _is_without_place(cameras: Any, name: str) -> bool:
+    """Whether a camera was given as a calibration on its own, which stands nowhere."""
+    return isinstance(cameras, Mapping) and isinstance(cameras[name], Calibration)
 
 
 def finished(task: RigTask, own: Mapping[str, Alone]) -> Refinement[RigCalibration]:
@@ -120,7 +131,7 @@ def finished(task: RigTask, own: Mapping[str, Alone]) -> Refinement[RigCalibrati
         found = yield from with_points(found, task.held_points, chosen)
     elif task.known is not None:
         found = yield from weighed_anew(found, chosen)
-    rig = rig_outcome(found, own)
+    rig = rig_outcome(replace(found, held_errors=task.held_errors), own)
     if chosen.throw and rig.status != Status.CONVERGED:
         raise CalibrationError(f"{who}: {rig.message}", rig)
     return rig

@@ -22,8 +22,9 @@ class RigOptions(TypedDict, total=False):
         fixed: what keeps its value. `"intrinsics"` of all cameras, `"rig"`, their poses; names or groups of parameters
             as in `calibrate` (`"k3"`, `"distortion"`, `"principal_point"`, ...), of all cameras that have them; or any
             of these of one camera, as `"left.intrinsics"`, `"left.k3"`, `"right.pose"`. Values are those of `cameras`;
-            where there is none, as in `calibrate`, the middle of the image and 0 for the lens. With free points,
-            `"points_z"` keeps them in the plane.
+            where there is none, as in `calibrate`, the middle of the image and 0 for the lens. Of cameras they count
+            as exact; of calibrations, and of a rig, they err as its covariance says, and what is found follows. With
+            free points, `"points_z"` keeps them in the plane.
         shape: of the target. `"flat"`, the default, has its points where the target says. `"bow"` fits the board's bow
             too, a paraboloid of two parameters that all cameras share. `"free"` fits the place of every point, in the
             plane and out of it, to all cameras together: `RigCalibration.points` then is the target as it was printed.
@@ -137,7 +138,10 @@ def held_places(
             continue
         if first is None or name not in known:
             lacking = parameters.cameras[0] if first is None else name
-            raise ValueError(f"fixed: want cameras={{{lacking!r}: ...}} at its pose, from which {name!r} is held")
+            raise ValueError(
+                f"fixed: want cameras={{{lacking!r}: ...}} at its pose, from which {name!r} is held; a calibration of "
+                "one camera stands nowhere, a rig's cameras do"
+            )
         places[number] = place_in_rig(first, known[name])
     return places
 

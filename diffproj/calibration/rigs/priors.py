@@ -50,6 +50,7 @@ def rig_knowledge(
     parameters: RigParameters,
     own: Mapping[str, Mapping[str, Any]],
     known: Mapping[str, Camera],
+    placed: Mapping[str, Camera],
     views: RigViews,
     held: Sequence[int],
 ) -> RigKnowledge | None:
@@ -59,6 +60,7 @@ def rig_knowledge(
         parameters: the shared unknowns.
         own: priors by camera and bare name, of `own_priors`.
         known: cameras that are known beforehand: priors without a mean are about them.
+        placed: those of them that stand somewhere.
         views: of all cameras.
         held: positions of the shared unknowns that are.
 
@@ -66,7 +68,7 @@ def rig_knowledge(
         TypeError: no numbers.
         ValueError: values that cannot be, nothing to be about, or something that is held as well.
     """
-    like, first = views.points, known.get(parameters.cameras[0])
+    like, first = views.points, placed.get(parameters.cameras[0])
     numbers: list[Tensor] = []
     places: list[KnownPlace] = []
     for c, (name, kind) in enumerate(zip(parameters.cameras, parameters.kinds, strict=True)):
@@ -86,7 +88,7 @@ def rig_knowledge(
             if what in own[name]:
                 at = parameters.pose(c).start
                 _check_free(at, held, parameters)
-                there = place_in_rig(first, known[name]) if first is not None and name in known else None
+                there = place_in_rig(first, placed[name]) if first is not None and name in placed else None
                 places.append(_place(c, what, at, f"{name}.{what}", own[name][what], there, like))
     if not numbers and not places:
         return None
@@ -127,7 +129,7 @@ def _place(
     elif there is None:
         raise ValueError(
             f"priors: want (mean, deviation) for {entry!r}, or cameras= with it and the first camera at their poses, "
-            "got a deviation alone"
+            "got a deviation alone; calibrations stand nowhere"
         )
     else:
         R, t = (part.to(like) for part in there)

@@ -28,6 +28,7 @@ from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.results.covariance import Covariance, Scores, covariance, points_turned, reshaped
 from diffproj.calibration.rigs.common_errors import CommonErrors
 from diffproj.calibration.rigs.fit import RigFit
+from diffproj.calibration.rigs.held_errors import following
 from diffproj.calibration.rigs.problem import RigProblem
 from diffproj.calibration.trust.dispersion import FEW_VIEWS, FEW_VIEWS_OF_A_SHAPE, believed, contradiction
 from diffproj.calibration.trust.noisy_views import beyond_chance
@@ -213,6 +214,8 @@ def rig_covariance(
         dispersion=phi,
         unseen=unseen(found),
     )
+    if found.held_errors is not None and found.basis is not None:
+        found_one = following(found_one, H, found.basis, found.held_errors.covariance)
     if pulls is not None:
         inverse, _ = local_inverse(H.W)
         found_one = replace(found_one, _alone=found_one._alone + of_corners * inverse @ pulls @ inverse)

@@ -138,7 +138,7 @@ def test_points_stay_in_the_plane_if_asked_to() -> None:
     flat = dp.calibrate_rig(views, BOARD, "none")
     free = dp.calibrate_rig(views, BOARD, "none", shape="free")
     assert flat.rms > rig.rms > free.rms
-    held = dp.calibrate_rig(views, BOARD, "none", shape="free", cameras=flat, fixed=("intrinsics", "rig"))
+    held = dp.calibrate_rig(views, BOARD, "none", shape="free", cameras=flat.cameras, fixed=("intrinsics", "rig"))
     assert torch.equal(held["a"].camera.K, flat["a"].camera.K)
     assert bool((held.place_covariance("b") == 0).all())
     assert bool((held.points_deviation[:, :2] > 0).all())

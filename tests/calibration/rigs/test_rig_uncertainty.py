@@ -127,7 +127,7 @@ def test_triangulated_points_are_found_and_held_to_account(three: Scene, rig: dp
     draw = torch.Generator().manual_seed(0)
     many = {name: at.repeat(400, 1) + 0.3 * torch.randn(1200, 2, generator=draw, dtype=D) for name, at in exact.items()}
     scattered = rig.triangulate(many, pixel_sigma=0.3).points.reshape(400, 3, 3)
-    frozen = dp.calibrate_rig(three.views, three.board, cameras=rig, fixed=("rig", "intrinsics"))
+    frozen = dp.calibrate_rig(three.views, three.board, cameras=rig.cameras, fixed=("rig", "intrinsics"))
     held = frozen.triangulate(exact, pixel_sigma=0.3)
     assert torch.allclose(scattered.std(0), held.deviations, rtol=0.12)
     assert bool((found.deviations > frozen.triangulate(exact).deviations).all())
