@@ -8,6 +8,7 @@ import torch
 
 from diffproj.calibration.problem.parametrisation import INTRINSICS
 from diffproj.calibration.results.calibration import Calibration
+from diffproj.calibration.results.remark import Kind, Remark, Remarks
 from diffproj.cli.known_beforehand import FOCAL, FieldOfView, Known
 from diffproj.cli.terminal import rounded
 from diffproj.geometry.camera import Camera
@@ -125,22 +126,24 @@ def assumed_camera(
     return Assumed(camera, tuple(one for one in priors if one.name not in taken), _source(view, exif, size))
 
 
-def contradicted(assumed: Assumed, found: Calibration) -> list[str]:
-    """What landmarks say against what was assumed, a sentence each: they and it cannot both be right."""
+def contradicted(assumed: Assumed, found: Calibration) -> Remarks:
+    """What landmarks say against what was assumed, a remark each: they and it cannot both be right."""
     values = dict(zip(found.parameters.names, found.shared.tolist(), strict=True))
     spread = found.covariance.deviations
-    sentences = []
+    remarks = []
     for one in assumed.priors:
         name = "f_x" if one.name == "focal" else one.name
         left = one.deviation**2 - min(float(spread[name]), one.deviation) ** 2
         far = abs(values[name] - one.value) / math.sqrt(left) if left > 0 else 0.0
         if far > APART:
             (title, unit), pair = TITLES[one.name], rounded(values[name], float(spread[name]))
-            sentences.append(
+            told = (
                 f"{title} {' ± '.join(pair)}{unit} as the landmarks tell, {far:.2g} deviations from what is assumed: "
                 "check --fov, that the photograph is whole, and the landmarks"
             )
-    return sentences
+            reason = f"the landmarks tell a {title} {far:.2g} deviations from what is assumed"
+            remarks.append(Remark(told, Kind.WRONG_PRIOR, reason))
+    return tuple(remarks)
 
 
 def _check_known(view: FieldOfView, told: bool, relative: float, free: bool) -> None:

@@ -34,6 +34,8 @@ TOGETHER = 32
 """Cameras that are calibrated at once, and lost if the run is killed before."""
 WORST = 10
 """Cameras in the table."""
+CONNECTS = 10
+"""Seconds in which a scheduler must answer."""
 
 
 def run(options: argparse.Namespace) -> int:
@@ -128,7 +130,14 @@ def _workers(options: argparse.Namespace, cameras: int) -> Iterator[Executor | N
             from distributed import Client
         except ImportError:
             raise ValueError("--dask: want the package distributed; pip install 'diffproj[dask]'") from None
-        with Client(options.dask) as client:
+        try:
+            client = Client(options.dask, timeout=CONNECTS)
+        except (OSError, ValueError) as error:
+            raise ValueError(
+                f"--dask: want the address of a scheduler that answers, such as tcp://host:8786, got {options.dask}: "
+                f"no answer in {CONNECTS} s, or none that is one; is it running, and can it be reached from here?"
+            ) from error
+        with client:
             yield client.get_executor()
         return
     count = min(options.workers or os.cpu_count() or 1, cameras)
@@ -234,3 +243,5 @@ def _tell(options: argparse.Namespace, lines: list[dict[str, Any]], new: int, se
         f"{stages['search']:.1f} to search, {stages['calibration']:.1f} to calibrate, {stages['report']:.1f} to report"
     )
     result(f"Written to {options.output}; dp.load_calibration({str(options.output)!r}, camera=...) reads one")
+    if failed:  # the exit code is 0 where others did not
+        result(f'{len(failed)} of {counted(len(lines), "camera")} failed: see "error" in the file, or above')

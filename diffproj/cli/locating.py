@@ -4,6 +4,7 @@ import argparse
 import re
 import warnings
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -76,11 +77,13 @@ def run(options: argparse.Namespace) -> int:
     for remark in found.findings[0]:
         if remark.kind == Kind.BELOW:
             warn_caller(f"{options.landmarks}: {remark.sentence}")
-    against = [] if assumed is None else contradicted(assumed, found)
+    against = () if assumed is None else contradicted(assumed, found)
     for one in against:
-        warn_caller(f"{options.landmarks}: {one}")
+        warn_caller(f"{options.landmarks}: {one.sentence}")
+    if against:  # the verdict, here and in the file, is to know of it
+        found = replace(found, _remarks=partial(tuple, [(*found.findings[0], *against)]))
     told = document(options, found, surveyed, _free(options, camera), calibration is not None, assumed)
-    told["remarks"] += [f"{sentence(one)}." for one in against]
+    told["remarks"] += [f"{sentence(one.sentence)}." for one in against]
     told["warnings"] = options.warned
     if options.draw is not None:
         from diffproj import figures  # here, for it loads matplotlib

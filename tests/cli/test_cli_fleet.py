@@ -86,6 +86,7 @@ def test_each_camera_gets_its_line(fleet, truth, tmp_path, capsys):
     assert "cam3" not in truth[1]
     assert "error" in lines["cam3"]
     assert "2 cameras calibrated, 3 failed" in out
+    assert out.strip().splitlines()[-1] == '3 of 5 cameras failed: see "error" in the file, or above'
     assert out.index("cam10") < out.index("wall: ")
     assert "The worst" in out
 
@@ -318,3 +319,12 @@ def test_processes_and_a_dask_cluster_give_the_same(fleet, tmp_path, capsys):
         for name, line in lines_of(file).items():
             for key in ("camera", "calibration", "error", "notes"):
                 assert alike(line.get(key), lines_of(alone)[name].get(key)), key
+
+
+def test_a_scheduler_that_does_not_answer_is_refused_soon(tmp_path, capsys, monkeypatch):
+    """In words, and not after the half minute that dask waits."""
+    monkeypatch.setattr(calibrating_fleet, "CONNECTS", 0.5)
+    (tmp_path / "fleet" / "cam1").mkdir(parents=True)
+    given = ["--board", "9x6", "--square", "25mm", "--dask", "tcp://127.0.0.1:9", "-o", str(tmp_path / "out.jsonl")]
+    assert main(["calibrate", "--fleet", str(tmp_path / "fleet"), *given]) == 1
+    assert "--dask: want the address of a scheduler that answers" in capsys.readouterr().err

@@ -143,6 +143,7 @@ def test_a_field_of_view_that_landmarks_contradict_is_told(capsys: pytest.Captur
     told = r"ocal length \d+ ± \d+ px as the landmarks tell, .* deviations from what is assumed: check --fov"
     assert re.search(f"walls.csv: f{told}", err)
     assert re.search(f"F{told}", " ".join(out.split()))
+    assert "Weak: the landmarks tell a focal length" in " ".join(out.split())  # it said "Good" beside the warning
     code, _, err = run(capsys, *walls, "--fov", "40+-2")
     assert code == 1
     assert "no pose was found that sees what was observed: check the camera, or look for mixed-up pixels" in err
