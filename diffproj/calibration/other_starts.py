@@ -47,7 +47,9 @@ def lowest(begin: Begun, options: Options) -> Fit:
     for shared, poses in _starts(task, begin.shared[rows]):
         other = fit(task, shared, poses, reject=options.outlier_limit, **limits)
         best = lower_fit(best, _kept_from_folding(other), every, options.outlier_limit)
-    return lower_fit(_kept_from_folding(found), best, rows, options.outlier_limit)
+    end = lower_fit(_kept_from_folding(found), best, rows, options.outlier_limit)
+    cost = torch.where(end.solution.cost.isinf(), found.solution.cost, end.solution.cost)  # folded, and none is better
+    return Fit(end.task, end.solution._replace(cost=cost), end.rejected)
 
 
 def _doubtful(found: Fit) -> Tensor:
