@@ -58,6 +58,9 @@ def held_errors(given: Any, parameters: RigParameters, positions: Sequence[int])
         given: the cameras known beforehand, checked: a rig, or cameras and calibrations by name.
         parameters: the shared unknowns.
         positions: of those that are held.
+
+    Raises:
+        ValueError: what is held is undetermined there: all that follows it would be told as if it were exact.
     """
     if isinstance(given, RigCalibration):
         known = given if given.has_covariance else {}
@@ -65,7 +68,16 @@ def held_errors(given: Any, parameters: RigParameters, positions: Sequence[int])
         each = given.items() if isinstance(given, Mapping) else ()
         known = {name: one for name, one in each if isinstance(one, Calibration) and one.has_covariance}
     held = {parameters.names[i].rpartition(".")[0] for i in positions}
-    return HeldErrors(known, parameters, tuple(positions)) if held & set(known) else None
+    if not held & set(known):
+        return None
+    errors = HeldErrors(known, parameters, tuple(positions))
+    unknown = [parameters.names[i] for i in positions if bool(errors.covariance[i, i].isinf())]
+    if unknown:
+        raise ValueError(
+            f"fixed: want what the calibration in cameras= determines, got {', '.join(unknown)}, whose deviation is "
+            "infinite; leave it free, or give the camera alone, without its calibration, where it counts as exact"
+        )
+    return errors
 
 
 def _of_cameras(calibrations: Mapping[str, Calibration], parameters: RigParameters) -> Tensor:

@@ -2,6 +2,7 @@
 
 import pickle
 from collections.abc import Mapping
+from dataclasses import replace
 
 import pytest
 import torch
@@ -121,3 +122,19 @@ def seen_exactly(seen: Scene, name: str) -> tuple[Tensor, Tensor]:
     parts = [one.project(seen.board.points) for one in (first, camera.at(own.R, own.t))]
     pixels, visible = (torch.cat(both) for both in zip(*parts, strict=True))
     return pixels, visible & camera.in_image(pixels)
+
+
+def test_what_a_calibration_does_not_determine_cannot_be_held(pair: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What follows it would be told as if it were exact."""
+    known = focal_alone(pair)
+    told = known["cam1"].covariance_of_kept_poses
+    without = torch.tensor([name != "f_x" for name in told.names])
+    shared = torch.where(without & without.unsqueeze(-1), told.shared, 0.0)
+    shared = shared + torch.diag(torch.where(without, 0.0, torch.inf).to(D))
+    lacking = replace(told, shared=shared, undetermined=~without)
+    monkeypatch.setattr(dp.Calibration, "covariance_of_kept_poses", property(lambda self: lacking))
+    with pytest.raises(
+        ValueError, match=r"fixed: want what the calibration in cameras= determines, got cam0.f_x, cam1"
+    ):
+        held(pair, known)
+    held(pair, {name: one.camera for name, one in known.items()})
