@@ -59,7 +59,7 @@ _LENS = re.compile(
     r"fish ?eye|\bomni(?!vision)|\bequi(dist|rect|sol|$)|spherical|panoram|orthograph|stereograph|eucm|inverse"
     r"|\bf ?theta|double sphere|division|^(mei|fov\d?|ds)$"
 )
-"""What names a lens; no maker or name of a camera is meant."""
+"""What names a lens, and makers hardly use; a camera whose name holds it, as "Fisheye Cam", is refused."""
 
 
 def kind_of(name: str, value: object) -> Kind | None:
@@ -102,7 +102,11 @@ def told(fields: dict[str, Any], read: Iterable[str] = ()) -> dict[Kind, str]:
             continue
         if plain in LOOSE and not _names_lens(value, numbers=plain in MODELS):
             continue
-        kind = kind_of(key, value)
+        try:
+            kind = kind_of(key, value)
+        except ValueError as error:
+            remedy = f", or take {key} out where it is what the camera is called" if plain in LOOSE else ""
+            raise ValueError(f"{error}{remedy}") from None
         if kind is not None:
             kinds[kind] = key
     return kinds

@@ -35,6 +35,8 @@ LENSES = _words(
 )
 SIZES = _words("cameraresolution imagesize imgsize resolution size framesize imageresolution")
 SIDES = (("imagewidth", "imageheight"), ("imgwidth", "imgheight"), ("width", "height"))
+LEAST_SKEW = 1e-6
+"""In px, up to which a skew is what is left of none."""
 OMNIDIRECTIONAL = _words("xi mirrorparameters alpha gamma1 gamma2")
 COEFFICIENTS = _words("k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4 taux tauy r1 r2 t1 t2 d0 d1 d2 d3 d4 d5 d6 d7")
 
@@ -197,7 +199,7 @@ def check_no_lens_key(key: str, value: Any) -> None:
             f"{key}: want a perspective or fisheye lens of OpenCV, got the parameters of an omnidirectional model; "
             "calibrate again with one of them"
         )
-    if plain in ("skew", "cameraskew") and isinstance(value, int | float | np.number) and value != 0:
+    if plain in ("skew", "cameraskew") and isinstance(value, int | float | np.number) and abs(value) > LEAST_SKEW:
         raise ValueError(
             f"{key}: want 0, or the skew in the camera matrix, got {value} beside one without; "
             "dp.Camera(K, ...) takes it"

@@ -89,6 +89,8 @@ def test_a_model_of_other_equations_is_refused_beside_k(tmp_path: Path, said: st
         load(tmp_path, "plain.json", json.dumps(tree | {"model": said}))
     for harmless in ("Logitech C920", "OmniVision OV9281", "color", "none"):
         assert numbers(load(tmp_path, "plain.json", json.dumps(tree | {"model": harmless})))[1] == D
+    with pytest.raises(ValueError, match="or take model out where it is what the camera is called"):
+        load(tmp_path, "plain.json", json.dumps(tree | {"model": "Fisheye Cam IMX219"}))
     with pytest.raises(ValueError, match="fisheye and of another"):
         load(tmp_path, "plain.json", json.dumps(FOUR | {"model": "fisheye", "lens_model": "brown"}))
 
@@ -127,7 +129,8 @@ def test_skew_and_coefficients_one_by_one_are_not_dropped(tmp_path: Path, more: 
         if tree is FOUR or "skew" in more:
             with pytest.raises(ValueError, match=said):
                 load(tmp_path, "plain.json", json.dumps(tree | more))
-        assert load(tmp_path, "plain.json", json.dumps(tree | {"skew": 0})).K[0, 1] == 0
+        for none in (0, 1e-12):
+            assert load(tmp_path, "plain.json", json.dumps(tree | {"skew": none})).K[0, 1] == 0
 
 
 def test_k_of_nuscenes_name_without_a_pose_is_a_plain_one(tmp_path: Path) -> None:

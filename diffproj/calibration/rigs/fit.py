@@ -15,7 +15,6 @@ from diffproj.calibration.least_squares.normal_equations import Equations
 from diffproj.calibration.least_squares.solver import Prior
 from diffproj.calibration.problem.shape import Restraint
 from diffproj.calibration.results.border import border_with_rays
-from diffproj.calibration.rigs.held_errors import HeldErrors
 from diffproj.calibration.rigs.knowledge import RigKnowledge
 from diffproj.calibration.rigs.options import free_directions
 from diffproj.calibration.rigs.parameters import RigParameters
@@ -50,7 +49,7 @@ class RigFit:
         restraint: what fixes the frame of free points; `None` where none are free.
         positions: of the shared unknowns that are held.
         prior_variance: the variance of residuals that what is known beforehand was weighed against.
-        held_errors: how what is held errs; `None` where it counts as exact.
+        held_errors: the covariance of what is held, as `held_errors.py` has it; `None` where it counts as exact.
     """
 
     views: RigViews
@@ -69,7 +68,7 @@ class RigFit:
     restraint: Restraint | None = None
     positions: tuple[int, ...] = ()
     prior_variance: float = 1.0
-    held_errors: HeldErrors | None = None
+    held_errors: Tensor | None = None
 
     @property
     def prior(self) -> Prior | None:

@@ -82,7 +82,7 @@ def contradicted_held(found: RigFit, noise: CameraNoise) -> Held | None:
     squares, most, worst = variance * float(noise.freedom.clamp(min=0).sum()), DEVIATIONS, None
     errors = torch.zeros_like(S)
     if found.held_errors is not None:
-        own = found.held_errors.covariance.to(S)
+        own = found.held_errors.to(S)
         errors[: len(own), : len(own)] = own
     by_held = S - S[:, free] @ known @ S[free]  # how pulls follow what is held, and what is free that
     for rows in _groups(found):
@@ -93,7 +93,7 @@ def contradicted_held(found: RigFit, noise: CameraNoise) -> Held | None:
         saved = min(float(-change @ g) / max(squares, 1e-300), 1 - LEAST)
         deviation = (variance * (1 - saved) * inverse_V[0].diagonal().clamp(min=0)).sqrt()
         slope = inverse_V[0] @ by_held[rows]
-        own = (slope @ errors @ slope.mT).diagonal().nan_to_num(torch.inf).clamp(min=0).sqrt()
+        own = (slope @ errors @ slope.mT).diagonal().clamp(min=0).sqrt()
         whole = torch.hypot(deviation, own)
         far = torch.where((deviation > 0) & ~unknown[0], change.abs() / whole, 0.0).nan_to_num(0.0)
         i = int(far.argmax())

@@ -9,8 +9,7 @@ The noise of both is taken to be independent.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -27,32 +26,10 @@ from diffproj.calibration.rigs.result import RigCalibration
 from diffproj.geometry.cayley import cross_matrix
 
 
-@dataclass(frozen=True, eq=False)
-class HeldErrors:
-    """How what is held errs.
+def held_errors(given: Any, parameters: RigParameters, positions: Sequence[int]) -> Tensor | None:
+    """The covariance of what is held, among the shared unknowns `(few, few)`, with 0 for what is free or exact.
 
-    Attributes:
-        known: a rig, or calibrations by the names of their cameras, with their covariances.
-        parameters: the shared unknowns.
-        positions: of those that are held.
-    """
-
-    known: RigCalibration | dict[str, Calibration]
-    parameters: RigParameters
-    positions: tuple[int, ...]
-
-    @cached_property
-    def covariance(self) -> Tensor:
-        """Of the shared unknowns `(few, few)`: 0 for what is free or exact, infinite where nothing is known."""
-        given, parameters = self.known, self.parameters
-        found = _of_cameras(given, parameters) if isinstance(given, dict) else _of_a_rig(given, parameters)
-        held = torch.zeros(len(found), dtype=torch.bool, device=found.device)
-        held[list(self.positions)] = True
-        return torch.where(held & held.unsqueeze(-1), found, 0.0)
-
-
-def held_errors(given: Any, parameters: RigParameters, positions: Sequence[int]) -> HeldErrors | None:
-    """How what is held errs; `None` where it counts as exact, as that of cameras without a covariance does.
+    `None` where all that is held counts as exact, as that of cameras without a covariance does.
 
     Args:
         given: the cameras known beforehand, checked: a rig, or cameras and calibrations by name.
@@ -62,22 +39,26 @@ def held_errors(given: Any, parameters: RigParameters, positions: Sequence[int])
     Raises:
         ValueError: what is held is undetermined there: all that follows it would be told as if it were exact.
     """
+    if not positions:
+        return None
     if isinstance(given, RigCalibration):
-        known = given if given.has_covariance else {}
+        found = _of_a_rig(given, parameters) if given.has_covariance else None
     else:
         each = given.items() if isinstance(given, Mapping) else ()
         known = {name: one for name, one in each if isinstance(one, Calibration) and one.has_covariance}
-    held = {parameters.names[i].rpartition(".")[0] for i in positions}
-    if not held & set(known):
+        found = _of_cameras(known, parameters) if known else None
+    if found is None:
         return None
-    errors = HeldErrors(known, parameters, tuple(positions))
-    unknown = [parameters.names[i] for i in positions if bool(errors.covariance[i, i].isinf())]
+    held = torch.zeros(len(found), dtype=torch.bool, device=found.device)
+    held[list(positions)] = True
+    found = torch.where(held & held.unsqueeze(-1), found, 0.0)
+    unknown = [parameters.names[i] for i in positions if bool(found[i, i].isinf())]
     if unknown:
         raise ValueError(
             f"fixed: want what the calibration in cameras= determines, got {', '.join(unknown)}, whose deviation is "
             "infinite; leave it free, or give the camera alone, without its calibration, where it counts as exact"
         )
-    return errors
+    return found if bool(found.any()) else None
 
 
 def _of_cameras(calibrations: Mapping[str, Calibration], parameters: RigParameters) -> Tensor:
@@ -95,7 +76,10 @@ def _of_cameras(calibrations: Mapping[str, Calibration], parameters: RigParamete
 
 
 def _of_a_rig(rig: RigCalibration, parameters: RigParameters) -> Tensor:
-    """Of a rig that was calibrated before, in whose frame another camera may have been the first."""
+    """Of a rig that was calibrated before, in whose frame another camera may have been the first.
+
+    Infinite where it does not determine a number.
+    """
     known = rig.covariance
     J = known.shared.new_zeros(parameters.few, len(known.names))
     first = parameters.cameras[0]
@@ -128,7 +112,7 @@ def following(found: Covariance, H: Equations, basis: Tensor, held: Tensor) -> C
         found: without them, of one rig with its batch axis.
         H: the curvature at the minimum, with all shared unknowns.
         basis: of the free directions `(1, s, q)`.
-        held: the covariance of `HeldErrors`.
+        held: the covariance of what is held, of `held_errors`.
     """
     s = basis.shape[-2]
     held = torch.nn.functional.pad(held.to(basis), (0, s - len(held), 0, s - len(held)))
@@ -136,9 +120,6 @@ def following(found: Covariance, H: Equations, basis: Tensor, held: Tensor) -> C
     T = basis.mT
     free, _ = inverse(T @ S @ basis, (T @ H.U @ basis).diagonal(dim1=-2, dim2=-1))
     A = torch.eye(s, dtype=S.dtype, device=S.device) - basis @ free @ T @ S
-    more = A @ zero_where_infinite(held) @ A.mT
-    unknown = found.undetermined | held.diagonal().isinf()
-    shared = zero_where_infinite(found.shared) + (more + more.mT) / 2
-    shared = torch.where(unknown.unsqueeze(-1) | unknown.unsqueeze(-2), 0.0, shared)
-    shared = shared + torch.diag_embed(torch.where(unknown, torch.inf, 0.0).to(shared))
-    return replace(found, shared=shared, undetermined=unknown)
+    more = A @ held @ A.mT
+    unknown = found.undetermined.unsqueeze(-1) | found.undetermined.unsqueeze(-2)
+    return replace(found, shared=torch.where(unknown, found.shared, found.shared + (more + more.mT) / 2))

@@ -13,7 +13,7 @@ from diffproj.calibration.problem.parametrisation import Parametrisation
 from diffproj.calibration.results.calibration import Calibration, CalibrationError
 from diffproj.calibration.rigs.alone import Alone, Asked, alone, checked_cameras, lenses
 from diffproj.calibration.rigs.fit import rig_fit
-from diffproj.calibration.rigs.held_errors import HeldErrors, held_errors
+from diffproj.calibration.rigs.held_errors import held_errors
 from diffproj.calibration.rigs.knowledge import RigKnowledge
 from diffproj.calibration.rigs.options import held, held_places, held_points
 from diffproj.calibration.rigs.outcome import rig_outcome
@@ -39,18 +39,20 @@ class RigTask:
         parameters: the shared unknowns.
         positions: of those that are held.
         held_points: coordinates of free points that are, numbers from 0.
+        places: `(R, t)` from the first camera's frame to that of each whose pose is held, by their numbers.
         known: what is known of them beforehand, if anything is.
         moved: how far the target's points are known to lie from where it has them `(N, 3)`, if they do.
-        held_errors: how what is held errs; `None` where it counts as exact.
+        held_errors: the covariance of what is held, as `held_errors.py` has it; `None` where it counts as exact.
     """
 
     asked: Asked
     parameters: RigParameters
     positions: list[int]
     held_points: list[int]
+    places: dict[int, tuple[Tensor, Tensor]]
     known: RigKnowledge | None = None
     moved: Tensor | None = None
-    held_errors: HeldErrors | None = None
+    held_errors: Tensor | None = None
 
 
 def rig_calibrated(task: RigTask) -> RigCalibration:
@@ -92,10 +94,10 @@ def rig_task(
     alone = {name: {what: value for what, value in own.items() if what not in PLACES} for name, own in priors.items()}
     # On its own, each camera takes landmarks for exact: their errors are unknowns that all views of the rig share.
     bare = Landmarks(target.points, target.names) if isinstance(target, Landmarks) else target
-    held_places(parameters, positions, placed)
+    places = held_places(parameters, positions, placed)
     asked = Asked(views, bare, lens, known, names, alone, chosen, who)
     errors = held_errors(cameras, parameters, positions)
-    return RigTask(asked, parameters, positions, points, knowledge, moved, errors)
+    return RigTask(asked, parameters, positions, points, places, knowledge, moved, errors)
 
 
 def _is_without_place(cameras: Any, name: str) -> bool:
@@ -111,7 +113,7 @@ def finished(task: RigTask, own: Mapping[str, Alone]) -> Refinement[RigCalibrati
     """
     views, chosen, who = task.asked.views, task.asked.options, task.asked.who
     seen = {name: one.seen for name, one in own.items()}
-    start = rig_start(views, seen, held_places(task.parameters, task.positions, task.asked.known), who)
+    start = rig_start(views, seen, task.places, who)
     found = yield from rig_fit(
         views,
         task.parameters,

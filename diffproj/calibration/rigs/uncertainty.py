@@ -215,7 +215,7 @@ def rig_covariance(
         unseen=unseen(found),
     )
     if found.held_errors is not None and found.basis is not None:
-        found_one = following(found_one, H, found.basis, found.held_errors.covariance)
+        found_one = following(found_one, H, found.basis, found.held_errors)
     if pulls is not None:
         inverse, _ = local_inverse(H.W)
         found_one = replace(found_one, _alone=found_one._alone + of_corners * inverse @ pulls @ inverse)
