@@ -4,6 +4,8 @@ It lies near the image's middle, but for images that were cut out of larger ones
 that are half of a larger one, from anywhere in it, one in 150 passes for one with exchanged sides, and is refused.
 """
 
+import torch
+
 from diffproj.geometry.camera import Camera
 from diffproj.geometry.image_sides import exchanged, principal_point
 
@@ -34,17 +36,30 @@ def other_image(camera: Camera) -> str:
 
 
 def parts_of_the_image(camera: Camera) -> str:
-    """What makes K look normalised, in parts of the image instead of pixels, in words; empty where nothing does."""
+    """What makes K look normalised, in parts of the image instead of pixels, in words; empty where nothing does.
+
+    Parts may count from the image's corner or from its middle. The identity without a size is that of pixels which are
+    rays, and is none of these.
+    """
     if camera.K.numel() == 0:
         return ""
     K = camera.K.reshape(-1, 3, 3)[0]
     centre, focal = K[:2, 2], K.diagonal()[:2].abs()
-    if not (bool(((centre > 0) & (centre < 1)).all()) and bool((focal < LONGEST).all())):
+    rays = camera.size is None and torch.equal(K, torch.eye(3, dtype=K.dtype, device=K.device))
+    if rays or not (bool((centre.abs() <= 1).all()) and bool((focal < LONGEST).all())):
         return ""
+    corner = bool((centre > 0.1).all())
+    where = "as in parts of the image" if corner else "as in parts of the image, or in millimetres, from its middle"
+    remedy = (
+        "its first row times the width and its second times the height, less half a pixel of the principal point where "
+        "(0, 0) is the image's corner, mend it"
+        if corner
+        else "where the parts run from -1 to 1, its first row times half the width and its second times half the "
+        "height, and the principal point counted from the first pixel's centre, mend it"
+    )
     return (
         f"K: want pixels, got focal lengths ({focal[0]:g}, {focal[1]:g}) and the principal point "
-        f"{_principal_point(camera)}, as in parts of the image: its first row times the width and its second times "
-        "the height, less half a pixel of the principal point where (0, 0) is the image's corner, mend it"
+        f"{_principal_point(camera)}, {where}: {remedy}"
     )
 
 

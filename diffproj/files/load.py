@@ -48,9 +48,10 @@ def load_camera(path: PathLike, format: FormatName | None = None, camera: str | 
     Example:
         >>> import tempfile, torch, diffproj as dp
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     dp.save_camera(f"{folder}/camera.yaml", dp.Camera(torch.eye(3), size=(640, 480)))
+        ...     K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+        ...     dp.save_camera(f"{folder}/camera.yaml", dp.Camera(K, size=(640, 480)))
         ...     dp.load_camera(f"{folder}/camera.yaml")
-        Camera(f 1.0, 1.0 px, c 0.0, 0.0 px, pinhole, 640 x 480 px, no pose, torch.float64)
+        Camera(f 500.0, 500.0 px, c 320.0, 240.0 px, pinhole, 640 x 480 px, no pose, torch.float64)
     """
     return _chosen(Document.read(file_path("path", path)), format, camera)
 

@@ -93,3 +93,30 @@ def test_a_k_in_parts_of_the_image_is_refused(tmp_path: Path, size):
     dp.save_camera(tmp_path / "own.json", own)
     with pytest.warns(UserWarning, match="K: want pixels"):
         assert torch.equal(dp.load_camera(tmp_path / "own.json").K, own.K)
+
+
+@pytest.mark.parametrize("centre", [(0.0, 0.0), (-0.03, 0.02), (0.0, 0.5)])
+@pytest.mark.parametrize("size", [None, (640, 480)])
+def test_a_k_in_parts_from_the_middle_is_refused(tmp_path: Path, size, centre):
+    """As normalised device coordinates have it, in whatever format; they were read as pixels."""
+    K = torch.tensor([[1.2, 0, centre[0]], [0, 1.6, centre[1]], [0, 0, 1]], dtype=torch.float64)
+    names = ["a.yaml", "a.npz", *(["cameras.txt", "transforms.json"] if size else [])]
+    for name in names:
+        dp.save_camera(tmp_path / name, dp.Camera(K, size=size), format={"transforms.json": "nerfstudio"}.get(name))
+        with pytest.raises(
+            ValueError, match=r"K: want pixels, got focal lengths \(1.2, 1.6\).* from its middle: where"
+        ):
+            dp.load_camera(tmp_path / name)
+
+
+def test_where_the_file_counts_from_the_corner_the_first_pixel_s_centre_is_half_a_pixel_off(tmp_path: Path):
+    fields = {"fl_x": 1.2, "fl_y": 1.6, "cx": 0.5, "cy": 0.5, "w": 640, "h": 480}
+    (tmp_path / "transforms.json").write_text(json.dumps(fields))
+    with pytest.raises(ValueError, match="K: want pixels"):
+        dp.load_camera(tmp_path / "transforms.json")
+
+
+def test_pixels_that_are_rays_are_read(tmp_path: Path):
+    """The identity, of a file that knows no size: its pixels are the rays themselves."""
+    dp.save_camera(tmp_path / "a.npz", dp.Camera(torch.eye(3, dtype=torch.float64)))
+    assert torch.equal(dp.load_camera(tmp_path / "a.npz").K, torch.eye(3, dtype=torch.float64))
