@@ -18,14 +18,12 @@ from diffproj.targets import videos
 from diffproj.targets.boards import Board
 from diffproj.targets.detection import Searched, searched
 from diffproj.targets.exif import AS_RECORDED, MIRRORED, Exif, as_recorded, exif_of
-from diffproj.targets.images import SUFFIXES, NotAnImageError, Orientation, Photograph, decoded, listed
+from diffproj.targets.images import HEIC, SUFFIXES, NotAnImageError, Orientation, Photograph, decoded, listed
 from diffproj.targets.one_camera import doubts
 
-HEIC = frozenset({".heic", ".heif", ".hif"})
 RAW = frozenset({".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2"})
 REMEDIES = {
-    HEIC: "HEIC photograph{}, which OpenCV does not read: convert to JPEG in full size, and let an iPhone take JPEG by "
-    "Settings, Camera, Formats, Most Compatible",
+    frozenset({".heic", ".heif", ".hif"}): HEIC,
     RAW: "raw photograph{}, which OpenCV does not read: convert to TIFF or PNG in full size, without lens correction",
 }
 """Photographs that have to be converted: by their suffixes, what they are and what to do."""

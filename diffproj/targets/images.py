@@ -153,6 +153,13 @@ def as_8_bit(image: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
 UNREADABLE = "OpenCV cannot read as one"
 """What is said of the bytes of a file that is no image, or a damaged one."""
 
+HEIC = (
+    "HEIC photograph{}, which OpenCV does not read: convert to JPEG in full size, and let an iPhone take JPEG by "
+    "Settings, Camera, Formats, Most Compatible"
+)
+HEIC_BRANDS = frozenset({b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1"})
+"""What stands behind `ftyp` at the start of such files, whatever these are called."""
+
 
 class NotAnImageError(ValueError):
     """A file that is no image, or a damaged one, or one whose values are no grey levels.
@@ -193,6 +200,8 @@ def decoded(path: Path, orientation: Orientation, colour: bool = False, content:
         image = cv2.imdecode(data, flags) if data.size else None
     except cv2.error as error:  # as of a header that tells of a gigapixel and more
         raise NotAnImageError(path, f"one that OpenCV refuses ({error.err})") from None
+    if image is None and content[4:8] == b"ftyp" and content[8:12] in HEIC_BRANDS:
+        raise NotAnImageError(path, "a " + HEIC.format(""))
     if image is None:
         raise NotAnImageError(path, f"{data.size} bytes that {UNREADABLE}")
     if image.dtype not in (np.uint8, np.uint16, np.int16) and not np.issubdtype(image.dtype, np.floating):

@@ -499,6 +499,9 @@ def test_bad_files_are_named(tmp_path, monkeypatch):
             detect([good, tmp_path / "missing.jpg"], BOARD)
     with pytest.raises(ValueError, match=r"broken\.png: want an image, got 12 bytes that OpenCV cannot read"):
         detect([good, broken], BOARD)
+    broken.with_suffix(".jpg").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(99))  # as phones rename them
+    with pytest.raises(ValueError, match=r"broken\.jpg: want an image, got a HEIC photograph, .*: convert to JPEG"):
+        detect([good, broken.with_suffix(".jpg")], BOARD)
     with pytest.raises(ValueError, match=r"empty\.png: want an image, got 0 bytes"):
         detect([good, empty], BOARD)
     with pytest.raises(FileNotFoundError, match="no such file"):
