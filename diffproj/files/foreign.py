@@ -18,6 +18,10 @@ def _text(pattern: str) -> Callable[[Document], bool]:
 
 KNOWN: tuple[tuple[Callable[[Document], bool], str], ...] = (
     (_text(r"<lensdatabase"), "a lensfun database, whose lens models are of other equations" + CANNOT),
+    (
+        _text(r'"camera_path"\s*:'),
+        "a camera path of nerfstudio, for pictures that it renders; give the transforms.json of the photographs",
+    ),
     (_text(r'"camera_type"\s*:\s*"'), "a calibration of Basalt; export it from there as Kalibr's camchain"),
     (_text(r"^\s*cam0\s*=\s*\["), "a Middlebury calib.txt, of rectified images: K is cam0, without a lens" + CANNOT),
     (_text(r"^\[cam_?\d+\]"), "an anipose calibration.toml" + CANNOT),
@@ -26,6 +30,10 @@ KNOWN: tuple[tuple[Callable[[Document], bool], str], ...] = (
         "cameras of OpenSfM, in units of the image's longer side" + CANNOT,
     ),
     (_text(r"\bxi\b.*:|\bMEI\b"), "an omnidirectional camera (xi), which is neither perspective nor OpenCV's fisheye"),
+    (_text(r"xcr:"), "a camera of RealityCapture, whose focal length is that of 35 mm film" + CANNOT),
+    (_text(r"\ANVM_V\d|\A# Bundle file"), "a model of VisualSFM or Bundler, of other axes and lenses" + CANNOT),
+    (_text(r'"sfm_data_version"\s*:'), "a scene of OpenMVG" + CANNOT),
+    (_text(r'"ppx"\s*:'), "intrinsics of RealSense, fx fy ppx ppy, and coeffs of the model that it names" + CANNOT),
     (_text(r"^\s*-\s*camera\s*:"), "a camera rig of SVO; export it as Kalibr's camchain, or" + CANNOT[1:]),
     (_text(r"^\s*(rvec|tvec|R|T|Tr)\b|<rvec|<R\b"), "a pose alone, without K; give the file with the camera matrix"),
 )

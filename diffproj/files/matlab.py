@@ -23,6 +23,14 @@ HDF5 = b"\x89HDF"
 PAIR = ("CameraParameters1", "CameraParameters2")
 """The cameras of `toStruct(stereoParams)`."""
 
+TURN, SHIFT = "RotationOfCamera2", "TranslationOfCamera2"
+"""The place of the second one, for rows of points times the rotation: it is transposed."""
+
+UNPLACED = (
+    f"the second camera stands where the first one does, for there is no {TURN} and {SHIFT}, and a PoseCamera2 is not "
+    "read; in MATLAB, [~, ~, ~, ~, R, t] = stereoParametersToOpenCV(stereoParams) tells what camera.at(R, t) takes"
+)
+
 TO_STRUCT = "s = toStruct(cameraParams); save('camera.mat', '-struct', 's', '-v7')"
 
 
@@ -53,7 +61,7 @@ def read(document: Document) -> Found:
         return _bouguet(fields)
     stereo = next((holder for holder in (fields, *fields.values()) if _is_stereo(holder)), None)
     if stereo is not None:
-        return Found(_pair(stereo))
+        return Found(_pair(stereo), remarks=() if TURN in stereo else (UNPLACED,))
     structs = {name: value for name, value in {"": fields, **fields}.items() if _is_struct(value)}
     if not structs:
         if any(isinstance(value, mat5.Unreadable) for value in fields.values()):
@@ -74,13 +82,12 @@ def _is_stereo(fields: Any) -> bool:
 def _pair(fields: dict[str, Any]) -> dict[str, Camera]:
     """The two cameras of `stereoParameters`, the second at its place beside the first where the file has it."""
     first, second = (_camera(fields[name]) for name in PAIR)
-    turn, shift = "RotationOfCamera2", "TranslationOfCamera2"  # for rows of points times the rotation: transposed
-    missing = [key for key in (turn, shift) if key not in fields]
+    missing = [key for key in (TURN, SHIFT) if key not in fields]
     if len(missing) == 1:
-        raise ValueError(f"{missing[0]}: want it beside {turn if missing[0] == shift else shift}, got none")
+        raise ValueError(f"{missing[0]}: want it beside {TURN if missing[0] == SHIFT else SHIFT}, got none")
     if not missing:
-        R, t = square(turn, fields[turn], 3, 3).T, vector(shift, fields[shift], (3,))
-        pose = rigid(turn, np.column_stack([R, t]))
+        R, t = square(TURN, fields[TURN], 3, 3).T, vector(SHIFT, fields[SHIFT], (3,))
+        pose = rigid(TURN, np.column_stack([R, t]))
         second = camera_of(second.K.numpy(), second.distortion, second.size, pose)
     return {PAIR[0]: first, PAIR[1]: second}
 

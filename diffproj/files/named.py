@@ -79,7 +79,7 @@ def read(mapping: dict[str, Any], four_is_brown: bool = True) -> Found:
         raise ValueError(_nothing(mapping))
     size, kind = _sides(mapping), _kind(mapping)
     found = {}
-    for label, (name, value) in sorted(matrices.items()):
+    for label, (name, value) in sorted(matrices.items(), key=lambda item: _by_number(item[0])):
         K = intrinsics(name, value)
         lens = _lens(lenses, label, len(matrices), kind, four_is_brown)
         found[label or "camera"] = camera_of(K, lens, _plausible(sizes.get(label, sizes.get("", size)), K))
@@ -89,7 +89,31 @@ def read(mapping: dict[str, Any], four_is_brown: bool = True) -> Found:
             f"{strays[0]}: want a camera matrix to this lens, got {', '.join(n for n, _ in matrices.values())}"
         )
     cameras, keys = posed(found, mapping)
-    return Found(cameras, unread=tuple(poses_beside.unread(mapping, keys)))
+    return Found(cameras, unread=tuple(poses_beside.unread(mapping, keys)), remarks=parts_of_an_image(mapping))
+
+
+def parts_of_an_image(fields: dict[str, Any]) -> tuple[str, ...]:
+    """What ROS's keys say of an image that is a part of the one which was calibrated; empty where it is the whole one.
+
+    Args:
+        fields: the mapping of a camera.
+    """
+    for key in ("binning_x", "binning_y"):
+        if isinstance(fields.get(key), int | float) and fields[key] not in (0, 1):
+            return (
+                f"{key}: want 0 or 1, got {fields[key]}: K is of the image before binning; remove the key, and give "
+                "camera.resized(...) the size after it",
+            )
+    roi = fields.get("roi")
+    if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset", "width", "height")):
+        whole = [roi.get("x_offset", 0), roi.get("y_offset", 0), roi.get("width"), roi.get("height")]
+        width, height = (fields.get(side, fields.get(f"image_{side}")) for side in ("width", "height"))
+        if whole != [0, 0, width, height]:
+            return (
+                f"roi: want the whole image, got {whole}: K is of the image before cropping; remove the key, and cut "
+                "by camera.cropped(left, top, width, height)",
+            )
+    return ()
 
 
 def holds_matrix(mapping: dict[str, Any]) -> bool:
@@ -181,6 +205,11 @@ def _parted(key: str) -> tuple[str, str]:
         return "", core
     label = parts["front"] or parts["back"] or parts["side"] or ""
     return label, parts["core"].replace("_", "")
+
+
+def _by_number(label: str) -> list[tuple[int, str]]:
+    """What labels are sorted by: 2 before 10, where text would be the other way."""
+    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", label)]
 
 
 def _once(known: dict[str, tuple[str, Any]], label: str, key: str, value: Any) -> None:
@@ -303,6 +332,8 @@ def posed(
 ) -> tuple[dict[str, Camera], set[str]]:
     """The second of two cameras at its place beside the first, or the only one at its pose, and the keys of the pose.
 
+    Where the names of two cameras do not tell which is the first, there is no pose.
+
     Args:
         cameras: by name.
         mapping: where the pose may stand.
@@ -314,7 +345,10 @@ def posed(
     pose, keys = poses_beside.of(len(cameras), mapping, apart)
     if pose is None:
         return cameras, set()
-    last = list(cameras)[-1]
+    order = list(cameras) if len(cameras) == 1 else poses_beside.in_order(list(cameras))
+    if order is None:
+        return cameras, set()
+    last = order[-1]
     camera = cameras[last]
     return cameras | {last: camera_of(camera.K.numpy(), camera.distortion, camera.size, pose)}, keys
 

@@ -41,18 +41,20 @@ def read(document: Document) -> Found:
     named.check_no_lens(document.tree, list(holders.values()))
     cameras: dict[str, Camera] = {}
     unread: list[str] = []
+    remarks: list[str] = []
     placed = False
     for name, holder in holders.items():
         found = named.read(holder)
         for inner, camera in found.cameras.items():
             cameras[name if inner == "camera" else f"{name} {inner}"] = camera
         unread += [f"{name}.{key}" for key in found.unread]
+        remarks += [f"{name}, {remark}" for remark in found.remarks]
         placed |= poses_beside.of(len(found.cameras), holder)[0] is not None
     if isinstance(document.tree, dict):
         # A pose of the file's own would overwrite those of its cameras, whose common frame it does not tell.
         cameras, keys = (cameras, set()) if placed else named.posed(cameras, document.tree, apart=True)
-        unread += poses_beside.unread(document.tree, keys | set(holders))
-    return Found(cameras, unread=tuple(unread))
+        unread += poses_beside.unread(document.tree, keys | {*holders, "cameras"})
+    return Found(cameras, unread=tuple(unread), remarks=tuple(remarks))
 
 
 def _holders(tree: Any) -> dict[str, dict[str, Any]]:

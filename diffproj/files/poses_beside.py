@@ -1,8 +1,9 @@
 """Poses that stand beside camera matrices: which of them place a camera, and which are not read, which is said.
 
 Of two cameras `R` and `T`, or `rotation_matrix` and `translation_vector`, as `cv2.stereoCalibrate` calls them, lead
-from the first to the second. Of one camera, `R` and `t` are those that this package writes, world to camera. What
-others mean their programs know: `rvec` and `tvec` of a board, `extrinsics` from a lidar or to a vehicle, either way.
+from the first to the second, where their names tell which that is. Of one camera, `R` and `t` are those that this
+package writes, world to camera. What others mean their programs know: `rvec` and `tvec` of a board, `extrinsics` from
+a lidar or to a vehicle, either way.
 """
 
 import re
@@ -29,11 +30,26 @@ WHOLE = _words("rt extrinsic extrinsics cameraextrinsic cameraextrinsics pose ca
 """Names in lower case, without what stands between words. A place is one of a pose only where a rotation is there too.
 Of 4 x 4 and 3 x 4 numbers with a rotation any name will do."""
 
+SEVERAL = re.compile(
+    r"(?!.*(board|target|marker|pattern)).*(pose|extrinsic|transform|trajector|frames|c2w|w2c|cam(era)?to|tocam)"
+)
+"""Names of lists of poses; those of the board's views are a calibration's own."""
+
+QUATERNIONS = TURNS | _words("q quat")
+ANGLES = _words("roll pitch yaw heading azimuth tilt pan omega phi kappa")
+"""Names of single numbers of a pose; others have `x`, `w` or `01` behind a name of those above."""
+
+SIDES = (("left", "right"), ("first", "second"), ("camera", "projector"), ("cam", "proj"))
+"""Words of two names that tell which camera is the first."""
+
 LARGEST = 16
 """Numbers of a pose, at most."""
 
 MOST_NAMES = 4
 """Keys in a remark."""
+
+_INDEX = re.compile(r"(.*?)_?(\d_?\d|[wxyz\d])")
+"""Where one number of several stands: `t_x`, `qw`, `r11`."""
 
 
 def of(count: int, mapping: dict[str, Any], apart: bool = False) -> tuple[Pose | None, set[str]]:
@@ -95,6 +111,15 @@ def of_one(mapping: dict[str, Any]) -> tuple[Pose | None, set[str]]:
     return rigid("R", np.column_stack([square("R", mapping["R"], 3, 3), square("t", mapping["t"], 3, 1)])), {"R", "t"}
 
 
+def in_order(names: Sequence[str]) -> Sequence[str] | None:
+    """Two cameras, the first before the second; `None` where their names do not tell which that is, as rgb and depth.
+
+    Args:
+        names: of the cameras.
+    """
+    return next((pair for pair in (names, names[::-1]) if _is_before(*pair)), None)
+
+
 def unread(mapping: dict[str, Any], read: set[str]) -> list[str]:
     """The keys of poses that nobody reads; empty where there is none, as where a rotation stands alone.
 
@@ -102,7 +127,8 @@ def unread(mapping: dict[str, Any], read: set[str]) -> list[str]:
         mapping: what to look through, and the mappings right in it.
         read: keys that were read, or that others look through.
     """
-    found = [(key, kind) for key, value in mapping.items() if key not in read for kind in _kinds(key, value)]
+    rest = {key: value for key, value in mapping.items() if key not in read}
+    found = list(_found(rest))
     return [key for key, _ in found] if _tell({kind for _, kind in found}) else []
 
 
@@ -120,16 +146,56 @@ def _tell(kinds: set[str]) -> bool:
     return bool(kinds & {"shift", "pose"}) or kinds == {"turn", "place"}
 
 
+def _found(mapping: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """The keys of a mapping that hold a part of a pose, with what `_kinds` calls it; also where numbers stand alone."""
+    yield from ((key, kind) for key, value in mapping.items() for kind in _kinds(key, value))
+    groups: dict[str, dict[str, str]] = {}
+    for key, value in mapping.items():
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+            continue
+        if (plain := re.sub("[^a-z0-9]", "", key.lower())) in ANGLES:
+            groups.setdefault("angles", {})[plain] = key
+        elif parts := _INDEX.fullmatch(re.sub(r"[\s.\-]+", "_", key.strip()).lower()):
+            groups.setdefault(_plain(parts[1]), {})[parts[2].replace("_", "")] = key
+    for name, parts in groups.items():
+        kind = _kind_of(name, {part: mapping[key] for part, key in parts.items()})
+        if kind is not None:
+            keys = list(parts.values())
+            yield f"{keys[0]} to {keys[-1]}", kind
+
+
+def _kind_of(name: str, parts: dict[str, Any]) -> str | None:
+    """What numbers are, by their common name and what each has behind it."""
+    axes, indices = "".join(sorted(parts)), [part for part in parts if part.isdigit()]
+    if name == "angles":
+        return "pose" if len(parts) > 1 else None
+    if axes == "wxyz":
+        return "turn"
+    if len(indices) in (12, 16) and len(indices) == len(parts):
+        return "pose" if _is_rigid(np.array([float(parts[part]) for part in sorted(parts)])) else None
+    if name in QUATERNIONS and (axes == "xyz" or len(indices) in (3, 4, 9)):
+        return "turn"
+    if axes == "xyz" or len(indices) == 3:
+        return "shift" if name in SHIFTS else "place" if name in PLACES or (not name and axes == "xyz") else None
+    return None
+
+
 def _kinds(key: str, value: Any) -> Iterator[str]:
     """Whether a key holds a `"turn"`, a `"shift"`, a `"place"` or a whole `"pose"`."""
     plain = _plain(key)
     if isinstance(value, dict) and "data" not in value:
-        inside = {kind for inner, item in value.items() for kind in _kinds(inner, item)}
+        inside = {kind for _, kind in _found(value)}
         if plain in TURNS | SHIFTS | PLACES:  # x, y, z by their names
             yield "turn" if plain in TURNS else "shift" if plain in SHIFTS else "place"
         elif _tell(inside):
             yield "pose"
         return
+    if SEVERAL.match(plain) and isinstance(value, list | np.ndarray) and len(value):
+        first = value[0]
+        numbers = None if isinstance(first, dict) else _numbers(key, first)
+        if _tell({kind for _, kind in _found(first)}) if isinstance(first, dict) else _is_rigid(numbers):
+            yield "pose"
+            return
     numbers = _numbers(key, value)
     if numbers is None:
         return
@@ -157,9 +223,24 @@ def _numbers(key: str, value: Any) -> np.ndarray | None:
         return None
 
 
-def _is_rigid(numbers: np.ndarray) -> bool:
+def _is_before(first: str, second: str) -> bool:
+    """Whether the names of two cameras tell that the one is before the other: by a number, a letter or a side."""
+    one, other = first.lower(), second.lower()
+    if first == "camera" or any(one.replace(*side) == other != one for side in SIDES):
+        return True
+    words = [re.findall(r"[a-z]+|\d+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) for name in (first, second)]
+    if words[0] == words[1][:-1] and words[1][-1].isdigit():  # cam, cam2
+        return True
+    apart = [pair for pair in zip(*words, strict=False) if pair[0] != pair[1]]
+    if len(words[0]) != len(words[1]) or len(apart) != 1:
+        return False
+    ((a, b),) = apart
+    return int(a) < int(b) if a.isdigit() and b.isdigit() else len(a) == len(b) == 1 and a < b
+
+
+def _is_rigid(numbers: np.ndarray | None) -> bool:
     """Whether these are 4 x 4 or 3 x 4 numbers, or one list of them, with a rotation."""
-    if numbers.shape not in ((4, 4), (3, 4), (12,), (16,)):
+    if numbers is None or numbers.shape not in ((4, 4), (3, 4), (12,), (16,)):
         return False
     rows = numbers.reshape(-1, 4)
     last = len(rows) == 3 or rows[3].tolist() == [0, 0, 0, 1]

@@ -17,7 +17,7 @@ from diffproj.files import named, poses_beside
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import coefficients, is_fisheye, kind_of, lens_of
-from diffproj.files.numbers import camera_of, image_size, intrinsics, matrix, number, square
+from diffproj.files.numbers import camera_of, image_size, intrinsics, matrix, square
 from diffproj.files.writing import numbers_text, one_camera, without_pose
 from diffproj.geometry.camera import Camera
 
@@ -98,7 +98,8 @@ def _camera(fields: dict[str, Any]) -> Found:
         models = "; its model is plumb_bob (5 coefficients), rational_polynomial (8) or equidistant (4)"
         remedy = models if missing == ["distortion_model"] else ""
         raise ValueError(f"want {' and '.join(missing)} in a camera_info, got none{remedy}")
-    _check_whole_image(fields)
+    for part in named.parts_of_an_image(fields):
+        raise ValueError(part)
     width, height = (fields.get(f"image_{side}", fields.get(side)) for side in ("width", "height"))
     size = image_size(width, height)
     K = intrinsics(*_first(fields, MATRIX))
@@ -128,25 +129,6 @@ def _of_old(fields: dict[str, Any]) -> bool:
 def _first(fields: dict[str, Any], names: tuple[str, ...]) -> Any:
     """The first of the names that holds something, with what it holds; `None` where none does."""
     return next(((name, fields[name]) for name in names if fields.get(name) is not None), None)
-
-
-def _check_whole_image(fields: dict[str, Any]) -> None:
-    """Refuse an image that is a part of the one that was calibrated: K and D hold for the whole one."""
-    for key in ("binning_x", "binning_y"):
-        if number(key, fields.get(key, 0)) not in (0, 1):
-            raise ValueError(
-                f"{key}: want 0 or 1, got {fields[key]}: K is of the image before binning; remove the key, and give "
-                "camera.resized(...) the size after it"
-            )
-    roi = fields.get("roi") or {}
-    if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset", "width", "height")):
-        whole = [roi.get("x_offset", 0), roi.get("y_offset", 0), roi.get("width"), roi.get("height")]
-        width, height = (fields.get(side, fields.get(f"image_{side}")) for side in ("width", "height"))
-        if whole != [0, 0, width, height]:
-            raise ValueError(
-                f"roi: want the whole image, got {whole}: K is of the image before cropping; remove the key, and cut "
-                "by camera.cropped(left, top, width, height)"
-            )
 
 
 def _is_ini(document: Document) -> bool:

@@ -4,8 +4,9 @@ ORB-SLAM writes them flat (`Camera.fx`, `Camera1.fx`; of some pairs `Camera.fx` 
 `Camera`, VINS in `projection_parameters` and `distortion_parameters`. Integer pixel centres. A fisheye only where the
 file says so: `KannalaBrandt8`, `fisheye`, VINS's `KANNALA_BRANDT` with k2 to k5. `Stereo.T_c1_c2` and `Tlr` take the
 second camera to the first, the world; so does `Stereo.b`, along x, where both are rectified. Poses in a body are not
-taken. Where the file also has the two cameras before rectification (`stereo_rectifier`), these are read, and the
-rectified one by its name `"rectified"`.
+taken. A pinhole without coefficients has no lens, but in SLAM's settings, which have them always. Where the file also
+has the two cameras before rectification (`stereo_rectifier`), these are read, and the rectified one by its name
+`"rectified"`.
 """
 
 import re
@@ -17,7 +18,7 @@ from diffproj.files import poses_beside
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import brown, fisheye, kind_of, told
-from diffproj.files.named import check_no_lens, check_no_lens_key, holds_lens, holds_matrix
+from diffproj.files.named import check_no_lens, check_no_lens_key, holds_lens, holds_matrix, parts_of_an_image
 from diffproj.files.named import read as read_named
 from diffproj.files.numbers import camera_of, focal_lengths, image_size, inverse, number, rigid
 from diffproj.files.stereo_rectifier import raw_cameras, raw_sides
@@ -62,7 +63,7 @@ def read(document: Document) -> Found:
     if plain and _is_whole(tree) and holds_lens(tree):
         return _with_vector(tree)
     common = _common(fields)
-    cameras = {name: _camera(common | own, None) for name, own in fields.items()}
+    cameras = {name: _camera(common | own, None, plain) for name, own in fields.items()}
     if raw_sides(tree) and len(cameras) == 1:
         ((name, rectified),) = cameras.items()
         return Found(raw_cameras(tree, fields[name], rectified), {"rectified": rectified})
@@ -71,7 +72,8 @@ def read(document: Document) -> Found:
         second = list(cameras)[1]
         pose = inverse(rigid(poses[0], tree[poses[0]])) if poses else (np.eye(3), _along_x(tree[BASELINE]))
         cameras[second] = _camera(common | fields[second], pose)
-    return Found(cameras, unread=tuple(poses_beside.unread(tree, set())) if plain else ())
+    unread = tuple(poses_beside.unread(tree, set())) if plain else ()
+    return Found(cameras, unread=unread, remarks=parts_of_an_image(tree))
 
 
 def _cameras(tree: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -127,19 +129,19 @@ def _vins(tree: dict[str, Any]) -> dict[str, Any]:
     return {"model_type": tree["model_type"]} | fields | lens | sides
 
 
-def _camera(fields: dict[str, Any], pose: Any) -> Camera:
+def _camera(fields: dict[str, Any], pose: Any, may_be_bare: bool = False) -> Camera:
     if "projection_parameters" in fields:
-        fields = _vins(fields)
+        fields, may_be_bare = _vins(fields), False
     f_x, f_y, c_x, c_y = (_got(fields, key) for key in FOCAL)
     K = focal_lengths(f_x, f_y, c_x, c_y)
     size = None
     for width, height in SIZES:
         if width in fields or height in fields:
             size = image_size(fields.get(width), fields.get(height), f"{width}, {height}")
-    return camera_of(K, _lens(fields), size, pose)
+    return camera_of(K, _lens(fields, may_be_bare), size, pose)
 
 
-def _lens(fields: dict[str, Any]) -> Lens | None:
+def _lens(fields: dict[str, Any], may_be_bare: bool) -> Lens | None:
     kinds = {kind_of(key, fields[key]) for key in TYPES if key in fields and not _is_perspective(fields[key])}
     kinds |= told(fields, TYPES).keys()
     if {"brown", "fisheye"} <= kinds:
@@ -154,7 +156,7 @@ def _lens(fields: dict[str, Any]) -> Lens | None:
             raise ValueError(f"want k1 to k4 of the fisheye lens that the file names, got {', '.join(given) or 'none'}")
         return fisheye([given[key] for key in ("k1", "k2", "k3", "k4")])
     types = [key for key in TYPES if key in fields and str(fields[key]).lower() != "rectified"]
-    if not given and types:
+    if not given and types and not (may_be_bare and all(_is_perspective(fields[key]) for key in types)):
         raise ValueError(f"want k1 k2 p1 p2 beside {types[0]}, got none")
     if not given:
         return None

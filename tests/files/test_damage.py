@@ -352,6 +352,11 @@ def test_what_formats_have_and_we_do_not(tmp_path: Path, name: str, change: tupl
             "a lensfun database",
         ),
         ("a.json", '{"value0": {"intrinsics": [{"camera_type": "ds"}]}}', "a calibration of Basalt"),
+        ("a.json", '{"camera_type": "fisheye", "camera_path": [{"fov": 50}]}', "a camera path of nerfstudio"),
+        ("a.xmp", '<x:xmpmeta xmlns:x="a"><a xmlns:xcr="b" xcr:Skew="0"/></x:xmpmeta>', "a camera of RealityCapture"),
+        ("a.nvm", "NVM_V3\n\n1\na.jpg 500 1 0 0 0 0 0 0 0.1 0\n", "a model of VisualSFM or Bundler"),
+        ("sfm_data.json", '{"sfm_data_version": "0.3", "intrinsics": [{"key": 0}]}', "a scene of OpenMVG"),
+        ("a.json", '{"fx": 1.0, "ppx": 2.0, "model": "distortion.brown_conrady"}', "intrinsics of RealSense"),
         (
             "calib.txt",
             "cam0=[3979.911 0 1244.772; 0 3979.911 1019.507; 0 0 1]\ndoffs=124.343\n",

@@ -41,6 +41,14 @@ PAIR = {"K1": K, "D1": D, "K2": K, "D2": D}
         ({"rotation": R, "position": T}, "rotation, position"),
         ({"orientation": {"x": 0, "y": 0, "z": 0, "w": 1}, "position": {"x": 1, "y": 2, "z": 3}}, "orientation, pos"),
         ({"mounting": {"quaternion": [1, 0, 0, 0], "location": T}}, "mounting"),
+        ({"qw": 1, "qx": 0, "qy": 0, "qz": 0, "tx": 1, "ty": 2, "tz": 3}, "qw to qz, tx to tz"),
+        ({f"t_{i}{j}": RT[i][j] for i in range(3) for j in range(4)}, "t_00 to t_23"),
+        ({f"r{i}{j}": R[i - 1][j - 1] for i in (1, 2, 3) for j in (1, 2, 3)} | {"tvec": T}, "tvec, r11 to r33"),
+        ({"x": 1, "y": 2, "z": 3, "roll": 0.1, "pitch": 0.2, "yaw": 0.3}, "x to z, roll to yaw"),
+        ({"heading": 90.0, "tilt": 20.0, "height": 6.0}, "heading to tilt"),
+        ({"extrinsics": {"rx": 0.1, "ry": 0.2, "rz": 0.3, "tx": 1, "ty": 2, "tz": 3}}, "extrinsics"),
+        ({"extrinsics": [[*RT, [0, 0, 0, 1]]] * 3}, "extrinsics"),
+        ({"frames": [{"name": "a.png", "c2w": [*RT, [0, 0, 0, 1]]}]}, "frames"),
     ],
 )
 def test_a_pose_of_unknown_meaning_is_not_dropped_in_silence(
@@ -64,6 +72,10 @@ def test_a_pose_of_unknown_meaning_is_not_dropped_in_silence(
         {"position": "front", "origin": [0, 0, 0]},
         {"twelve": [0.5] * 12, "bounds": [[1, 0, 0, 1]] * 3},
         {"R1": R, "P1": [[*row, 0.0] for row in K], "Q": np.diag([1.0, 1, 0, 0.1]).tolist(), "E": R, "F": R},
+        {"x": 1, "y": 2, "z": 3, "yaw": 0.5, "gx": 0, "gy": 0, "gz": 9.8, "qx": 1, "qy": 2},
+        {"lat": 47.1, "lon": 8.2, "alt": 400, "v0": 1, "v1": 2, "v2": 3, "on_x": True, "on_y": True, "on_z": True},
+        {f"m{i}{j}": 0.5 for i in range(3) for j in range(4)} | {"board_poses": [[*RT, [0, 0, 0, 1]]] * 3},
+        {"observations": [{"pose": {"rotation": [1, 0, 0, 0], "translation": T}}] * 3},
         {"newcameramtx": K, "roi": [0, 0, 640, 480], "T": 25.5, "pose": "front", "transform": None},
     ],
 )
@@ -88,6 +100,36 @@ def test_a_pair_is_placed_by_what_opencv_calls_r_and_t(tmp_path: Path, names: tu
     np.testing.assert_allclose(poses(load(tmp_path, "pair.npz", npz(**arrays))[1])[:3], RT, atol=1e-15)
     with pytest.raises(ValueError, match=f"from the first camera to the second, got {names[0]}"):
         load(tmp_path, "plain.json", json.dumps(PAIR | {names[0]: R}))
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        *(("left", "right"), ("cam0", "cam1"), ("camera2", "camera10"), ("camL", "camR"), ("leftCam", "rightCam")),
+        *(("cam_a", "cam_b"), ("cam", "cam2"), ("camera", "projector"), ("stereo 1", "stereo 2")),
+    ],
+)
+def test_names_tell_the_first_of_a_pair_whatever_the_order_in_the_file(tmp_path: Path, first: str, second: str) -> None:
+    """The left camera was placed where the right one is, if it stood behind it in the file."""
+    for names in ((first, second), (second, first)):
+        tree = dict.fromkeys(names, ONE) | {"R": R, "T": T}
+        np.testing.assert_array_equal(poses(load(tmp_path, "plain.json", json.dumps(tree), camera=first)), np.eye(4))
+        placed = load(tmp_path, "plain.json", json.dumps(tree), camera=second)
+        np.testing.assert_allclose(poses(placed)[:3], RT, atol=1e-15)
+
+
+def test_a_pair_whose_names_tell_no_order_has_no_pose(tmp_path: Path) -> None:
+    """It was that of whichever name is later in the alphabet, or in the file."""
+    flat = {"rgb_K": K, "rgb_D": D, "depth_K": K, "depth_D": D}
+    for tree in (flat, {"rgb": ONE, "depth": ONE}, {"depth": ONE, "rgb": ONE}):
+        with pytest.warns(UserWarning, match="R, T: a pose that is not read"):
+            assert not load(tmp_path, "plain.json", json.dumps(tree | {"R": R, "T": T})).t.any()
+
+
+def test_cameras_are_counted_by_their_numbers(tmp_path: Path) -> None:
+    """As text, 10 comes before 2."""
+    tree = {f"cam{i}_K": [[500.0 + i, 0, 320], [0, 501, 240], [0, 0, 1]] for i in (10, 2)}
+    assert load(tmp_path, "plain.json", json.dumps(tree)).K[:, 0, 0].tolist() == [502.0, 510.0]
 
 
 def test_three_cameras_have_no_pair_s_pose(tmp_path: Path) -> None:

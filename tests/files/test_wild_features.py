@@ -119,7 +119,41 @@ def test_matlabs_stereo_pair_stands_as_it_says(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="TranslationOfCamera2: want it beside RotationOfCamera2, got none"):
         load(tmp_path, "a.json", json.dumps(pair))
     del pair["RotationOfCamera2"]
-    assert not load(tmp_path, "a.json", json.dumps(pair)).t.any()
+    for pose in ({}, {"PoseCamera2": {"R": TURN, "Translation": t}}):  # the latter since R2022b; both were silent
+        with pytest.warns(UserWarning, match="the second camera stands where the first one does, for there is no Rot"):
+            assert not load(tmp_path, "a.json", json.dumps(pair | pose)).t.any()
+
+
+@pytest.mark.parametrize("beside", [{"binning_x": 2}, {"roi": {"x_offset": 9, "y_offset": 0, "width": 9, "height": 9}}])
+def test_a_part_of_the_calibrated_image_is_told_of_beside_opencvs_keys_too(
+    tmp_path: Path, beside: dict[str, object]
+) -> None:
+    """In a camera_info it is refused; here the keys may be settings of the camera while it was calibrated."""
+    K = {"camera_matrix": [[500, 0, 320], [0, 500, 240], [0, 0, 1]], "dist_coeffs": [0.1, 0, 0, 0, 0]}
+    numbers_alone = {"fx": 500, "fy": 500, "cx": 320, "cy": 240}
+    for tree in (K | beside, numbers_alone | beside, {"left": K | beside, "right": K}):
+        with pytest.warns(UserWarning, match=rf"{next(iter(beside))}: want .*K is of the image before"):
+            assert load(tmp_path, "a.json", json.dumps(tree), camera=0).K[0, 2] == 320.0
+
+
+@pytest.mark.parametrize("key", ["model", "camera_model", "type"])
+def test_a_pinhole_of_numbers_one_by_one_has_no_lens(tmp_path: Path, key: str) -> None:
+    """It was refused."""
+    for value in ("pinhole", "PINHOLE", "perspective"):
+        tree = {key: value, "fx": 500, "fy": 501, "cx": 320, "cy": 240, "width": 640, "height": 480}
+        assert load(tmp_path, "a.json", json.dumps(tree)).distortion is None
+    with pytest.raises(ValueError, match="want k1 k2 p1 p2 beside"):
+        load(tmp_path, "a.json", json.dumps(tree | {key: "radtan"}))
+
+
+@pytest.mark.parametrize("key", ["camera_type", "lens_model"])
+def test_the_number_of_a_kind_is_no_flag_of_a_fisheye(tmp_path: Path, key: str) -> None:
+    """1 was taken for the fisheye model, under any of the keys that name a model."""
+    tree = {key: 1, "K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]]}
+    five = load(tmp_path, "a.json", json.dumps(tree | {"dist": [0.1, 0.01, 0, 0, 0]}))
+    assert isinstance(five.distortion, dp.BrownConrady)
+    with pytest.raises(ValueError, match="want 5 coefficients, or the name of the model beside 4"):
+        load(tmp_path, "a.json", json.dumps(tree | {"dist": [0.1, 0.01, 0, 0]}))
 
 
 def _rectified_pair() -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
