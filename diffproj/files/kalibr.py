@@ -15,7 +15,7 @@ import numpy as np
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.files.document import Document
 from diffproj.files.found import Found
-from diffproj.files.lenses import coefficients, first_brown, is_fisheye, kind_of, lens_of
+from diffproj.files.lenses import KINDS_BY_NAME, coefficients, first_brown, is_fisheye, kind_of, lens_of
 from diffproj.files.named import check_no_lens_key
 from diffproj.files.numbers import camera_of, focal_lengths, image_size, inverse, matrix, rigid, vector
 from diffproj.files.poses_beside import unread as unread_poses
@@ -108,6 +108,11 @@ def _number(name: str) -> int | None:
 
 def _camera(name: str, fields: dict[str, Any], pose: Pose | None) -> Camera:
     model = fields.get("camera_model", "pinhole")
+    if model != "pinhole" and str(model) in KINDS_BY_NAME:
+        raise ValueError(
+            f"{name}, camera_model: want pinhole, got the lens {model!r}; write camera_model: pinhole, and this as "
+            "distortion_model"
+        )
     if model != "pinhole":
         raise ValueError(
             f"{name}, camera_model: want pinhole, got {model!r}, whose equations no lens of this package has; "

@@ -89,7 +89,10 @@ def read(mapping: dict[str, Any], four_is_brown: bool = True) -> Found:
             f"{strays[0]}: want a camera matrix to this lens, got {', '.join(n for n, _ in matrices.values())}"
         )
     cameras, keys = posed(found, mapping)
-    return Found(cameras, unread=tuple(poses_beside.unread(mapping, keys)), remarks=parts_of_an_image(mapping))
+    remarks = parts_of_an_image(mapping)
+    if len(found) == 1:
+        remarks += other_focal_lengths(mapping, *found.values())
+    return Found(cameras, unread=tuple(poses_beside.unread(mapping, keys)), remarks=remarks)
 
 
 def parts_of_an_image(fields: dict[str, Any]) -> tuple[str, ...]:
@@ -112,6 +115,29 @@ def parts_of_an_image(fields: dict[str, Any]) -> tuple[str, ...]:
             return (
                 f"roi: want the whole image, got {whole}: K is of the image before cropping; remove the key, and cut "
                 "by camera.cropped(left, top, width, height)",
+            )
+    return ()
+
+
+def other_focal_lengths(fields: dict[str, Any], camera: Camera) -> tuple[str, ...]:
+    """What is said of a K, or of fx and fy, beside those that were read; empty where they agree to 1 %.
+
+    Args:
+        fields: the mapping of the camera.
+        camera: as it was read.
+    """
+    read = camera.K.diagonal().numpy()[:2]
+    beside = [(key, value) for key, value in fields.items() if _is_matrix(*_parted(key), value)]
+    for names, value in [*beside, ("fx, fy", [fields.get("fx"), fields.get("fy")])]:
+        try:
+            found = matrix(names, value)
+        except ValueError:
+            continue
+        focal = found.ravel()[[0, 4]] if found.size == 9 else found.ravel()
+        if focal.shape == (2,) and not np.allclose(focal, read, rtol=0.01):
+            return (
+                f"{names}: focal lengths {focal[0]:g} and {focal[1]:g} beside those that were read, {read[0]:g} and "
+                f"{read[1]:g}: take the wrong ones out of the file",
             )
     return ()
 

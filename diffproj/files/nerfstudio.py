@@ -17,7 +17,7 @@ from diffproj.calibration.results.calibration import Calibration
 from diffproj.files.document import Document
 from diffproj.files.found import Found
 from diffproj.files.lenses import brown, coefficients, first_brown, fisheye, is_fisheye, told, unused
-from diffproj.files.named import check_no_lens_key
+from diffproj.files.named import check_no_lens_key, other_focal_lengths
 from diffproj.files.numbers import camera_of, focal_lengths, image_size, inverse, number, rigid
 from diffproj.files.writing import cameras_of
 from diffproj.geometry.camera import Camera
@@ -54,8 +54,10 @@ def read(document: Document) -> Found:
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise ValueError("frames: want a list of frames, got something else")
     if not frames:
-        return Found({"camera": _camera(tree, None)})
+        camera = _camera(tree, None)
+        return Found({"camera": camera}, remarks=other_focal_lengths(tree, camera))
     cameras: dict[str, Camera] = {}
+    remarks: list[str] = []
     for i, frame in enumerate(frames):
         name = str(frame.get("file_path", i))
         if name in cameras:
@@ -64,7 +66,8 @@ def read(document: Document) -> Found:
             raise ValueError(f"frame {name}: want a transform_matrix, got none")
         R, t = rigid("transform_matrix", frame["transform_matrix"])
         cameras[name] = _camera(tree | frame, inverse((R @ FLIP, t)))
-    return Found(cameras)
+        remarks += other_focal_lengths(tree | frame, cameras[name])
+    return Found(cameras, remarks=tuple(remarks[:1]))
 
 
 def write(path: Path, item: Camera | Calibration) -> dict[Path, str]:

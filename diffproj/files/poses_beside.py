@@ -35,6 +35,12 @@ SEVERAL = re.compile(
 )
 """Names of lists of poses; those of the board's views are a calibration's own."""
 
+ENDINGS = re.compile(
+    r"(?!.*(board|target|marker|pattern|rect)).+"
+    r"((?P<turn>rotation(matrix|vector)?|rvec|quaternion|(?<=ext|sic)r)|(?P<shift>translation(vector)?|tvec|(?<=ext|sic)t))"
+)
+"""Names with another word before those of a rotation or a shift, as `extrinsicRotation` and `camera_ext_t`."""
+
 QUATERNIONS = TURNS | _words("q quat")
 ANGLES = _words("roll pitch yaw heading azimuth tilt pan omega phi kappa")
 """Names of single numbers of a pose; others have `x`, `w` or `01` behind a name of those above."""
@@ -203,6 +209,10 @@ def _kinds(key: str, value: Any) -> Iterator[str]:
         yield "pose"
     elif plain in TURNS and numbers.size in (3, 4, 9):
         yield "turn"
+    elif (named := ENDINGS.fullmatch(re.sub("[^a-z0-9]", "", key.lower()))) and numbers.size in (
+        (3, 4, 9) if named["turn"] else (3,)
+    ):
+        yield "turn" if named["turn"] else "shift"
     elif plain in SHIFTS | PLACES and numbers.size == 3:
         yield "shift" if plain in SHIFTS else "place"
 

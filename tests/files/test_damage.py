@@ -291,6 +291,11 @@ def test_a_pose_with_a_scale_is_named_as_one(tmp_path: Path) -> None:
         ("images.txt", (" 1 left", " 7 left"), "want a camera of cameras.txt, got the id 7"),
         ("images.txt", ("0.9659258", "0.5659258"), "want a quaternion of length 1"),
         ("camchain.yaml", ("camera_model: pinhole", "camera_model: ds"), "want pinhole, got 'ds'"),
+        (
+            "camchain.yaml",
+            ("camera_model: pinhole", "camera_model: plumb_bob"),
+            "the lens 'plumb_bob'; write camera_mo",
+        ),
         ("camchain.yaml", ("distortion_model: radtan", "distortion_model: fov"), "got 'fov', which is neither"),
         ("camchain.yaml", ("  distortion_model: radtan\n", ""), "want a distortion_model, got none"),
         ("camchain.yaml", ("intrinsics: [458", "intrinsic: [458"), "cam0: want intrinsics"),

@@ -48,6 +48,8 @@ PAIR = {"K1": K, "D1": D, "K2": K, "D2": D}
         ({"heading": 90.0, "tilt": 20.0, "height": 6.0}, "heading to tilt"),
         ({"extrinsics": {"rx": 0.1, "ry": 0.2, "rz": 0.3, "tx": 1, "ty": 2, "tz": 3}}, "extrinsics"),
         ({"extrinsics": [[*RT, [0, 0, 0, 1]]] * 3}, "extrinsics"),
+        ({"extrinsicRotation": R, "extrinsicTranslation": T}, "extrinsicRotation, extrinsicTranslation"),
+        ({"camera_ext_R": np.ravel(R).tolist(), "camera_ext_t": T}, "camera_ext_R, camera_ext_t"),
         ({"frames": [{"name": "a.png", "c2w": [*RT, [0, 0, 0, 1]]}]}, "frames"),
     ],
 )
@@ -75,6 +77,7 @@ def test_a_pose_of_unknown_meaning_is_not_dropped_in_silence(
         {"x": 1, "y": 2, "z": 3, "yaw": 0.5, "gx": 0, "gy": 0, "gz": 9.8, "qx": 1, "qy": 2},
         {"lat": 47.1, "lon": 8.2, "alt": 400, "v0": 1, "v1": 2, "v2": 3, "on_x": True, "on_y": True, "on_z": True},
         {f"m{i}{j}": 0.5 for i in range(3) for j in range(4)} | {"board_poses": [[*RT, [0, 0, 0, 1]]] * 3},
+        {"board_rotation": R, "board_translation": T, "rectify_translation": T, "cameraRotation": R, "offset": T},
         {"observations": [{"pose": {"rotation": [1, 0, 0, 0], "translation": T}}] * 3},
         {"newcameramtx": K, "roi": [0, 0, 640, 480], "T": 25.5, "pose": "front", "transform": None},
     ],

@@ -1,6 +1,7 @@
 """Odd features of real files, each read as its program means it, or refused."""
 
 import json
+import warnings
 from pathlib import Path
 
 import cv2
@@ -288,3 +289,27 @@ def test_a_lens_that_holds_for_both_cameras_is_not_dropped(tmp_path: Path, kind:
         assert numbers(camera) == ([250.5 + i] * 4, [0.1, 0.2, 0.01, 0.02, 0.3])
     second = load(tmp_path, "pair.yaml", text + "Camera2.k1: -0.1\n", camera=1)
     assert numbers(second)[1] == [-0.1, 0.2, 0.01, 0.02, 0.3]
+
+
+def test_focal_lengths_that_contradict_those_that_are_read_are_told_of(tmp_path: Path) -> None:
+    """They were passed over."""
+    K = [[500.0, 0, 320], [0, 501, 240], [0, 0, 1]]
+    frames = [{"file_path": name, "transform_matrix": np.eye(4).tolist(), "K": K} for name in "ab"]
+    sides = {"w": 640, "h": 480}
+    agreeing = [
+        ({"fl_x": 500, "fl_y": 501, "frames": frames} | sides),
+        ({"K": K, "fx": 500.4, "fy": 500.6}),
+        ({"K": K, "fx": None, "fy": "a"}),
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for tree in agreeing:
+            load(tmp_path, "a.json", json.dumps(tree))
+    for tree, focal in (
+        ({"camera_angle_x": 0.9, "frames": frames} | sides, 662.5),
+        ({"K": K, "fx": 99, "fy": 99}, 500),
+    ):
+        with pytest.warns(UserWarning, match=r"(K|fx, fy): focal lengths .* beside those that were read, ") as told:
+            camera = load(tmp_path, "a.json", json.dumps(tree))
+        assert camera.K[..., 0, 0].ravel()[0] == pytest.approx(focal, abs=0.1)
+        assert len(told) == 1
