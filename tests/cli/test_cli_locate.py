@@ -52,7 +52,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     dp.save_camera(folder / "sizeless.json", dp.Camera.from_opencv(K, lens))
     K = [[1400, 0, 959.5], [0, 1400, 539.5], [0, 0, 1]]
     dp.save_camera(folder / "rough.yaml", dp.Camera.from_opencv(K, [0, 0, 0, 0], size=(1920, 1080)))
-    two = dp.Camera(torch.eye(3, dtype=torch.float64).expand(2, 3, 3), size=(640, 480))
+    K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+    two = dp.Camera(K.expand(2, 3, 3), size=(640, 480))
     dp.save_camera(folder / "two.json", two)
     cv2.imwrite(str(folder / "beach.jpg"), np.full((2160, 3840), 120, np.uint8))
     cv2.imwrite(str(folder / "small.png"), np.full((216, 384), 120, np.uint8))
