@@ -30,8 +30,11 @@ FILM = math.hypot(36.0, 24.0)
 TOLD = 0.05
 """Relative deviation of a focal length that they tell: in whole mm, and of the width or of the diagonal."""
 
+SENSORS = (4 / 3, 3 / 2)
+"""Ratios of the sides of nearly all sensors; photographs of other ratios show a part of them."""
+
 OTHER_SHAPE = 0.02
-"""Logarithm of the ratio of two ratios of sides from which on a photograph was cropped: some files tell the sensor's
+"""Logarithm of the ratio of two ratios of sides from which on one is a part of the other: some files tell the sensor's
 sides, with some columns and rows more."""
 
 SECOND = 0.5
@@ -96,8 +99,12 @@ def assumed_camera(
     if known := {one.name for one in said} & {*FOCAL}:
         raise ValueError(f"--prior: want no {min(known)!r} beside --fov, which tells the focal length")
     width, height = size
+    if view.degrees is None:
+        focal, relative = _focal_in_file(exif, size)
+    else:
+        focal, relative = width / 2 / math.tan(math.radians(view.degrees / 2)), 0.0
     # Half the width and half the diagonal, squared, as parts of the distance at which the sensor seems to be.
-    edge = width / 2 / _focal_in_file(exif, size) if view.degrees is None else math.tan(math.radians(view.degrees / 2))
+    edge = width / 2 / focal
     corner = (edge * math.hypot(width, height) / width) ** 2
     usual = Known("k1", 0.0, min(max(BEND, LEAST / corner), MOST / corner))
     lens = next((one for one in said if one.name == "k1"), usual)
@@ -106,7 +113,6 @@ def assumed_camera(
             f"--prior: want a k1 above {-1 / (3 * corner):.2g} with this field of view, got {lens.value:g}, with which "
             "the image folds before its corners"
         )
-    focal, relative = width / 2 / edge, TOLD
     if view.degrees is not None:
         bent = 1 + lens.value * edge**2
         slope = (1 + 3 * lens.value * edge**2) * (1 + edge**2) / (2 * edge * bent)
@@ -164,8 +170,12 @@ def _check_known(view: FieldOfView, told: bool, relative: float, free: bool) -> 
         )
 
 
-def _focal_in_file(exif: Exif, size: tuple[int, int]) -> float:
-    """The focal length in px that the file of a photograph tells, by the diagonal as CIPA's guideline has it.
+def _focal_in_file(exif: Exif, size: tuple[int, int]) -> tuple[float, float]:
+    """The focal length in px that the file of a photograph tells, and its relative deviation.
+
+    It is told by the diagonal of the image area, as CIPA's guideline has it. EXIF does not say which area that is where
+    a camera shows a part of its sensor, as one set to 16:9 does: some mean the photograph, others the sensor as ever.
+    The focal length then lies in the middle between the two, and may be as far off as they are.
 
     Raises:
         ValueError: it tells none.
@@ -179,7 +189,17 @@ def _focal_in_file(exif: Exif, size: tuple[int, int]) -> float:
             f"--fov: want PHOTO as a whole, whose EXIF data tell its focal length, got {width} x {height} px of what "
             f"they tell as {before} x {above}; say degrees from its left to its right edge, as 70+-5"
         )
-    return exif.focal_35 / FILM * math.hypot(*size)
+    ratio = _ratio(size)
+    whole = any(abs(math.log(ratio / own)) <= OTHER_SHAPE for own in SENSORS)
+    larger = 1.0 if whole else max(_diagonals(own, ratio) for own in SENSORS)
+    middle, apart = (larger + 1) / 2, (larger - 1) / 2
+    return middle * exif.focal_35 / FILM * math.hypot(*size), math.hypot(TOLD, apart / middle)
+
+
+def _diagonals(own: float, ratio: float) -> float:
+    """The diagonal of a sensor over that of the largest part of it whose sides have another ratio."""
+    width = min(own, ratio)  # both in heights of the sensor
+    return math.hypot(own, 1) / math.hypot(width, width / ratio)
 
 
 def _ratio(size: tuple[int, int]) -> float:

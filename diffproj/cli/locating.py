@@ -253,6 +253,9 @@ def _in_words(text: str, surveyed: Surveyed) -> str:
     text = re.sub("^(target|views): |^(refine|adjust): ", "", text)
     text = re.sub("^(priors|fixed|pixel_sigma): ", lambda m: f"{OPTIONS[m[1]]}: ", text)
     text = re.sub(r"; fix (\w+|some of them) or give a prior, as .*$", r"; tell \1 by --fixed or --prior", text)
+    text = re.sub(
+        r"; fix (\w+|some of them) or give (a narrower) prior, as .*$", r"; tell \1 by --fixed or \2 --prior", text
+    )
     text = re.sub(r"; fixed=\(.*$", "; or less in --free", text)
     text = re.sub(r": start closer, or ", ": check the camera, or ", text)
     text = re.sub(r": fit --distortion .*$", ": tell more of the lens, as by --prior k1=-0.1+-0.05", text)

@@ -9,6 +9,7 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
 from diffproj._core.numerics import in_float64
+from diffproj._core.warn import warn_caller
 from diffproj.calibration.problem.parametrisation import POSE
 from diffproj.calibration.results.calibration import Calibration, as_calibration
 from diffproj.geometry.camera import Camera, as_camera
@@ -32,6 +33,9 @@ class CalibrationPrior(GeometryModule):
     Directions without a finite, positive variance add nothing, however far the camera moves along them: what the
     calibration held fixed, the ratio of focal lengths that it tied (`tied_focal=True`), and what the corners did not
     determine. To keep what was fixed, do not learn it.
+
+    Pixels are those of the calibration's image: a camera of that image resized or cropped counts in others, and a
+    warning says so.
 
     Everything is in float64, whatever the dtype of the network around it: the covariance of a lens is too close to
     singular for less.
@@ -74,7 +78,7 @@ class CalibrationPrior(GeometryModule):
         # The rows of C are the camera's parameters, the target's shape, which is none of the camera's, and the pose.
         of_pose = range(len(known.names), len(known.names) + (0 if view is None else POSE))
         rows = torch.tensor([*range(parameters.size), *of_pose], device=C.device)
-        self.parametrisation, self.with_pose = parameters, view is not None
+        self.parametrisation, self.with_pose, self.size = parameters, view is not None, camera.size
         self.register_buffer("R_0", in_float64(camera.R).clone())
         self.register_buffer("middle", torch.zeros_like(self.R_0[0]) if middle is None else middle.clone())
         self.register_buffer("center", self._vector(camera).clone())
@@ -97,6 +101,13 @@ class CalibrationPrior(GeometryModule):
             raise ValueError(f"camera: want the calibration's lens model {wanted!r}, got {lens!r}")
         if camera.device != self.center.device:
             raise ValueError(f"camera: want device {self.center.device} as the prior has, got {camera.device}")
+        if self.size is not None and camera.size is not None and self.size != camera.size:
+            here, there = (f"{width} x {height}" for width, height in (camera.size, self.size))
+            warn_caller(
+                f"CalibrationPrior: the calibration's image has {there} px, and the camera's {here}: where it was "
+                "resized or cropped, its focal lengths and principal point are no more comparable; learn the camera of "
+                "the calibration, and resize or crop what it gives"
+            )
         off = self._vector(camera) - self.center
         return (off * (self.precision * off.unsqueeze(-2)).sum(-1)).sum(-1) / 2
 

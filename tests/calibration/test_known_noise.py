@@ -1,5 +1,6 @@
 """Poses found with a known noise: where residuals contradict it, whatever is measured from them says so."""
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -66,13 +67,16 @@ TOGETHER = "the views contradict each other"
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_noise_that_leaves_out_what_corners_of_a_view_have_in_common_is_told(side: str) -> None:
-    """Without it deviations are 2.5 and 2.8 times as large."""
+    """Without it those of the lens are 2.4 and 2.7 times as large; of the focal length views tell more by themselves."""
     views, board = dp.example_views(side), dp.Chessboard()
     plain = dp.calibrate(views, board)
     known = dp.calibrate(views, board, pixel_sigma=float(plain.pixel_sigma))  # type: ignore[arg-type]
-    times = float(plain.covariance.deviations["f_x"] / known.covariance.deviations["f_x"])
+    times = float(plain.covariance.deviations["k1"] / known.covariance.deviations["k1"])
     assert times > 2
-    assert f"{TOGETHER} {times:.2g} times as much as corners of that pixel_sigma would" in known.remarks[0]
+    said = re.search(f"{TOGETHER} (.*) times as much as corners of that pixel_sigma would", known.remarks[0])
+    assert said is not None
+    assert float(said[1]) == pytest.approx(times, rel=0.05)
+    assert plain.covariance.deviations["f_x"] < 1.5 * known.covariance.deviations["f_x"]
     assert known.verdict.startswith(f"Weak: {TOGETHER}")
     assert TOGETHER not in plain.remarks[0]
     assert TOGETHER not in dp.calibrate(views, board, pixel_sigma=2.5 * float(plain.pixel_sigma)).remarks[0]  # type: ignore[arg-type]

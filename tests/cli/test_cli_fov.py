@@ -11,6 +11,9 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 import diffproj as dp
+from diffproj.cli.assumed_camera import assumed_camera
+from diffproj.cli.known_beforehand import FieldOfView
+from diffproj.targets.exif import Exif
 from tests.cli.commands import parser, runner
 
 W, H = 1920, 1080
@@ -150,13 +153,40 @@ def test_a_field_of_view_that_landmarks_contradict_is_told(capsys: pytest.Captur
 
 
 def test_the_photographs_file_tells_the_focal_length(capsys: pytest.CaptureFixture[str]) -> None:
-    """As that of a 35 mm film camera, by the diagonal, to a twentieth."""
+    """As that of a 35 mm film camera, by the diagonal of the photograph or, in 16:9, of a sensor with 4:3."""
     found = parsed(capsys, "told.jpg", *YARD[1:], "--fov", "exif")
-    focal = 27 / np.hypot(36, 24) * np.hypot(W, H)
-    assert found["priors"]["focal"] == {"value": pytest.approx(focal), "deviation": pytest.approx(0.05 * focal)}
+    ends = 27 / np.hypot(36, 24) * np.array([np.hypot(W, H), np.hypot(W, W * 3 / 4)])
+    focal, apart = ends.mean(), (ends[1] - ends[0]) / 2
+    deviation = np.hypot(0.05 * focal, apart)
+    assert found["priors"]["focal"] == {"value": pytest.approx(focal), "deviation": pytest.approx(deviation)}
     assert "27 mm of 35 mm film, if nobody cropped the photograph" in found["assumed"]["text"]
     # Made smaller, or turned, it shows as much.
     assert parsed(capsys, "turned.jpg", *YARD[1:], "--fov", "exif")["priors"] == found["priors"]
+
+
+@pytest.mark.parametrize(
+    ("size", "truths"),
+    [
+        ((4000, 3000), (4000 * 1.25,)),
+        ((3024, 4032), (4032 * 1.25,)),
+        ((6000, 4000), (np.hypot(6000, 4000),)),
+        ((6016, 4000), (np.hypot(6016, 4000),)),
+        ((4000, 2250), (np.hypot(4000, 2250), 4000 * 1.25, np.hypot(4000, 4000 / 1.5))),
+        ((2250, 4000), (np.hypot(4000, 2250), 4000 * 1.25, np.hypot(4000, 4000 / 1.5))),
+        ((3000, 3000), (np.hypot(3000, 3000), np.hypot(3000, 4000), np.hypot(3000, 4500))),
+    ],
+)
+def test_a_file_means_the_photograph_or_the_whole_sensor(size: tuple[int, int], truths: tuple[float, ...]) -> None:
+    """The diagonal in px that 43.3 mm of film stand for: 16:9 and 1:1 are parts of sensors with 4:3 or 3:2.
+
+    Taken by the photograph's own to 5 %, whole sensors were 1.6 and 4.3 deviations off.
+    """
+    told = assumed_camera(FieldOfView(None, None), size, (), (), Exif(focal_35=28.0)).priors[0]
+    off = [abs(28.0 / np.hypot(36, 24) * truth - told.value) / told.deviation for truth in truths]
+    assert max(off) < 1
+    if len(truths) == 1:
+        assert max(off) < 0.02
+        assert told.deviation == pytest.approx(0.05 * told.value)
 
 
 def test_a_photograph_that_its_file_tells_to_be_cropped_tells_no_focal_length(

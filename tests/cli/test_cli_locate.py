@@ -365,6 +365,10 @@ def test_two_landmarks_and_what_is_known(mast: tuple[str, ...], capsys: pytest.C
     code, _, err = run(capsys, *two, "--prior", "height=12.3+-0.02")
     assert code == 1
     assert re.search(r"two\.csv: roll, heading and position: .*; tell some of them by --fixed or --prior$", err.strip())
+    wide = ("--prior", "x=100+-1e7", "--prior", "height=12.3+-0.02")
+    code, _, err = run(capsys, *two, *wide)
+    assert code == 1
+    assert re.search("the prior on position is too wide; tell .* by --fixed or a narrower --prior$", err.strip()), err
 
 
 def test_priors_that_contradict_the_landmarks_are_told(

@@ -79,6 +79,18 @@ def test_it_stays_in_float64_whatever_the_network() -> None:
         assert network["prior"](moved.to(torch.float32)).dtype == D
 
 
+def test_a_camera_of_another_image_is_told() -> None:
+    """Half as large, the focal length was 280 px off without a word, and pulled there."""
+    calibration = dp.calibrate(dp.example_views("left"), dp.Chessboard())
+    prior, camera = dp.CalibrationPrior(calibration, view=0), calibration.cameras[0]
+    for other in (camera.resized((320, 240)), camera.cropped(20, 20, 600, 440)):
+        with pytest.warns(
+            UserWarning, match="image has 640 x 480 px, and the camera's .*: where it was resized or cro"
+        ):
+            assert prior(other) > 1e4
+    assert float(prior(dp.Camera(camera.K, camera.R, camera.t, camera.distortion))) == 0  # of no size
+
+
 def test_another_lens_model_is_refused() -> None:
     prior = dp.CalibrationPrior(dp.calibrate(dp.example_views("left"), dp.Chessboard(), "brown4"))
     K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=D)

@@ -196,8 +196,10 @@ def _outcome(
         left = spare(task, found)
     lacking = torch.tensor([bool(each.names) for each in names], device=found.status.device)
     status = torch.where(lacking & (found.status != Status.DIVERGED), Status.DEGENERATE, found.status)
+    parameters = found.parameters.names
+    said = {parameters[at] for known in task.known.priors for at in known.where}
     causes = tuple(
-        described(each) if each.names and code == Status.DEGENERATE else ""
+        described(each, said) if each.names and code == Status.DEGENERATE else ""
         for each, code in zip(names, status.tolist(), strict=True)
     )
     values = differentiated(task, found) if differentiable else found.values

@@ -70,7 +70,16 @@ def _lowest(task: Task, steps: int) -> Found:
         found = for_some(task, found, rows, partial(_with_other, steps=steps, anywhere=count >= 3))
     if bool(mirrored.any()):
         found = for_some(task, found, mirrored.nonzero().flatten(), partial(_with_rival, steps=steps))
+    few = mirrored & (2 * landmarks < POSE + _free_intrinsics(task)) & (left >= 0) & (left < SPARSE)
+    for count in landmarks[few].unique().tolist():
+        rows = (few & (landmarks == count)).nonzero().flatten()
+        found = for_some(task, found, rows, partial(_with_nearer_rival, steps=steps))
     return found
+
+
+def _free_intrinsics(task: Task) -> int:
+    """How many numbers of the camera itself are found along with its pose."""
+    return sum(at < task.known.camera.size for at in task.known.columns) - task.known.tied
 
 
 def _about_itself(task: Task, found: Found, steps: int) -> Found:
@@ -202,6 +211,23 @@ def _with_other(task: Task, found: Found, *, steps: int, anywhere: bool) -> Foun
     state = {name: getattr(ends, name)[chosen] for name in STATE}
     other = replace(found, parameters=replace(ends.parameters, start=start), **state)
     return _rivalled(task, found, other, told)
+
+
+def _with_nearer_rival(task: Task, found: Found, *, steps: int) -> Found:
+    """The same where the mirrored pose is known: the more likely of both is the rival.
+
+    With a camera that is known roughly alone, four or five landmarks do not tell the pose but for its mirror image.
+    """
+    other, mirrored = _with_other(task, found, steps=steps, anywhere=True), found.rival
+    if mirrored is None or other.rival is None:
+        return other
+    # Where the other was taken in the place of what was found, that is its rival, and lower than what was mirrored.
+    nearer = (other.rival.above <= mirrored.above) | (other.cost < found.cost)
+    parts = [
+        torch.where(nearer.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+        for new, old in zip(other.rival, mirrored, strict=True)
+    ]
+    return replace(other, rival=Rival(*parts))
 
 
 def _apart(task: Task, found: Found, other: Found) -> Tensor:

@@ -1,5 +1,6 @@
 """What evidence does not tell of a camera, by name: directions of the parameters in which nothing holds them."""
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import torch
@@ -33,10 +34,12 @@ class Lacking(NamedTuple):
     Attributes:
         names: of parameters or groups.
         together: whether something is told of them, but not of each.
+        each: of the parameters alone.
     """
 
     names: tuple[str, ...] = ()
     together: bool = False
+    each: tuple[str, ...] = ()
 
 
 def natural(values: Tensor, reach: Tensor) -> Tensor:
@@ -120,23 +123,26 @@ def undetermined(
     shown = [*parameters.camera.names, *MOUNTING]
     said = (along * lost.unsqueeze(-2)).square().sum(-1) > PART**2
     for camera, (row, count) in enumerate(zip(said.tolist(), lost.sum(-1).tolist(), strict=True)):
-        found = [SHOWN.get(name, name) for name, lacking in zip(shown, row, strict=True) if lacking]
-        names[camera] = Lacking(tuple(dict.fromkeys(found)), count < len(found) - found.count("focal") // 2)
+        each = tuple(name for name, lacking in zip(shown, row, strict=True) if lacking)
+        found = [SHOWN.get(name, name) for name in each]
+        names[camera] = Lacking(tuple(dict.fromkeys(found)), count < len(found) - found.count("focal") // 2, each)
     return unknown, names
 
 
-def described(lacking: Lacking) -> str:
-    """What is lacking, and what to do, in words."""
+def described(lacking: Lacking, said: Collection[str] = ()) -> str:
+    """What is lacking, and what to do, in words; `said` are names of parameters that have a prior."""
     names = lacking.names
+    wide = [name for name in names if name in {SHOWN.get(each, each) for each in lacking.each if each in said}]
     first = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
     pose = [name for name in names if name in (*MOUNTING, "position")]
     inside = [name for name in names if name not in pose]
     remedies = [f"fixed=({', '.join(map(repr, pose))}{',' * (len(pose) == 1)})"] if pose else []
     remedies += [f"leave {', '.join(inside)} out of free"] if inside else []
-    remedies.append(f"priors={{{names[0]!r}: (value, deviation)}}")
+    remedies.append(f"priors={{{[*wide, *names][0]!r}: (value, deviation)}}")
     them = "it" if len(names) == 1 else "some of them" if lacking.together else "them"
     what = "the evidence does not tell them apart" if lacking.together else "no evidence"
-    return f"{first}: {what}; fix {them} or give a prior, as {' or '.join(remedies)}"
+    told = f", for the prior on {wide[0]} is too wide" if wide else ""
+    return f"{first}: {what}{told}; fix {them} or give a {'narrower ' * bool(wide)}prior, as {' or '.join(remedies)}"
 
 
 def _angles(parameters: PoseParameters, values: Tensor, turn: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ integrals; outliers bound away from that, so that what the residuals themselves 
 
 An item that the loss hardly counts and noise does not explain is none of these: the estimate lacks it, and what the
 loss lets through of its pull goes into the estimate. So it counts by its own score and slope, as a corner does in
-`trust/robust_loss.py`, with m near 1 for such an item and near 0 else:
+`trust/robust_loss.py`, with m near 1 for such an item and near 0 else, the more the loss takes of its squared pull:
 
     H = a sum (1 - m) J^T J + sum m (rho' J^T J + 2 rho'' (J^T e) (J^T e)^T)
     M = q sum (1 - m) J^T J + sum m rho'^2 (J^T e) (J^T e)^T
@@ -43,7 +43,7 @@ def robust_matrices(loss: Loss | None, residuals: Tensor, rows: Tensor) -> tuple
     squared, k = e.square().sum(-1), e.shape[-1]
     slope, bend = slope_and_bend(loss, squared)
     chance = torch.special.gammaincc(torch.full_like(squared, k / 2), squared / 2)
-    own = (1 - slope).square() * (1 - 1 / (1 + (2 * chance.log() / NOISE).square()))
+    own = (1 - slope.square()) * (1 - 1 / (1 + (2 * chance.log() / NOISE).square()))
     right = (squared > 0) * (1 - own)
     a, q = robust_factors(loss, residuals, right)
     pulls = (rows * e.unsqueeze(1)).sum(-1)

@@ -106,7 +106,7 @@ def with_own_focal(whole: Covariance, found: Fit, pulls: Pulls | None) -> Covari
 
     Args:
         whole: without it.
-        found: the fit, of which nobody said how large its noise is.
+        found: the fit.
         pulls: those of its views, if they tell anything.
     """
     own = _own(found, whole.dispersion.detach(), pulls, (_focal,))

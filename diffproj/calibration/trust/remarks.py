@@ -238,7 +238,7 @@ def _contradict_each_other(found: Fit, pulls: Pulls | None) -> dict[int, float]:
 def _of_each_other(times: float) -> Remark:
     reason = f"the views contradict each other {times:.2g} times as much as corners of that pixel_sigma would"
     return Remark(
-        f"{reason}, and the deviations are too small by as much: corners of a view err together, for the board, the "
+        f"{reason}, and deviations are too small by up to as much: corners of a view err together, for the board, the "
         "lens model or the detector are not quite right; leave out pixel_sigma, then the deviations hold that",
         Kind.CONTRADICTION,
         reason,
@@ -325,18 +325,18 @@ def _explains(differs: Remark, own: OwnIntrinsics | None, p: int) -> bool:
 
 
 def _of_own_intrinsics(own: OwnIntrinsics, p: int, knows_noise: bool) -> Remark | None:
-    held = "those of pixel_sigma, which do not count that" if knows_noise else "those of the mean"
     if bool(own.focal_told[p]):
         part = f"{100 * float(own.focal.spread[p]):.1g} %"
         return Remark(
             f"the focal length differs by about {part} from view to view, as of a camera that focuses anew for each "
             "photograph: switch autofocus off and hold the zoom, for calibrating and for measuring; the deviations are "
-            f"{held}, and in one photograph it may be off by {part}",
+            f"those of the mean, and in one photograph it may be off by {part}",
             Kind.FOCUS,
             "its focal length differs from view to view",
         )
     if bool(own.point_told[p]):
         part = f"{float(own.point.spread[p]):.2g} px"
+        held = "those of pixel_sigma, which do not count that" if knows_noise else "those of the mean"
         return Remark(
             f"the principal point seems to differ by about {part} from view to view, as of a lens, a sensor or a "
             "recording that is steadied against shaking, or of a shutter that reads row after row of what moves: "

@@ -40,10 +40,12 @@ def covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = N
         known: the noise that a calibration before had, where the shared parameters are held.
         phi: and its dispersion `(P,)`; that of the fit if left out.
     """
-    if phi is not None or found.knows_noise:  # a noise that was given is the whole error
+    if phi is not None:
         return pooled_covariance_of(found, known, phi)
     pulls = pulls_of(found)
-    return with_own_focal(pooled_covariance_of(found, known, dispersion(found, pulls)), found, pulls)
+    # A noise that was given is the whole error of a corner, and focal lengths that differ are none of it.
+    phi = None if found.knows_noise else dispersion(found, pulls)
+    return with_own_focal(pooled_covariance_of(found, known, phi), found, pulls)
 
 
 def pooled_covariance_of(found: Fit, known: Noise | None = None, phi: Tensor | None = None) -> Covariance:

@@ -319,6 +319,21 @@ def test_a_robust_minimum_is_one_to_rounding() -> None:
         ("horizon", {"fixed": ("heading", "position")}, "height: no evidence; fix it or give a prior"),
         ("none", {"priors": {"tilt": 1.0}, "fixed": ("position", "height")}, "roll and heading: no evidence"),
         ("one", {"free": ("focal",)}, "the evidence does not tell them apart; fix some of them"),
+        (
+            "horizon",
+            {"fixed": ("heading", "position"), "priors": {"height": 1000.0}},
+            "height: no evidence, for the prior on height is too wide; fix it or give a narrower prior, as fixed=",
+        ),
+        (
+            "horizon",
+            {"fixed": ("heading", "position", "height"), "priors": {"f_x": 1e5}},
+            "focal: no evidence, for the prior on focal is too wide; .* priors=.'focal'",
+        ),
+        (
+            "horizon",
+            {"fixed": ("heading", "height"), "priors": {"x": 1.0}},
+            "position: no evidence; fix it or give a p",
+        ),
         ("vanishing", {"free": ("focal",), "fixed": ("position",)}, "height: no evidence"),
     ],
 )

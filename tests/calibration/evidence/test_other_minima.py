@@ -84,6 +84,21 @@ def test_three_landmarks_have_several_poses() -> None:
     assert not (far_off(found) & (found.rivals.ratio >= 100)).any()
 
 
+def test_four_landmarks_and_a_camera_that_is_known_roughly_have_several_poses() -> None:
+    """Upside down and 3 m high, or upright and 10 m high, as in truth; by the mirror image alone nothing was said."""
+    marks = [[9.998, 21.97, 0.0], [5.309, 16.904, 0.0], [10.052, 12.105, 0.0], [25.622, 30.879, 0.0]]
+    seen = [[938.211, 1042.663], [1467.728, 1113.925], [1322.427, 877.233], [194.589, 868.015]]
+    known = {"focal": 154.0, "principal_point": 32.0, "k1": 0.2, "k2": 0.13}
+    wrong = dp.Camera.mounted(2.7, 30.0, -162.0, 1.0, position=[13.7, 6.1], focal=1143.0, size=(1600, 1200))
+    lens = torch.zeros(4, dtype=D)
+    start = dp.Camera(wrong.K, wrong.R, wrong.t, dp.BrownConrady(lens), size=(1600, 1200))
+    found = dp.adjust(start, dp.Seen(marks, seen), priors=known)
+    assert found.rivals is not None
+    assert float(found.rivals.ratio) < 5
+    assert {round(float(height)) for height in (found.mounting.height, found.rivals.height)} == {3, 10}
+    assert "another pose explains the evidence nearly as well" in found.doubts
+
+
 @pytest.mark.parametrize("count", [3, 4, 5])
 @pytest.mark.parametrize("height", [0.0, 2000.0])
 def test_another_pose_lies_elsewhere_by_the_distance_of_what_was_seen(count: int, height: float) -> None:

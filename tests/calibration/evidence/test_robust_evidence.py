@@ -56,6 +56,21 @@ def test_intervals_hold_beside_a_wrong_landmark(loss: Loss, count: int, own: boo
     assert 0.94 < float(within(found).mean()) < 0.97, within(found)
 
 
+@pytest.mark.parametrize("loss", [dp.Huber(1.5), dp.SoftL1(1.0)])
+def test_intervals_hold_beside_several_landmarks_that_are_little_wrong(loss: Loss) -> None:
+    """Three of 12 are 8 deviations off: 93 and 94 % lie in their intervals, 95 with none wrong; it was 90 and 91."""
+    draw = torch.Generator().manual_seed(7)
+    places = landmarks(12, draw)
+    pixels = MAST.project(places)[0] + torch.randn(CAMERAS, 12, 2, generator=draw, dtype=D)
+    right = within(dp.adjust(MAST, dp.Seen(places, pixels, loss=loss))).mean()
+    assert 0.94 < float(right) < 0.965
+    angle = 2 * math.pi * torch.rand(CAMERAS, 3, generator=draw, dtype=D)
+    which = torch.rand(CAMERAS, 12, generator=draw).argsort(-1)[:, :3]
+    pixels[torch.arange(CAMERAS).unsqueeze(-1), which] += 8 * torch.stack([angle.cos(), angle.sin()], dim=-1)
+    found = within(dp.adjust(MAST, dp.Seen(places, pixels, loss=loss), throw=False))
+    assert float(found.mean()) > 0.925, found
+
+
 @pytest.mark.parametrize("loss", [dp.Huber(1.5), dp.Cauchy(2.0)])
 def test_what_is_not_seen_does_not_make_the_rest_surer(loss: Loss) -> None:
     """Of 40 landmarks each camera sees 8, of which one or two are wrong: as sure as with these alone."""
