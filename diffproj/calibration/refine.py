@@ -11,6 +11,7 @@ from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.free_points import with_free_points
 from diffproj.calibration.fitting.implicit import check_differentiable, differentiated
 from diffproj.calibration.fitting.options import CalibrationOptions, calibration_options
+from diffproj.calibration.other_starts import lowest
 from diffproj.calibration.outcome import begun, outcome
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.camera import Camera, as_camera
@@ -81,7 +82,8 @@ def refine(
         own, local, parameters = start.from_camera(beginning, data, chosen.bow, chosen.skew)
         own = own if differentiable else own.detach()
         begin = begun(data, chosen, parameters, own.detach(), local, own)
-        found, prior = begin.minimum(chosen), begin.prior
+        posed = not start.broadcasts(beginning.batch_shape, tuple(data.batch))
+        found, prior = begin.minimum(chosen) if posed else lowest(begin, chosen), begin.prior
         found, prior = with_free_points(found, data, chosen, prior)
         if differentiable:
             found = differentiated(found, data, prior, chosen, own)
