@@ -8,12 +8,13 @@ all side by side in one batch. Only the lowest of them goes on to its minimum, a
 The minima are compared as they are: on the same corners, and with the likelihood of uncertain landmarks' errors.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from diffproj.calibration.fitting.fit import Fit, fit
+from diffproj.calibration.fitting.fit import Fit, fit, normal_tensors
 from diffproj.calibration.fitting.options import Options
 from diffproj.calibration.fitting.second_look import LOWER, exchanged
 from diffproj.calibration.fitting.start import candidate_poses
@@ -23,6 +24,9 @@ from diffproj.calibration.fitting.two_poses import tilted_poses
 from diffproj.calibration.least_squares.solver import Solution, Status
 from diffproj.calibration.outcome import Begun
 from diffproj.calibration.problem.parametrisation import POSE, Pose
+from diffproj.calibration.results.ambiguity import difference
+from diffproj.calibration.results.remark import Kind, Remark, Remarks
+from diffproj.calibration.trust.other_poses import APART, typical_noise
 from diffproj.calibration.trust.reach import folds_at_corners
 
 SPARE = 8
@@ -41,12 +45,15 @@ NEAR = 1e-6
 """Part of the cost that another of these steps need not gain."""
 FEWEST_STEPS = 40
 """Steps that the solver must be allowed: who wants fewer gets where they lead from the start."""
+NEARLY = 20.0
+"""Ratio of likelihoods up to which another minimum is spoken of."""
+ANOTHER = "another camera and pose explain the corners nearly as well"
 
 
 def lowest(begin: Begun, options: Options) -> Fit:
     """The minimum from the start, or a lower one from another pose or focal length, where the first is doubtful."""
     found = begin.minimum(options)
-    if not _may_be_several(found, options):
+    if options.max_iterations < FEWEST_STEPS or not _may_be_several(found):
         return found
     rows = _doubtful(found, begin.shared).nonzero().flatten()
     if len(rows) == 0:
@@ -61,12 +68,12 @@ def lowest(begin: Begun, options: Options) -> Fit:
     return exchanged(found, other, rows[which], _better(first.part(which), other, start[which]))
 
 
-def _may_be_several(found: Fit, options: Options) -> bool:
-    """Whether there can be several minima worth a search, and steps enough to find them."""
+def _may_be_several(found: Fit) -> bool:
+    """Whether there can be several minima worth a search."""
     task = found.task
     free = task.basis is None or task.basis.shape[-1] > 0
     few = task.used.shape[1] <= FEW_VIEWS and int(task.used.sum((1, 2)).amin()) <= FEW_CORNERS
-    return free and few and task.objective == "image" and options.max_iterations >= FEWEST_STEPS
+    return free and few and task.objective == "image" and not task.free
 
 
 def _doubtful(found: Fit, start: Tensor) -> Tensor:
@@ -107,21 +114,26 @@ def _no_camera(task: Task, solution: Solution, start: Tensor) -> Tensor:
 
 def _best_of(first: Fit, start: Tensor) -> tuple[Tensor, Tensor, Pose] | None:
     """Of the starts of each camera that one which came lowest: the cameras `(n,)` it is lower for, and where it is."""
+    near, cost = _led_to(first, start)
+    lowest, lane = cost.min(0)
+    before = torch.where(_impossible(first, start), torch.inf, first.solution.cost * (1 - LOWER))
+    which = (lowest < before).nonzero().flatten()
+    if len(which) == 0:
+        return None
+    at = lane[which] * len(start) + which
+    return which, near.shared[at], tuple(z[at] for z in near.local)
+
+
+def _led_to(first: Fit, start: Tensor) -> tuple[Solution, Tensor]:
+    """Where starts lead in a few steps `(L P, ...)`, and the costs there `(L, P)`; infinite of what is no camera's."""
     with torch.inference_mode():
-        starts, poses = _starts(first.task, start, first.solution.local)
+        starts, poses = _starts(first.task, start, tuple(z.detach() for z in first.solution.local))
         P = len(start)
-        every = torch.arange(P, device=start.device).repeat(len(starts) // P)
-        lanes = first.task.part(every)
+        lanes = first.task.part(torch.arange(P, device=start.device).repeat(len(starts) // P))
         near = solved(lanes, starts, poses, max_iterations=SHORT_FIT, tolerance=NEAR)
         wrong = _no_camera(lanes, near, starts)
         cost = torch.where(wrong, torch.inf, near.cost.nan_to_num(torch.inf)).reshape(-1, P)
-        lowest, lane = cost.min(0)
-        before = torch.where(_impossible(first, start), torch.inf, first.solution.cost * (1 - LOWER))
-        which = (lowest < before).nonzero().flatten()
-        at = lane[which] * P + which
-    if len(which) == 0:
-        return None
-    return which.clone(), near.shared[at].clone(), tuple(z[at].clone() for z in near.local)
+    return normal_tensors(near), cost.clone()
 
 
 def _starts(task: Task, shared: Tensor, found: Pose) -> tuple[Tensor, Pose]:
@@ -175,3 +187,43 @@ def _improbability(found: Fit) -> Tensor:
     level = found.residual_variance().nan_to_num(0.0).clamp(min=1.0 if task.known_noise else FINEST_PX**2)
     log = level.log()[:, None, None] - torch.linalg.slogdet(task.whitening)[1]
     return cost / level + torch.where(task.used, log, 0.0).sum((1, 2))
+
+
+def with_other_minima(said: Callable[[], tuple[Remarks, ...]], found: Fit, start: Tensor) -> tuple[Remarks, ...]:
+    """The remarks on each of P cameras, and one where another minimum, beyond its error bars, is nearly as likely.
+
+    Args:
+        said: the remarks without it.
+        found: the lowest minimum.
+        start: shared parameters that the camera was given with `(P, s)`.
+    """
+    with torch.no_grad():
+        rows = (_doubtful(found, start) & (found.solution.status == Status.CONVERGED)).nonzero().flatten()
+        if not _may_be_several(found) or len(rows) == 0:
+            return said()
+        first = found.part(rows)
+        near, cost = _led_to(first, start[rows])
+        kept, P = first.solution, len(rows)
+        each = torch.arange(P, device=rows.device).repeat(len(cost))
+        step = near.shared - kept.shared[each]
+        turn = difference(tuple(z[each] for z in kept.local), near.local, first.task.points.mean(0))
+        U, E, W = (getattr(kept.equations, name)[each] for name in ("U", "E", "W"))
+        along = (step.unsqueeze(-2) @ U @ step.unsqueeze(-1)).flatten()
+        along += (2 * step[:, None, None] @ E @ turn.unsqueeze(-1) + turn.unsqueeze(-2) @ W @ turn.unsqueeze(-1)).sum(
+            (1, 2, 3)
+        )
+        variance, freedom = typical_noise(first)
+        another = (along.reshape(-1, P) > APART**2 * variance) & (near.status == Status.CONVERGED).reshape(-1, P)
+        lowest, lane = torch.where(another, cost, torch.inf).min(0)
+        excess = 2 * (lowest - kept.cost).clamp(min=0) / (variance.clamp(min=1e-18) * freedom)
+        ratio = (freedom / 2 * excess.log1p()).exp()
+    more: dict[int, Remarks] = {}
+    for row in (ratio < NEARLY).nonzero().flatten().tolist():
+        here, there = (float(x[0]) for x in (kept.shared[row], near.shared[lane[row] * P + row]))
+        moved = f", focal length {there:.4g} px in place of {here:.4g} px" if abs(there - here) > 1e-3 * here else ""
+        sentence = (
+            f"{ANOTHER}, {float(1 / ratio[row]):.2g} times as likely{moved}; more corners, off the line or plane of "
+            "the others, or a prior, tell them apart"
+        )
+        more[int(rows[row])] = (Remark(sentence, Kind.RIVAL, ANOTHER),)
+    return tuple((*one, *more.get(p, ())) for p, one in enumerate(said()))
