@@ -1,5 +1,7 @@
 """`refine`: a camera that is known roughly, refined on the corners of a target; differentiable if asked."""
 
+from dataclasses import replace
+from functools import partial
 from typing import Unpack
 
 from kornia.geometry.camera import PinholeCamera
@@ -11,6 +13,7 @@ from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.free_points import with_free_points
 from diffproj.calibration.fitting.implicit import check_differentiable, differentiated
 from diffproj.calibration.fitting.options import CalibrationOptions, calibration_options
+from diffproj.calibration.other_starts import lowest, with_other_minima
 from diffproj.calibration.outcome import begun, outcome
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.camera import Camera, as_camera
@@ -27,6 +30,9 @@ def refine(
     **options: Unpack[CalibrationOptions],
 ) -> Calibration:
     """Refine a camera on the corners of a target.
+
+    Few corners, or such as lie nearly on a line, have several minima: then other poses and focal lengths are started
+    from, too, unless the camera brings poses, and the lowest minimum is taken. A remark tells of one nearly as likely.
 
     Args:
         views: corners `(*B, V, N, 2)`.
@@ -81,10 +87,15 @@ def refine(
         own, local, parameters = start.from_camera(beginning, data, chosen.bow, chosen.skew)
         own = own if differentiable else own.detach()
         begin = begun(data, chosen, parameters, own.detach(), local, own)
-        found, prior = begin.minimum(chosen), begin.prior
+        posed = not start.broadcasts(beginning.batch_shape, tuple(data.batch))
+        found, prior = begin.minimum(chosen) if posed else lowest(begin, chosen), begin.prior
         found, prior = with_free_points(found, data, chosen, prior)
         if differentiable:
             found = differentiated(found, data, prior, chosen, own)
-        return outcome("refine", data, found, beginning.size or views.size, chosen.throw)
+        refined = outcome("refine", data, found, beginning.size or views.size, chosen.throw)
+        said = refined._remarks
+        if posed or said is None:
+            return refined
+        return replace(refined, _remarks=partial(with_other_minima, said, found, begin.shared))
 
     return with_true_centres(fit, views, target)

@@ -321,13 +321,20 @@ def lower_fit(found: Fit, other: Fit, which: Tensor, reject: float | None) -> Fi
         before, now = truncated(found, other, which, reject)
     margin = torch.full_like(before, 1 - LOWER).masked_fill(ended, 1 + LOWER)
     lower = now.isfinite() & ~(now >= before * margin)
-    taken = which[lower]
+    return exchanged(found, other, which, lower)
+
+
+def exchanged(found: Fit, other: Fit, which: Tensor, where: Tensor) -> Fit:
+    """The fit with that of some cameras `(n,)` replaced by another, where that says so."""
+    taken = which[where]
     if len(taken) == 0:
         return found
-    used, rejected = found.task.used.clone(), found.rejected.clone()
-    used[taken], rejected[taken] = other.task.used[lower], other.rejected[lower]
-    solution = replaced(found.solution, taken, other.solution, lower)
-    return Fit(replace(found.task, used=used), solution, rejected)
+    used, rejected, whitening = found.task.used.clone(), found.rejected.clone(), found.task.whitening
+    used[taken], rejected[taken] = other.task.used[where], other.rejected[where]
+    if whitening is not None and other.task.whitening is not None:
+        whitening = whitening.index_put((taken,), other.task.whitening[where])
+    solution = replaced(found.solution, taken, other.solution, where)
+    return Fit(replace(found.task, used=used, whitening=whitening), solution, rejected)
 
 
 def truncated(found: Fit, other: Fit, which: Tensor, reject: float) -> tuple[Tensor, Tensor]:

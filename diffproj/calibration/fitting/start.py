@@ -45,8 +45,8 @@ def from_camera(
     given.check_size(camera.size, data.views.size)
     camera = camera.to(data.points.device, data.points.dtype)
     batch, V = tuple(data.batch), len(data.views)
-    posed = not _broadcasts(camera.batch_shape, batch)
-    if posed and not (with_poses and _broadcasts(camera.batch_shape, (*batch, V))):
+    posed = not broadcasts(camera.batch_shape, batch)
+    if posed and not (with_poses and broadcasts(camera.batch_shape, (*batch, V))):
         ways = f", or to {(*batch, V)} with the poses to start from" if with_poses else ""
         remedy = "" if with_poses else "; index it, or take calibration.camera"
         raise ValueError(
@@ -110,7 +110,7 @@ def best_pose(task: Task, shared: Tensor, poses: Sequence[Pose]) -> Pose:
     return normal_tensors(best)
 
 
-def _broadcasts(shape: Sequence[int], to: Sequence[int]) -> bool:
+def broadcasts(shape: Sequence[int], to: Sequence[int]) -> bool:
     """Whether a tensor of that shape expands to the other."""
     if len(shape) > len(to):
         return False

@@ -240,6 +240,7 @@ def _faults(seen: Evidence, tilt: float, covered: Tensor | None) -> list[str]:
             Kind.STEADIED,
             Kind.BENT,
             Kind.FLEXING,
+            Kind.RIVAL,
             *OF_THE_CAMERA,
         ),
     ]

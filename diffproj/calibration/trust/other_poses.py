@@ -38,7 +38,7 @@ def other_poses(found: Fit, noise: Noise | None = None) -> OtherPoses:
             contradict it.
     """
     with torch.inference_mode():
-        R, t, ratio = _other_poses(found, *_noise(found, noise))
+        R, t, ratio = _other_poses(found, *typical_noise(found, noise))
     return OtherPoses(R.clone(), t.clone(), ratio.clone())
 
 
@@ -90,7 +90,7 @@ def _improbability(task: Task, shared: Tensor, poses: Pose, variance: Tensor) ->
     return torch.where(task.used, each, 0.0).sum(-1)
 
 
-def _noise(found: Fit, known: Noise | None) -> Noise:
+def typical_noise(found: Fit, known: Noise | None = None) -> Noise:
     """The noise of the corners, where few of them tell little with what is usual of photographs.
 
     That counts even where the residuals contradict it: a pose with an error several times as large takes a noise that
