@@ -29,8 +29,8 @@ from diffproj.calibration.results.remark import Kind, Remark, Remarks
 from diffproj.calibration.trust.other_poses import APART, typical_noise
 from diffproj.calibration.trust.reach import folds_at_corners
 
-SPARE = 8
-"""Coordinates of corners beyond those of poses, priors not counted, below which other minima are always looked for."""
+SPARE = 3
+"""Coordinates of corners beyond the unknowns, priors not counted, below which other minima are always looked for."""
 LINE, LINE_CORNERS = 0.15, 12
 """Extent of corners across a line, relative to that along it, up to which so many of a view lie nearly on it."""
 POOR = 9.0
@@ -80,8 +80,11 @@ def _doubtful(found: Fit, start: Tensor) -> Tensor:
     """Which minima may not be the lowest `(P,)`."""
     task = found.task
     count = task.used.sum((1, 2))
-    spare = 2 * count - POSE * task.used.any(-1).sum(-1)
-    poor = ~_explains(found) | (found.solution.status != Status.CONVERGED) | _impossible(found, start)
+    intrinsics = len(task.names) if task.basis is None else task.basis.shape[-1]
+    spare = 2 * count - POSE * task.used.any(-1).sum(-1) - intrinsics
+    poor = (
+        ~_explains(found) | (found.solution.status != Status.CONVERGED) | _no_camera(found.task, found.solution, start)
+    )
     return (count <= FEW_CORNERS) & ((spare < SPARE) | _on_a_line(task) | poor)
 
 
@@ -102,12 +105,8 @@ def _explains(found: Fit) -> Tensor:
     return found.solution.cost <= POOR * weights.sum((1, 2))
 
 
-def _impossible(found: Fit, start: Tensor) -> Tensor:
-    """Which fits are no camera's `(P,)`: the lens folds inside the corners, or the image is the start's mirrored."""
-    return _no_camera(found.task, found.solution, start)
-
-
 def _no_camera(task: Task, solution: Solution, start: Tensor) -> Tensor:
+    """Which fits are no camera's `(P,)`: the lens folds inside the corners, or the image is the start's mirrored."""
     mirrored = ~(solution.shared[:, :2] * start[:, :2] > 0).all(-1)
     return mirrored | folds_at_corners(task, solution.shared, solution.local)
 
@@ -116,7 +115,7 @@ def _best_of(first: Fit, start: Tensor) -> tuple[Tensor, Tensor, Pose] | None:
     """Of the starts of each camera that one which came lowest: the cameras `(n,)` it is lower for, and where it is."""
     near, cost = _led_to(first, start)
     lowest, lane = cost.min(0)
-    before = torch.where(_impossible(first, start), torch.inf, first.solution.cost * (1 - LOWER))
+    before = torch.where(_no_camera(first.task, first.solution, start), torch.inf, first.solution.cost * (1 - LOWER))
     which = (lowest < before).nonzero().flatten()
     if len(which) == 0:
         return None
@@ -175,8 +174,8 @@ def _better(first: Fit, other: Fit, start: Tensor) -> Tensor:
     ended = other.solution.status == Status.CONVERGED
     here, there = _improbability(first), _improbability(other)
     lower = there < here - LOWER * here.abs()
-    lower = torch.where(_impossible(first, start), _explains(other), lower)
-    return same & ended & ~_impossible(other, start) & lower
+    lower = torch.where(_no_camera(first.task, first.solution, start), _explains(other), lower)
+    return same & ended & ~_no_camera(other.task, other.solution, start) & lower
 
 
 def _improbability(found: Fit) -> Tensor:

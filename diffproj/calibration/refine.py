@@ -31,8 +31,10 @@ def refine(
 ) -> Calibration:
     """Refine a camera on the corners of a target.
 
-    Few corners, or such as lie nearly on a line, have several minima: then other poses and focal lengths are started
-    from, too, unless the camera brings poses, and the lowest minimum is taken. A remark tells of one nearly as likely.
+    Few corners have several minima. Where up to 40 corners of up to four views hardly outnumber the unknowns, lie
+    nearly on a line or are explained badly, other poses and focal lengths are started from, too, and the lowest minimum
+    is taken, which takes some 10 ms a camera. A remark tells of one nearly as likely. Not so where the camera brings
+    poses, with the objective `"plane"`, or with fewer than 40 `max_iterations`.
 
     Args:
         views: corners `(*B, V, N, 2)`.

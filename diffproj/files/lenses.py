@@ -52,9 +52,6 @@ MODELS = _words(
 )
 """Keys that tell the lens, in lower case without what stands between words."""
 
-FLAGS = _words("fisheyemodel fisheye isfisheye")
-"""Keys whose 0 or 1 tells the lens; under others of them only a program knows what its numbers mean."""
-
 LOOSE = _words("cameratype model type lenstype projection projectiontype projectionmodel")
 """Keys that may tell the lens, or what the camera is called or for: heeded where they name a lens, of whatever kind."""
 
@@ -104,8 +101,6 @@ def told(fields: dict[str, Any], read: Iterable[str] = ()) -> dict[Kind, str]:
         if key in read or plain not in MODELS | LOOSE or value is None or value == "":
             continue
         if plain in LOOSE and not _names_lens(value, numbers=plain in MODELS):
-            continue
-        if plain not in FLAGS and isinstance(value, int | float) and value in (0, 1):
             continue
         try:
             kind = kind_of(key, value)

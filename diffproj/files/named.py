@@ -102,7 +102,7 @@ def parts_of_an_image(fields: dict[str, Any]) -> tuple[str, ...]:
         fields: the mapping of a camera.
     """
     for key in ("binning_x", "binning_y"):
-        if isinstance(fields.get(key), int | float) and fields[key] not in (0, 1):
+        if fields.get(key) is not None and not (isinstance(fields[key], int | float) and fields[key] in (0, 1)):
             return (
                 f"{key}: want 0 or 1, got {fields[key]}: K is of the image before binning; remove the key, and give "
                 "camera.resized(...) the size after it",
@@ -110,8 +110,8 @@ def parts_of_an_image(fields: dict[str, Any]) -> tuple[str, ...]:
     roi = fields.get("roi")
     if isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset", "width", "height")):
         whole = [roi.get("x_offset", 0), roi.get("y_offset", 0), roi.get("width"), roi.get("height")]
-        width, height = (fields.get(side, fields.get(f"image_{side}")) for side in ("width", "height"))
-        if whole != [0, 0, width, height]:
+        size = list(_sides(fields) or whole[2:])
+        if whole != [0, 0, *size]:
             return (
                 f"roi: want the whole image, got {whole}: K is of the image before cropping; remove the key, and cut "
                 "by camera.cropped(left, top, width, height)",

@@ -36,16 +36,21 @@ SEVERAL = re.compile(
 """Names of lists of poses; those of the board's views are a calibration's own."""
 
 ENDINGS = re.compile(
-    r"(?!.*(board|target|marker|pattern|rect)).+"
-    r"((?P<turn>rotation(matrix|vector)?|rvec|quaternion|(?<=ext|sic)r)|(?P<shift>translation(vector)?|tvec|(?<=ext|sic)t))"
+    r"(?!.*(board|target|marker|pattern|rect)).*_"
+    r"((?P<turn>rotation(_?matrix|_?vector)?|rvec|quaternion|(?<=_ext_|nsic_)r)"
+    r"|(?P<shift>translation(_?vector)?|tvec|(?<=_ext_|nsic_)t))"
 )
-"""Names with another word before those of a rotation or a shift, as `extrinsicRotation` and `camera_ext_t`."""
+"""Names with another word before those of a rotation or a shift, as `extrinsicRotation` and `camera_ext_t`; in lower
+case, with `_` before each word."""
 
 QUATERNIONS = TURNS | _words("q quat")
 ANGLES = _words("roll pitch yaw heading azimuth tilt pan omega phi kappa")
 """Names of single numbers of a pose; others have `x`, `w` or `01` behind a name of those above."""
 
-SIDES = (("left", "right"), ("first", "second"), ("camera", "projector"), ("cam", "proj"))
+SIDES = (
+    *(("left", "right"), ("first", "second"), ("main", "aux"), ("master", "slave")),
+    *(("camera", "projector"), ("cam", "proj")),
+)
 """Words of two names that tell which camera is the first."""
 
 LARGEST = 16
@@ -174,7 +179,7 @@ def _kind_of(name: str, parts: dict[str, Any]) -> str | None:
     """What numbers are, by their common name and what each has behind it."""
     axes, indices = "".join(sorted(parts)), [part for part in parts if part.isdigit()]
     if name == "angles":
-        return "pose" if len(parts) > 1 else None
+        return "pose" if len(parts) > 1 and any(parts.values()) else None
     if axes == "wxyz":
         return "turn"
     if len(indices) in (12, 16) and len(indices) == len(parts):
@@ -209,12 +214,15 @@ def _kinds(key: str, value: Any) -> Iterator[str]:
         yield "pose"
     elif plain in TURNS and numbers.size in (3, 4, 9):
         yield "turn"
-    elif (named := ENDINGS.fullmatch(re.sub("[^a-z0-9]", "", key.lower()))) and numbers.size in (
-        (3, 4, 9) if named["turn"] else (3,)
-    ):
+    elif (named := ENDINGS.fullmatch(_words_of(key))) and numbers.size in ((3, 4, 9) if named["turn"] else (3,)):
         yield "turn" if named["turn"] else "shift"
     elif plain in SHIFTS | PLACES and numbers.size == 3:
         yield "shift" if plain in SHIFTS else "place"
+
+
+def _words_of(key: str) -> str:
+    """A key in lower case, with `_` before each of its words, the first too: `_camera_ext_r`."""
+    return "_" + re.sub("[^a-z0-9]+", "_", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", key).lower())
 
 
 def _shape(key: str, value: Any) -> tuple[int, ...]:
@@ -234,18 +242,27 @@ def _numbers(key: str, value: Any) -> np.ndarray | None:
 
 
 def _is_before(first: str, second: str) -> bool:
-    """Whether the names of two cameras tell that the one is before the other: by a number, a letter or a side."""
+    """Whether the names of two cameras tell that the one is before the other: by a number, a letter or a side.
+
+    In each word in which they differ; serial numbers tell nothing.
+    """
     one, other = first.lower(), second.lower()
-    if first == "camera" or any(one.replace(*side) == other != one for side in SIDES):
+    if any(one.replace(*side) == other != one for side in SIDES):
         return True
     words = [re.findall(r"[a-z]+|\d+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) for name in (first, second)]
-    if words[0] == words[1][:-1] and words[1][-1].isdigit():  # cam, cam2
+    if words[0] == words[1][:-1] and words[1][-1] == "2":  # cam, cam2
+        return True
+    if words[0] == ["camera"] and words[1] in (["2"], ["right"], ["second"]):  # K, K2: the former has no label
         return True
     apart = [pair for pair in zip(*words, strict=False) if pair[0] != pair[1]]
-    if len(words[0]) != len(words[1]) or len(apart) != 1:
-        return False
-    ((a, b),) = apart
-    return int(a) < int(b) if a.isdigit() and b.isdigit() else len(a) == len(b) == 1 and a < b
+    return len(words[0]) == len(words[1]) and bool(apart) and all(_goes_before(*pair) for pair in apart)
+
+
+def _goes_before(a: str, b: str) -> bool:
+    """Whether of two words the one goes before the other."""
+    if a.isdigit() and b.isdigit():
+        return int(a) < int(b) and (max(len(a), len(b)) <= 2 or int(b) == int(a) + 1)
+    return (a, b) in SIDES or (len(a) == len(b) == 1 and a < b)
 
 
 def _is_rigid(numbers: np.ndarray | None) -> bool:

@@ -101,10 +101,11 @@ class CalibrationPrior(GeometryModule):
             raise ValueError(f"camera: want the calibration's lens model {wanted!r}, got {lens!r}")
         if camera.device != self.center.device:
             raise ValueError(f"camera: want device {self.center.device} as the prior has, got {camera.device}")
-        if self.size is not None and camera.size is not None and self.size != camera.size:
-            here, there = (f"{width} x {height}" for width, height in (camera.size, self.size))
+        own, its = self.size, camera.size
+        if own is not None and its is not None and own != its and not torch.compiler.is_compiling():
             warn_caller(
-                f"CalibrationPrior: the calibration's image has {there} px, and the camera's {here}: where it was "
+                f"CalibrationPrior: the calibration's image has {own[0]} x {own[1]} px, and the camera's {its[0]} x "
+                f"{its[1]}: where it was "
                 "resized or cropped, its focal lengths and principal point are no more comparable; learn the camera of "
                 "the calibration, and resize or crop what it gives"
             )

@@ -333,6 +333,7 @@ def test_a_pose_with_a_scale_is_named_as_one(tmp_path: Path) -> None:
         ),
         ("ost.yaml", ("plumb_bob", "ftheta"), "distortion_model: want a model"),
         ("ost.yaml", ("camera_name", "binning_x: 2\ncamera_name"), "binning_x: want 0 or 1"),
+        ("ost.yaml", ("camera_name", "binning_x: '2'\ncamera_name"), "binning_x: want 0 or 1"),
         (
             "ost.yaml",
             ("camera_name", "roi: {x_offset: 8, y_offset: 0, width: 8, height: 8}\ncamera_name"),

@@ -75,6 +75,7 @@ def test_a_pose_of_unknown_meaning_is_not_dropped_in_silence(
         {"twelve": [0.5] * 12, "bounds": [[1, 0, 0, 1]] * 3},
         {"R1": R, "P1": [[*row, 0.0] for row in K], "Q": np.diag([1.0, 1, 0, 0.1]).tolist(), "E": R, "F": R},
         {"x": 1, "y": 2, "z": 3, "yaw": 0.5, "gx": 0, "gy": 0, "gz": 9.8, "qx": 1, "qy": 2},
+        {"next_t": T, "context_t": T, "tilt": 0, "pan": 0, "zoom": 100},
         {"lat": 47.1, "lon": 8.2, "alt": 400, "v0": 1, "v1": 2, "v2": 3, "on_x": True, "on_y": True, "on_z": True},
         {f"m{i}{j}": 0.5 for i in range(3) for j in range(4)} | {"board_poses": [[*RT, [0, 0, 0, 1]]] * 3},
         {"board_rotation": R, "board_translation": T, "rectify_translation": T, "cameraRotation": R, "offset": T},
@@ -109,7 +110,8 @@ def test_a_pair_is_placed_by_what_opencv_calls_r_and_t(tmp_path: Path, names: tu
     ("first", "second"),
     [
         *(("left", "right"), ("cam0", "cam1"), ("camera2", "camera10"), ("camL", "camR"), ("leftCam", "rightCam")),
-        *(("cam_a", "cam_b"), ("cam", "cam2"), ("camera", "projector"), ("stereo 1", "stereo 2")),
+        *(("cam_a", "cam_b"), ("cam", "cam2"), ("camera", "projector"), ("stereo 1", "stereo 2"), ("master", "slave")),
+        *(("cam0_left", "cam1_right"), ("left0", "right1"), ("camera_1_left", "camera_2_right"), ("cam122", "cam123")),
     ],
 )
 def test_names_tell_the_first_of_a_pair_whatever_the_order_in_the_file(tmp_path: Path, first: str, second: str) -> None:
@@ -124,7 +126,14 @@ def test_names_tell_the_first_of_a_pair_whatever_the_order_in_the_file(tmp_path:
 def test_a_pair_whose_names_tell_no_order_has_no_pose(tmp_path: Path) -> None:
     """It was that of whichever name is later in the alphabet, or in the file."""
     flat = {"rgb_K": K, "rgb_D": D, "depth_K": K, "depth_D": D}
-    for tree in (flat, {"rgb": ONE, "depth": ONE}, {"depth": ONE, "rgb": ONE}):
+    pairs = [
+        ("rgb", "depth"),
+        ("depth", "rgb"),
+        ("cam_845112", "cam_123456"),
+        ("thermal", "camera"),
+        ("left1", "right0"),
+    ]
+    for tree in (flat, *(dict.fromkeys(pair, ONE) for pair in pairs)):
         with pytest.warns(UserWarning, match="R, T: a pose that is not read"):
             assert not load(tmp_path, "plain.json", json.dumps(tree | {"R": R, "T": T})).t.any()
 

@@ -135,6 +135,11 @@ def test_a_part_of_the_calibrated_image_is_told_of_beside_opencvs_keys_too(
     for tree in (K | beside, numbers_alone | beside, {"left": K | beside, "right": K}):
         with pytest.warns(UserWarning, match=rf"{next(iter(beside))}: want .*K is of the image before"):
             assert load(tmp_path, "a.json", json.dumps(tree), camera=0).K[0, 2] == 320.0
+    whole = {"roi": {"x_offset": 0, "y_offset": 0, "width": 640, "height": 480}, "binning_x": 0}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for size in ({"image_size": [640, 480]}, {"image_width": 640, "image_height": 480}, {}):
+            load(tmp_path, "a.json", json.dumps(K | whole | size))
 
 
 @pytest.mark.parametrize("key", ["model", "camera_model", "type"])
@@ -145,16 +150,6 @@ def test_a_pinhole_of_numbers_one_by_one_has_no_lens(tmp_path: Path, key: str) -
         assert load(tmp_path, "a.json", json.dumps(tree)).distortion is None
     with pytest.raises(ValueError, match="want k1 k2 p1 p2 beside"):
         load(tmp_path, "a.json", json.dumps(tree | {key: "radtan"}))
-
-
-@pytest.mark.parametrize("key", ["camera_type", "lens_model"])
-def test_the_number_of_a_kind_is_no_flag_of_a_fisheye(tmp_path: Path, key: str) -> None:
-    """1 was taken for the fisheye model, under any of the keys that name a model."""
-    tree = {key: 1, "K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]]}
-    five = load(tmp_path, "a.json", json.dumps(tree | {"dist": [0.1, 0.01, 0, 0, 0]}))
-    assert isinstance(five.distortion, dp.BrownConrady)
-    with pytest.raises(ValueError, match="want 5 coefficients, or the name of the model beside 4"):
-        load(tmp_path, "a.json", json.dumps(tree | {"dist": [0.1, 0.01, 0, 0]}))
 
 
 def _rectified_pair() -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:

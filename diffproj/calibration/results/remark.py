@@ -36,7 +36,7 @@ class Kind(StrEnum):
     CONTRADICTION = "contradiction"
     """The residuals contradict the deviations that were given."""
     RIVAL = "rival"
-    """Another pose explains the evidence nearly as well."""
+    """Another pose, or another camera and pose, explain the evidence nearly as well."""
     BELOW = "below"
     """Landmarks on a level plane are seen from below, by a camera that is upside down if z is up."""
     LEFT_OUT = "left out"

@@ -66,6 +66,17 @@ def test_deviations_hold_it_where_the_noise_is_given(views: int, by: float, most
     assert off(dp.calibrate(refocused(100, views, by), BOARD, pixel_sigma=0.1)) < most
 
 
+@pytest.mark.parametrize("views", [3, 4])
+def test_few_views_do_not_tell_it_beside_a_noise_that_is_given(views: int) -> None:
+    """By chance deviations of one in 25 cameras were more than twice as large. All of it counts as noise: it is linear."""
+    seen = refocused(100, views, 0.0)
+    here, there = (
+        dp.calibrate(seen, BOARD, pixel_sigma=sigma).covariance.shared.diagonal(dim1=-2, dim2=-1)[:, :2].sqrt()
+        for sigma in (0.1, 0.3)
+    )
+    torch.testing.assert_close(3 * here, there, rtol=1e-6, atol=0)
+
+
 @pytest.mark.parametrize("views", [5, 8, 20])
 @pytest.mark.parametrize("pixel_sigma", [None, 0.1])
 def test_noise_is_none_of_it(views: int, pixel_sigma: float | None) -> None:
