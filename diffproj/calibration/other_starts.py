@@ -82,9 +82,7 @@ def _doubtful(found: Fit, start: Tensor) -> Tensor:
     count = task.used.sum((1, 2))
     intrinsics = len(task.names) if task.basis is None else task.basis.shape[-1]
     spare = 2 * count - POSE * task.used.any(-1).sum(-1) - intrinsics
-    poor = (
-        ~_explains(found) | (found.solution.status != Status.CONVERGED) | _no_camera(found.task, found.solution, start)
-    )
+    poor = ~_explains(found) | (found.solution.status != Status.CONVERGED) | _no_camera(task, found.solution, start)
     return (count <= FEW_CORNERS) & ((spare < SPARE) | _on_a_line(task) | poor)
 
 

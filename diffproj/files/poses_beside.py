@@ -250,9 +250,11 @@ def _is_before(first: str, second: str) -> bool:
     if any(one.replace(*side) == other != one for side in SIDES):
         return True
     words = [re.findall(r"[a-z]+|\d+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) for name in (first, second)]
-    if words[0] == words[1][:-1] and words[1][-1] == "2":  # cam, cam2
+    last = words[1][-1:]
+    counted = bool(last) and last[0].isdigit() and len(last[0]) <= 2
+    if words[0] == words[1][:-1] and counted:  # cam, cam2
         return True
-    if words[0] == ["camera"] and words[1] in (["2"], ["right"], ["second"]):  # K, K2: the former has no label
+    if words[0] == ["camera"] and words[1] == last and (counted or last in (["right"], ["second"])):  # K, K2
         return True
     apart = [pair for pair in zip(*words, strict=False) if pair[0] != pair[1]]
     return len(words[0]) == len(words[1]) and bool(apart) and all(_goes_before(*pair) for pair in apart)

@@ -110,7 +110,14 @@ def test_a_pair_is_placed_by_what_opencv_calls_r_and_t(tmp_path: Path, names: tu
     ("first", "second"),
     [
         *(("left", "right"), ("cam0", "cam1"), ("camera2", "camera10"), ("camL", "camR"), ("leftCam", "rightCam")),
-        *(("cam_a", "cam_b"), ("cam", "cam2"), ("camera", "projector"), ("stereo 1", "stereo 2"), ("master", "slave")),
+        *(
+            ("cam_a", "cam_b"),
+            ("cam", "cam2"),
+            ("cam", "cam1"),
+            ("camera", "projector"),
+            ("stereo 1", "stereo 2"),
+            ("master", "slave"),
+        ),
         *(("cam0_left", "cam1_right"), ("left0", "right1"), ("camera_1_left", "camera_2_right"), ("cam122", "cam123")),
     ],
 )
