@@ -13,7 +13,7 @@ from diffproj._core.numerics import spread_evenly
 from diffproj.calibration.fitting import closed_form
 from diffproj.calibration.fitting.start import Straightened
 from diffproj.calibration.fitting.task import Task
-from diffproj.calibration.fitting.two_poses import predicted_costs
+from diffproj.calibration.fitting.two_poses import first_step
 from diffproj.calibration.problem.parametrisation import Pose
 
 FOCAL_GRID = tuple(0.3 * 1.5**i for i in range(14))
@@ -106,7 +106,7 @@ def _both_poses(task: Task, straight: Straightened, f: Tensor, views: Tensor) ->
     weights = None if task.weights is None else pick(task.weights)
     plain = Task(task.points, pick(straight.pixels), used, straight.lens, loss=robust, weights=weights)
     held = straight.held(f)
-    costs = [predicted_costs(plain, held, poses) for poses in (one, other)]
+    costs = [first_step(plain, held, poses)[1] for poses in (one, other)]
     better = costs[1] < costs[0]
     R = torch.where(better[..., None, None], other[0], one[0])
     return torch.minimum(*costs), (R, torch.where(better[..., None], other[1], one[1]))

@@ -8,7 +8,7 @@ solved once more, until none changes.
 Most views need no search to see this. Perspective moves the corners of a board of radius r, at a distance Z and tilted
 by theta, by about `d = 2 f (r / Z)^2 sin(theta)`, one way for the one pose and the other way for the other; where that
 is far more than the view's residuals, the other pose is no rival. For the views that are left, one linearisation at the
-other pose predicts the cost that its refinement can reach.
+other pose predicts the cost that its refinement can reach, and whether it only leads back to the pose that is known.
 """
 
 import math
@@ -25,7 +25,7 @@ from diffproj.calibration.fitting.task import Task, solved
 from diffproj.calibration.least_squares.everyone import for_each
 from diffproj.calibration.least_squares.losses import Cauchy
 from diffproj.calibration.least_squares.solver import Solution
-from diffproj.calibration.problem.parametrisation import POSE, Pose
+from diffproj.calibration.problem.parametrisation import POSE, Pose, moved
 from diffproj.geometry.cayley import turned
 
 PERSPECTIVE = 20.0
@@ -34,6 +34,8 @@ FACE_ON = 0.3
 """Foreshortening, relative to the residuals, up to which a view's two poses are one."""
 RIVAL = 4.0
 """Predicted cost of a view at its other pose, relative to its cost, up to which the other pose is refined."""
+BACK = 1 / 3
+"""Part of the way to the other pose that may be left after the first step back: the hill between is half way."""
 MISFIT = 25.0
 """Mean squared residual of a view, relative to the median of its camera's views, from which on it is sought anew."""
 FEW_CORNERS = 10
@@ -95,8 +97,11 @@ def better_poses(task: Task, solution: Solution, cameras: Tensor) -> tuple[Pose,
         other = closed_form.other_pose(poses[0], poses[1], task.points)
         p, v = rivals.nonzero(as_tuple=True)
         single, held, start = _single(task, solution.shared, other, p, v)
-        near = predicted_costs(single, held, start).squeeze(1) <= RIVAL * here[p, v]
-        rivals = torch.zeros_like(rivals).index_put((p, v), near)
+        (R, _), costs = first_step(single, held, start)
+        own = poses[0][p, v].unsqueeze(1)
+        goes_back = (R - own).square().sum((-2, -1)) <= BACK**2 * (start[0] - own).square().sum((-2, -1))
+        near = (costs <= RIVAL * here[p, v].unsqueeze(1)) & ~goes_back
+        rivals = torch.zeros_like(rivals).index_put((p, v), near.squeeze(1))
     poses, here, changed = _exchanged(task, solution.shared, poses, here, [other], rivals)
     lost = seen & (_misfit(task, here) | (task.used.sum(-1) <= FEW_CORNERS))
     poses, more = _sought(task, solution.shared, poses, here, lost)
@@ -268,10 +273,10 @@ def view_costs(task: Task, shared: Tensor, poses: Pose) -> Tensor:
     return (value if task.weights is None else value * task.weights).sum(-1) / 2
 
 
-def predicted_costs(task: Task, shared: Tensor, poses: Pose) -> Tensor:
-    """The cost of each view `(P, V)` after a Gauss-Newton step of its pose, by the linearised residuals.
+def first_step(task: Task, shared: Tensor, poses: Pose) -> tuple[Pose, Tensor]:
+    """Poses after a Gauss-Newton step of each, and the cost of each view `(P, V)` there by the linearised residuals.
 
-    Infinite where the residuals have no value or the corners determine no pose.
+    That is infinite where the residuals have no value or the corners determine no pose.
     """
     panel = task.problem.linearise(shared, poses)
     residual = panel[:, :, -1]
@@ -284,8 +289,10 @@ def predicted_costs(task: Task, shared: Tensor, poses: Pose) -> Tensor:
     W, h, cost = gram[..., :-1, :-1], gram[..., :-1, -1:], gram[..., -1, -1] / 2
     L, failed = torch.linalg.cholesky_ex(torch.where(W.isfinite(), W, 0.0))
     y = torch.linalg.solve_triangular(L, h, upper=False)
+    step = torch.linalg.solve_triangular(L.mT, y, upper=True).squeeze(-1)
     predicted = cost - y.square().sum((-2, -1)) / 2
-    return torch.where((failed == 0) & predicted.isfinite(), predicted.clamp(min=0), torch.inf)
+    costs = torch.where((failed == 0) & predicted.isfinite(), predicted.clamp(min=0), torch.inf)
+    return moved(poses, -step), costs
 
 
 def replaced(solution: Solution, which: Tensor, other: Solution, taken: Tensor) -> Solution:

@@ -22,9 +22,6 @@ RADIAL = ("k1", "k2", "k3", *DENOMINATOR)
 """The terms above and below the line."""
 FEW_STEPS = 15
 """Steps after which it is seen whether such a start leads lower."""
-FEWER_STEPS = 11
-"""The same where a tilt is to be added to what is found: of ten cameras that gain by it eight show it by then, and six
-after 8 steps."""
 
 
 def with_factor(task: Task, shared: Tensor, size: tuple[int, int], factor: tuple[float, float]) -> Tensor | None:

@@ -8,13 +8,14 @@ from torch import Tensor
 
 import diffproj as dp
 from diffproj import synthetic
+from diffproj.calibration.fitting import two_poses
 from diffproj.calibration.fitting.closed_form import other_pose
 from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.fitting.two_poses import (
     better_poses,
+    first_step,
     found_again,
     posed,
-    predicted_costs,
     view_costs,
     weak_perspective,
 )
@@ -50,7 +51,7 @@ def test_the_predicted_cost_is_that_of_the_refined_pose(loss: Loss | None, weigh
     torch.testing.assert_close(view_costs(task, SHARED, pose), cost)
     off = turned(pose[0], torch.full_like(pose[1], 2e-4)), pose[1] + 0.05
     assert bool((view_costs(task, SHARED, off) > 1.02 * cost).all())
-    predicted = predicted_costs(task, SHARED, off)
+    predicted = first_step(task, SHARED, off)[1]
     torch.testing.assert_close(predicted, cost, rtol=1e-4 if loss is None else 0.05, atol=0)
 
 
@@ -58,7 +59,7 @@ def test_no_prediction_without_corners() -> None:
     task, poses = seen()
     used = task.used.clone()
     used[0, 1] = False
-    assert predicted_costs(replace(task, used=used), SHARED, poses).isinf().tolist() == [
+    assert first_step(replace(task, used=used), SHARED, poses)[1].isinf().tolist() == [
         [False, True, False, False, False]
     ]
 
@@ -119,3 +120,24 @@ def test_a_view_in_the_worse_of_its_poses_is_turned_over() -> None:
     again, changed = better_poses(task, solution, torch.zeros(1, dtype=torch.bool))
     assert changed.tolist() == [False]
     assert all(torch.equal(z, new) for z, new in zip(wrong, again, strict=True))
+
+
+def test_a_view_whose_other_pose_leads_back_to_its_own_is_not_refined(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen nearly face on there is one pose; it was exchanged for itself where few steps had led to it."""
+    R = dp.rotation_from_euler(*torch.tensor([0.05, 0.0, 0.0], dtype=D)).expand(1, 1, 3, 3)
+    pose = R, torch.tensor([[[-100.0, -60.0, 900.0]]], dtype=D)
+    K = torch.tensor([[600.0, 0, 310.0], [0, 640.0, 250.0], [0, 0, 1]], dtype=D)
+    pixels, _ = dp.Camera(K, *pose).project(BOARD.points)
+    pixels = pixels + 0.2 * torch.randn(pixels.shape, dtype=D, generator=torch.Generator().manual_seed(0))
+    task = Task(BOARD.points, pixels, torch.ones(1, 1, 54, dtype=torch.bool), "none")
+    cost = view_costs(task, SHARED, pose)
+    assert bool(weak_perspective(task, SHARED, pose, cost / 54).all())
+    none = torch.zeros(1, dtype=torch.int64)
+    refined, lower = posed(task, SHARED, [other_pose(*pose, BOARD.points)], none, none)
+    assert float(lower) < 0.99 * float(cost)
+    assert float((refined[0][0] - R).abs().amax()) < 0.02
+    solution = Solution(SHARED, pose, cost[0], none, none, equations_at(task.problem, SHARED, pose, POSE))
+    monkeypatch.setattr(two_poses, "posed", None)
+    poses, changed = better_poses(task, solution, torch.ones(1, dtype=torch.bool))
+    assert changed.tolist() == [False]
+    assert torch.equal(poses[0], R)
