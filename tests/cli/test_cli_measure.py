@@ -381,6 +381,7 @@ def test_equations_and_quantities_for_people() -> None:
     assert equation([0, 0, 1, 0]) == "z = 0"
     assert equation([0, -1, 0.5, -3]) == "-y + 0.5 z = -3"
     assert equation([2, -3, 0, 1]) == "2 x - 3 y = 1"
+    assert equation([0.1, 0.2, 1, 1725135.5]) == "0.1 x + 0.2 y + z = 1725135.5"
     assert coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 0) == ("2.5", " ± unknown")
     assert coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 1) == ("0.00", " ± 0.20")
     assert coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 2) == ("0", "")
