@@ -107,17 +107,20 @@ def _judged(sources: Sources, c: int) -> tuple[Tensor, Tensor]:
     return log_tail(chi2, count, least / share.square().clamp(min=1e-300)), log_tail(chi2, count, least)
 
 
-def disagreeing(sources: Sources, seen_by: Callable[[Tensor], Sources] | None = None) -> Tensor:
+def disagreeing(
+    sources: Sources, seen_by: Callable[[Tensor], Sources] | None = None, chance: Tensor | None = None
+) -> Tensor:
     """Which sources disagree `(*B, C)`: the worst one, then the worst of the rest, as long as the rest disagree.
 
     Args:
         sources: all of them.
         seen_by: the sources linearised at the estimate of some `(*B, C)`; as they are if left out. One that is far off
             draws the estimate to where the others seem to disagree as well.
+        chance: their `chances`, where these are known already.
     """
     count = sources.y.shape[-2]
     limit, kept = math.log(CHANCE / count), torch.ones_like(sources.freedom, dtype=torch.bool)
-    if not bool((chances(sources) < limit).any()):
+    if not bool(((chances(sources) if chance is None else chance) < limit).any()):
         return ~kept
     for _ in range(count - 1):
         found = []

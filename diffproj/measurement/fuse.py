@@ -159,7 +159,9 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
     freedom = torch.stack([one.degrees_of_freedom.expand(batch) for one in found], dim=-1)
 
     def sources_at(one: _Joined) -> Sources:
-        return Sources(one.y, one.C, one.information, seen.repeat_interleave(2, dim=-1), one.estimated, freedom)
+        both = seen.repeat_interleave(2, dim=-1)
+        estimated = without(_covariances([_told(each) for each in one.found], T, shares), both)
+        return Sources(one.y, one.C, one.information, both, estimated, freedom)
 
     def seen_by(some: Tensor) -> Sources:
         theirs, _ = _settled(names, found, seen & some.unsqueeze(-1), T, shares)
@@ -167,7 +169,8 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
         return sources_at(_joined(names, [relinearised(one, at) for one in found], seen, T, shares))
 
     sources = sources_at(best)
-    disagrees = disagreeing(sources, seen_by)
+    chance = chances(sources)
+    disagrees = disagreeing(sources, seen_by, chance)
     scale = growth(sources, disagrees).sqrt()
     common = scale[..., None, None, None] * T @ torch.linalg.cholesky(covariance).unflatten(-2, (N, 2))
     there, placed = best.there, best.placed
@@ -186,7 +189,7 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
         warn_caller(doubts, CameraDisagreementWarning)
     told = "; ".join(dict.fromkeys([doubts, *(one.doubts for one in found)])).strip("; ")
     includes = all(one.includes_intrinsics for one in found)
-    each = {"names": names, "seen": seen, "chance": chances(sources).exp(), "disagrees": disagrees, "scale": scale}
+    each = {"names": names, "seen": seen, "chance": chance.exp(), "disagrees": disagrees, "scale": scale}
     fused = FusedMeasurement(placed, there, includes, noise, None, told, **each)
     curved = _curved(found, fused) | (moving.unsqueeze(-1) & there)
     return replace(fused, _hold=_hold(names, found), _bent=curved, _beyond=_extrapolated(found, seen))
@@ -215,20 +218,20 @@ class _Joined(NamedTuple):
     """The best estimate of measurements as they are linearised.
 
     Attributes:
+        found: these.
         y: what each measured, along the plane from near the points `(*B, C, 2 N)`.
         C: the covariances, as much larger as others share them `(*B, C, 2 N, 2 N)`.
         information: their inverses.
-        estimated: the part of C whose scale the residuals tell.
         estimate: the estimate of y, its covariance, and which coordinates anybody knows.
         placed: the estimate in the world `(*B, N, 3)`; 0 where nobody saw the point.
         there: which points somebody saw `(*B, N)`.
         T: the plane's directions `(*B, N, 3, 2)`.
     """
 
+    found: Sequence[Measurement]
     y: Tensor
     C: Tensor
     information: Tensor
-    estimated: Tensor
     estimate: tuple[Tensor, Tensor, Tensor]
     placed: Tensor
     there: Tensor
@@ -250,9 +253,7 @@ def _joined(names: Sequence[str], found: Sequence[Measurement], seen: Tensor, T:
     y = torch.einsum("...nij,...cni->...cnj", T, points - origin.unsqueeze(-3)).flatten(-2)
     both = seen.repeat_interleave(2, dim=-1)
     y = torch.where(both, y, 0.0)
-    C = torch.stack([_along(one.joint().expand(*batch, 3 * N, 3 * N), T) for one in found], dim=-3)
-    told = torch.stack([_along(_told(one).joint().expand(*batch, 3 * N, 3 * N), T) for one in found], dim=-3)
-    C, told = (without(shares[..., None, None] * one, both) for one in (C, told))
+    C = without(_covariances(found, T, shares), both)
     information, sound = inverse(C)
     if not bool(sound.all()):
         who = next(name for name, bad in zip(names, _of_any(~sound), strict=True) if bad)
@@ -263,7 +264,7 @@ def _joined(names: Sequence[str], found: Sequence[Measurement], seen: Tensor, T:
     estimate = joined(information, y)
     there = estimate[2].unflatten(-1, (N, 2)).all(-1)
     placed = origin + (T @ estimate[0].unflatten(-1, (N, 2)).unsqueeze(-1)).squeeze(-1)
-    return _Joined(y, C, information, told, estimate, torch.where(there.unsqueeze(-1), placed, 0.0), there, T)
+    return _Joined(found, y, C, information, estimate, torch.where(there.unsqueeze(-1), placed, 0.0), there, T)
 
 
 def _checked(
@@ -361,6 +362,12 @@ def _mean(points: Tensor, seen: Tensor) -> Tensor:
     """About where each point is `(*B, N, 3)`, of those that saw it."""
     kept = torch.where(seen.unsqueeze(-1), points.detach(), 0.0)
     return kept.sum(-3) / seen.sum(-2).clamp(min=1).unsqueeze(-1)
+
+
+def _covariances(found: Sequence[Measurement], T: Tensor, shares: Tensor) -> Tensor:
+    """Of coordinates along the plane `(*B, C, 2 N, 2 N)`, each as much larger as others share it."""
+    shape = *T.shape[:-3], 3 * T.shape[-3], 3 * T.shape[-3]
+    return shares[..., None, None] * torch.stack([_along(one.joint().expand(shape), T) for one in found], dim=-3)
 
 
 def _told(one: Measurement) -> Measurement:
