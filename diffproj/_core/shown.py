@@ -97,6 +97,11 @@ def counted(shape: Sequence[int], one: str) -> str:
     return f"{' x '.join(map(str, shape))} {one}s" if shape else ""
 
 
+def listed(words: Sequence[str]) -> str:
+    """`a`, `a and b`, `a, b and c`."""
+    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+
+
 def in_pixels(size: tuple[int, int] | None) -> str:
     """`640 x 480 px`; nothing where the size is not known."""
     return "" if size is None else f"{size[0]} x {size[1]} px"

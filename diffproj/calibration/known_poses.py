@@ -72,7 +72,7 @@ def known_poses(
         with torch.inference_mode(False):
             return known_poses(data, camera, alone, calibration, options, fixed, priors)
     camera = ordinary(camera.to(torch.float64))[..., None].expand(*batch).detach()
-    known = _checked(data, camera, options, fixed, priors)
+    known = _checked(data, camera, alone, options, fixed, priors)
     single = _single(data, known)
 
     def seen_by(used: Tensor) -> tuple[Seen, tuple[Found, ...], Fit]:
@@ -112,8 +112,15 @@ def known_poses(
     return located
 
 
-def _checked(data: Data, camera: Camera, options: Options, fixed: Sequence[str], priors: Priors | None) -> Knowledge:
-    known = knowledge(camera, priors, fixed, (), tied_focal=True)
+def _checked(
+    data: Data, camera: Camera, alone: Calibration, options: Options, fixed: Sequence[str], priors: Priors | None
+) -> Knowledge:
+    # How steeply a camera without a pose looks, the corners tell.
+    identity = torch.eye(3, dtype=camera.dtype, device=camera.device)
+    bare = (identity == camera.R).all(-1).all(-1) & (camera.t == 0).all(-1)
+    R = torch.where(bare[..., None, None], alone.cameras.R.detach().to(camera.R), camera.R)
+    looking = Camera.unchecked(camera.K, R, camera.t, camera.distortion, camera.size)
+    known = knowledge(looking, priors, fixed, (), tied_focal=True)
     few = known.camera.size
     names = {one.name: min(one.where) for one in known.priors}
     for name, first in names.items():
@@ -123,8 +130,7 @@ def _checked(data: Data, camera: Camera, options: Options, fixed: Sequence[str],
                 "dp.adjust from any evidence"
             )
     said = [*fixed, *(one.name for one in known.priors if one.mean is None)]
-    identity = torch.eye(3, dtype=camera.dtype, device=camera.device)
-    if said and bool(((identity == camera.R).all(-1).all(-1) & (camera.t == 0).all(-1)).any()):
+    if said and bool(bare.any()):
         option = "fixed" if fixed else "priors"
         raise ValueError(
             f"{option}: want a camera at the pose that {said[0]!r} is of, such as dp.Camera.mounted(...) or "

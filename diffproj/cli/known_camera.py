@@ -43,13 +43,18 @@ def one_focal_length(free: Sequence[str], priors: Sequence[Known]) -> bool:
 
 
 def posed(camera: Calibrated, known: Sequence[Known]) -> Calibrated:
-    """The camera, or the calibration with its camera, at the pose of which so much is known."""
+    """The camera, or the calibration with its camera, at the pose of which so much is known.
+
+    Without a pose of its own it looks straight up, where roll and heading turn it alike: then it is level.
+    """
     if isinstance(camera, Calibration):
         return replace(camera, camera=posed(camera.camera, known))
     camera = camera.upright().to(torch.float64)
     said = {one.name: camera.K.new_tensor(one.value) for one in known}
     own = mounting_of(camera)
     values = dict(zip(POSE, (own.tilt, own.roll, own.heading, *own.position.unbind(-1), own.height), strict=True))
+    if torch.equal(camera.R, torch.eye(3).to(camera.R)):
+        values["tilt"] = torch.zeros_like(own.tilt)
     values |= {name: value for name, value in said.items() if name in POSE}
     R = rotation_from_mounting(values["tilt"], values["roll"], values["heading"])
     center = torch.stack([values[name] for name in PLACE], dim=-1)

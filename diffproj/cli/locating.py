@@ -173,7 +173,8 @@ def _located(
             found = _adjusted(options, camera, calibration, surveyed, views, sigma, free, tied)
         elif of_pose:
             held = tuple(one.name for one in options.fixed)
-            start = posed(camera, options.fixed) if calibration is None else posed(calibration, options.fixed)
+            bare, known = camera.without_pose(), options.fixed
+            start = posed(bare, known) if calibration is None else posed(calibration, known)
             found = locate(views, target, start, fixed=held, priors=priors or None, **steps)
         elif free:
             held = tuple(name for name in Parametrisation.of(camera).names if name not in free)

@@ -8,6 +8,7 @@ import argparse
 
 import torch
 
+from diffproj._core.shown import plain
 from diffproj._core.warn import warn_caller
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.cli.scene import Scene
@@ -88,7 +89,7 @@ def equation(plane: list[float]) -> str:
         for factor, name in terms
     )
     text = text.removeprefix("+ ") if text.startswith("+") else text.replace("- ", "-", 1)
-    return f"{text} = {offset + 0.0:g}"
+    return f"{text} = {plain(offset)}"
 
 
 def _face(scene: Scene) -> tuple[float, float] | None:

@@ -13,9 +13,9 @@ from diffproj.cli.units import heading
 ALL = 3
 """What deviations may hold: noise of pixels, pose and camera."""
 
-EXACT = 1e-9
-"""Standard deviation, as a part of the point's largest coordinate, that is rounding error: the plane alone says what
-such a coordinate is."""
+EXACT, ROUNDED = 1e-9, 1e-13
+"""Standard deviation, as a part of the point's largest one or of its largest coordinate, that is rounding error: the
+plane alone says what such a coordinate is. On a map coordinates are millions of metres, and known to millimetres."""
 
 NOISE = {
     "hand": "{} px for each pixel, as for points picked by hand (--pixel-sigma)",
@@ -96,8 +96,9 @@ def coordinate(world: list[float], deviations: list[float | None], axis: int) ->
     scale = max(map(abs, world))
     if deviation is None:
         return plain(value), " ± unknown"
-    if deviation <= EXACT * max(scale, 1e-300):
-        return ("0" if abs(value) <= EXACT * scale else plain(value)), ""
+    known = [each for each in deviations if each is not None]
+    if deviation <= max(EXACT * max(known), ROUNDED * scale):
+        return ("0" if abs(value) <= max(EXACT * max(known), ROUNDED * scale) else plain(value)), ""
     text, spread = rounded(value, deviation)
     return text, f" ± {spread}"
 

@@ -12,6 +12,7 @@ from jaxtyping import Shaped
 from torch import Tensor
 
 from diffproj._core.atomic import write_whole
+from diffproj._core.shown import plain
 from diffproj.cli.inputs import check_not_the_same, check_writable, writing
 from diffproj.cli.measure_plane import described, height_above_face, plane_of
 from diffproj.cli.photographs import one_photograph
@@ -265,5 +266,6 @@ def _in_words(extent: tuple[float, ...] | list[float], plane: Plane, unit: str =
     x0, y0, x1, y1 = (f"{number:.10g}" for number in extent)
     if _is_level(plane):
         return f"x from {x0} to {x1} and y from {y0} to {y1}{unit}"
-    origin, *axes = (f"({', '.join(f'{z + 0.0:.4g}' for z in part.tolist())})" for part in plane_axes(plane))
+    places = (part.tolist() for part in plane_axes(plane))
+    origin, *axes = (f"({', '.join(plain(round(z, 9)) for z in place)})" for place in places)
     return f"From {origin}, {x0} to {x1}{unit} along {axes[0]} and {y0} to {y1}{unit} along {axes[1]}"

@@ -5,12 +5,16 @@ does not know has a unit variance in C_c, and no information.
 """
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 CHANCE = 1e-3
 """How likely a disagreement may be by chance, over all sources, before it is one."""
+KNOWN = 1e8
+"""Residuals from which on the scale that they tell counts as known."""
 
 
 def without(C: Tensor, known: Tensor) -> Tensor:
@@ -53,54 +57,144 @@ def chi_square(information: Tensor, difference: Tensor) -> Tensor:
     return ((information @ difference.unsqueeze(-1)).squeeze(-1) * difference).sum(-1)
 
 
+class Sources(NamedTuple):
+    """What C sources say of the same numbers.
+
+    Attributes:
+        y: their estimates `(*B, C, m)`.
+        C: the covariances of these `(*B, C, m, m)`.
+        information: their inverses, 0 in what a source does not know.
+        both: what each source knows `(*B, C, m)`; an even count, for points on a plane come with two coordinates.
+        estimated: the part of the covariances whose scale was estimated `(*B, C, m, m)`.
+        freedom: from how many residuals it was `(*B, C)`.
+    """
+
+    y: Tensor
+    C: Tensor
+    information: Tensor
+    both: Tensor
+    estimated: Tensor
+    freedom: Tensor
+
+
+def chances(sources: Sources) -> Tensor:
+    """The logarithm of how likely each source differs from all others as much as it does, by chance `(*B, C)`."""
+    return torch.stack([_judged(sources, c)[0] for c in range(sources.y.shape[-2])], dim=-1)
+
+
 @torch.no_grad()
-def chances(information: Tensor, y: Tensor, C: Tensor, both: Tensor, freedom: Tensor) -> Tensor:
-    """How likely each source differs from the estimate of all others as much as it does, by chance `(*B, C)`.
+def _judged(sources: Sources, c: int) -> tuple[Tensor, Tensor]:
+    """Source c against the estimate of all others: the logarithm of the chance that it differs as much `(*B,)`.
+
+    The scale of the difference is known the better, the smaller the part of it that was estimated (Welch 1947,
+    Satterthwaite 1946), all of which counts as estimated from as few residuals as that of any source.
+
+    Returns:
+        That, and one for comparing sources with each other, as if all scales were known alike.
+    """
+    others = [k for k in range(sources.y.shape[-2]) if k != c]
+    information = sources.information[..., others, :, :]
+    estimate, covariance, known = joined(information, sources.y[..., others, :])
+    common = known & sources.both[..., c, :]
+    off = torch.where(common, sources.y[..., c, :] - estimate, 0.0)
+    weight = torch.linalg.solve(without(sources.C[..., c, :, :] + covariance, common), off.unsqueeze(-1))
+    chi2, count = (weight.squeeze(-1) * off).sum(-1), common.sum(-1)
+    # The variance of `weight . off` is chi2, to which each source adds that of its own numbers.
+    back = information @ (covariance @ weight).unsqueeze(-3)
+    ours, theirs = _form(sources.estimated[..., c, :, :], weight), _form(sources.estimated[..., others, :, :], back)
+    share = (ours + theirs.sum(-1)) / torch.where(chi2 > 0, chi2, 1.0)
+    least = sources.freedom.amin(-1).clamp(min=1)
+    return log_tail(chi2, count, least / share.square().clamp(min=1e-300)), log_tail(chi2, count, least)
+
+
+def disagreeing(
+    sources: Sources, seen_by: Callable[[Tensor], Sources] | None = None, chance: Tensor | None = None
+) -> Tensor:
+    """Which sources disagree `(*B, C)`: the worst one, then the worst of the rest, as long as the rest disagree.
 
     Args:
-        information: as `joined` takes it.
-        y: too.
-        C: the covariances `(*B, C, m, m)`.
-        both: what each source knows `(*B, C, m)`.
-        freedom: how many residuals tell the scale of its covariance `(*B, C)`.
+        sources: all of them.
+        seen_by: the sources linearised at the estimate of some `(*B, C)`; as they are if left out. One that is far off
+            draws the estimate to where the others seem to disagree as well.
+        chance: their `chances`, where these are known already.
     """
-    found = []
-    for c in range(y.shape[-2]):
-        others = [k for k in range(y.shape[-2]) if k != c]
-        estimate, covariance, known = joined(information[..., others, :, :], y[..., others, :])
-        common = known & both[..., c, :]
-        off = torch.where(common, y[..., c, :] - estimate, 0.0)
-        S = without(C[..., c, :, :] + covariance, common)
-        chi2 = (torch.linalg.solve(S, off.unsqueeze(-1)).squeeze(-1) * off).sum(-1)
-        found.append(_tail(chi2, common.sum(-1), freedom.amin(-1)))
-    return torch.stack(found, dim=-1)
-
-
-def disagreeing(information: Tensor, y: Tensor, C: Tensor, both: Tensor, freedom: Tensor) -> Tensor:
-    """Which sources disagree `(*B, C)`: the worst one, then the worst of the rest, as long as the rest disagree."""
-    sources = y.shape[-2]
-    kept = torch.ones(*y.shape[:-2], sources, dtype=torch.bool, device=y.device)
-    for _ in range(sources - 1):
-        mask = kept[..., None] & both
-        chance = chances(information * kept[..., None, None].to(y), y, C, mask, freedom)
-        chance = torch.where(kept, chance, 1.0)
-        worst = chance.amin(-1, keepdim=True)
-        beyond = worst < CHANCE / sources
-        pair = kept.sum(-1, keepdim=True) == 2  # nothing tells which of two it is
-        now = beyond & torch.where(pair, kept, chance == worst) & kept
+    count = sources.y.shape[-2]
+    limit, kept = math.log(CHANCE / count), torch.ones_like(sources.freedom, dtype=torch.bool)
+    if not bool(((chances(sources) if chance is None else chance) < limit).any()):
+        return ~kept
+    for _ in range(count - 1):
+        found = []
+        for c in range(count):
+            others = kept.clone()
+            others[..., c] = False
+            rest = sources if seen_by is None else seen_by(others)
+            known = kept[..., None] & sources.both
+            information = rest.information * kept[..., None, None].to(rest.y)
+            found.append(_judged(rest._replace(information=information, both=known), c))
+        chance, alike = (torch.where(kept, torch.stack(one, -1), 0.0) for one in zip(*found, strict=True))
+        beyond = chance.amin(-1, keepdim=True) < limit
+        now = beyond & (alike == alike.amin(-1, keepdim=True)) & kept
+        now = now | (_pairs(kept[..., None] & sources.both) & now.unsqueeze(-2)).any(-1)
         if not bool(now.any()):
             break
         kept = kept & ~now
     return ~kept
 
 
-def _tail(chi2: Tensor, count: Tensor, freedom: Tensor) -> Tensor:
-    """The probability of more than that chi-square, of `count` numbers whose scale is known to `freedom` residuals.
+def _pairs(both: Tensor) -> Tensor:
+    """Which two sources have numbers in common with each other alone `(*B, C, C)`: which one is wrong nothing tells."""
+    share = (both.unsqueeze(-2) & both.unsqueeze(-3)).any(-1)
+    share = share & ~torch.eye(both.shape[-2], dtype=torch.bool, device=both.device)
+    alone = share.sum(-1) == 1
+    return share & alone.unsqueeze(-1) & alone.unsqueeze(-2)
 
-    By Paulson's approximation of F's distribution, the cube root of which is nearly normal (1942).
+
+def growth(sources: Sources, disagrees: Tensor) -> Tensor:
+    """Chi-square over its degrees of freedom `(*B,)` (Birge 1932): the largest one, at least 1.
+
+    That of all numbers, and for each source that disagrees that of the numbers that it knows: many on which all agree
+    would hide how far it is off.
     """
-    n = count.clamp(min=1).to(chi2)
-    F = (chi2 / n).clamp(min=0)
-    ours, theirs = 2 / (9 * n), 2 / (9 * freedom.clamp(min=1))
-    z = ((1 - theirs) * F ** (1 / 3) - (1 - ours)) / (theirs * F ** (2 / 3) + ours).sqrt()
-    return torch.where(count > 0, 0.5 * torch.erfc(z / math.sqrt(2)), 1.0)
+    found = [torch.ones_like(disagrees[..., 0], dtype=sources.y.dtype)]
+    everything = torch.ones_like(sources.both[..., 0, :])
+    for c, numbers in ((None, everything), *enumerate(sources.both.unbind(-2))):
+        where = disagrees.any(-1) if c is None else disagrees[..., c]
+        if not bool(where.any()):
+            continue
+        both = sources.both & numbers.unsqueeze(-2)
+        information = inverse(without(sources.C, both))[0]
+        information = torch.where(both.unsqueeze(-1) & both.unsqueeze(-2), information, 0.0)
+        estimate, _, known = joined(information, sources.y)
+        spare = both.sum((-1, -2)) - known.sum(-1)
+        chi2 = chi_square(information, sources.y - estimate.unsqueeze(-2)).sum(-1)
+        found.append(torch.where(where & (spare > 0), chi2 / spare.clamp(min=1), 1.0))
+    return torch.stack(found).amax(0)
+
+
+def log_tail(chi2: Tensor, count: Tensor, freedom: Tensor) -> Tensor:
+    """The logarithm of the probability of more than that chi-square.
+
+    Of an even `count` of numbers Fisher's F and chi-square have a finite sum, which no size of `chi2` underflows.
+
+    Args:
+        chi2: of the numbers, 0 or more.
+        count: of the numbers.
+        freedom: how many residuals tell their scale, infinite where it is known.
+    """
+    j = torch.arange(max(1, int(count.max()) // 2 if count.numel() else 1), dtype=chi2.dtype, device=chi2.device)
+    chi2, a = chi2.clamp(min=1e-300), freedom.clamp(max=KNOWN) / 2
+    beyond = torch.log1p(chi2 / (2 * a))
+    factors = torch.lgamma(a.unsqueeze(-1) + j) - torch.lgamma(a).unsqueeze(-1)
+    power = chi2.log() - (2 * a).log() - beyond
+    known = freedom > KNOWN
+    first = torch.where(known, -chi2 / 2, -a * beyond)
+    terms = torch.where(
+        known.unsqueeze(-1), j * (chi2 / 2).log().unsqueeze(-1), factors + j * power.unsqueeze(-1)
+    ) - torch.lgamma(j + 1)
+    terms = torch.where(2 * j < count.unsqueeze(-1), terms, -torch.inf)
+    return torch.where(count > 0, first + terms.logsumexp(-1), 0.0).clamp(max=0)
+
+
+def _form(matrix: Tensor, vector: Tensor) -> Tensor:
+    """`v^T M v` of vectors `(..., m, 1)`."""
+    return (vector * (matrix @ vector)).sum((-1, -2))

@@ -17,9 +17,11 @@ joint covariance, and is surer. So is one measurement of the mean of a point's p
 stands still: the mean of n clicks is off by a click's deviation over the root of n, which is its `pixel_sigma`.
 
 Whether the cameras agree is tested: each camera against the estimate of all others, by the chi-square of the difference
-(by F's distribution where deviations were estimated from few residuals). The camera that disagrees most is named, then
-tested is the rest. Where cameras disagree, nothing tells by itself which one is right: all stay in, and the covariance
-grows by chi-square over its degrees of freedom (Birge 1932), until its owner mends or leaves one out.
+(by F's distribution where deviations were estimated from few residuals), linearised where the others say that the
+points are. The camera that disagrees most is named, then tested is the rest; of two that share points with each other
+alone, both are. Where cameras disagree, nothing tells by itself which one is right: all stay in, and the covariance
+grows by chi-square over its degrees of freedom (Birge 1932), of all points or of those that a camera which disagrees
+saw, whichever is more, until its owner mends or leaves one out.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,10 +35,11 @@ from torch import Tensor
 
 from diffproj._core.arguments import called
 from diffproj._core.numerics import broadcast_batches
+from diffproj._core.shown import listed
 from diffproj._core.warn import warn_caller
 from diffproj.calibration.results.mismatch import CameraDisagreementWarning
 from diffproj.geometry.plane import Plane
-from diffproj.measurement.agreement import chances, chi_square, disagreeing, inverse, joined, without
+from diffproj.measurement.agreement import Sources, chances, disagreeing, growth, inverse, joined, without
 from diffproj.measurement.measurement import Measurement
 from diffproj.measurement.propagation import Noise
 from diffproj.measurement.quantity import BENT
@@ -69,6 +72,7 @@ class FusedMeasurement(Measurement):
     chance: Float[Tensor, "*batch c"] | None = None
     disagrees: Bool[Tensor, "*batch c"] | None = None
     scale: Float[Tensor, "*batch"] | None = None
+    _hold: tuple[str, ...] = ()
     _bent: Bool[Tensor, "*batch n"] | None = None
     _beyond: Bool[Tensor, "*batch n"] | None = None
 
@@ -101,6 +105,9 @@ class FusedMeasurement(Measurement):
         if self.extrapolated is not None:
             flags["extrapolated"] = self.extrapolated.flatten().tolist()
         return found | flags | {"reason": reasons}
+
+    def _held(self) -> tuple[str, ...]:
+        return self._hold
 
     def _facts(self) -> list[str]:
         return [f"{len(self.names)} cameras", *super()._facts()]
@@ -147,24 +154,24 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
     T = T.expand(*batch, N, 3, 2)
     seen = torch.stack([_seen(one).expand(*batch, N) for one in found], dim=-2)  # (*B, C, N)
     shares = sharing(found, batch).to(torch.float64)
-    best = _joined(names, found, seen, T, shares)
-    # From there on all are linearised at the estimate, each element of the batch until it stands still.
-    at, moving = best.placed.detach(), torch.ones(batch, dtype=torch.bool, device=T.device)
-    for _ in range(MOST_STEPS):
-        best = _joined(names, [relinearised(one, at) for one in found], seen, T, shares)
-        moving = moving & (best.deviations_from(at) > STANDS)
-        if not bool(moving.any()):
-            break
-        at = torch.where(moving[..., None, None], best.placed.detach(), at)
-    y, C, information, estimate, covariance, valid = best.y, best.C, best.information, *best.estimate
-    both = seen.repeat_interleave(2, dim=-1)
-    chi2 = chi_square(information, y - estimate.unsqueeze(-2)).sum(-1)
-    spare = both.sum((-1, -2)) - valid.sum(-1)
+    best, moving = _settled(names, found, seen, T, shares)
+    y, covariance = best.y, best.estimate[1]
     freedom = torch.stack([one.degrees_of_freedom.expand(batch) for one in found], dim=-1)
-    chance = chances(information, y, C, both, freedom)
-    disagrees = disagreeing(information, y, C, both, freedom)
-    grown = disagrees.any(-1) & (chi2 > spare)
-    scale = torch.where(grown, (chi2 / spare.clamp(min=1)).sqrt(), 1.0)
+
+    def sources_at(one: _Joined) -> Sources:
+        both = seen.repeat_interleave(2, dim=-1)
+        estimated = without(_covariances([_told(each) for each in one.found], T, shares), both)
+        return Sources(one.y, one.C, one.information, both, estimated, freedom)
+
+    def seen_by(some: Tensor) -> Sources:
+        theirs, _ = _settled(names, found, seen & some.unsqueeze(-1), T, shares)
+        at = torch.where(theirs.there.unsqueeze(-1), theirs.placed, best.placed).detach()
+        return sources_at(_joined(names, [relinearised(one, at) for one in found], seen, T, shares))
+
+    sources = sources_at(best)
+    chance = chances(sources)
+    disagrees = disagreeing(sources, seen_by, chance)
+    scale = growth(sources, disagrees).sqrt()
     common = scale[..., None, None, None] * T @ torch.linalg.cholesky(covariance).unflatten(-2, (N, 2))
     there, placed = best.there, best.placed
     common = torch.where(there[..., None, None], common, 0.0)
@@ -182,16 +189,36 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
         warn_caller(doubts, CameraDisagreementWarning)
     told = "; ".join(dict.fromkeys([doubts, *(one.doubts for one in found)])).strip("; ")
     includes = all(one.includes_intrinsics for one in found)
-    each = {"names": names, "seen": seen, "chance": chance, "disagrees": disagrees, "scale": scale}
+    each = {"names": names, "seen": seen, "chance": chance.exp(), "disagrees": disagrees, "scale": scale}
     fused = FusedMeasurement(placed, there, includes, noise, None, told, **each)
     curved = _curved(found, fused) | (moving.unsqueeze(-1) & there)
-    return replace(fused, _bent=curved, _beyond=_extrapolated(found, seen))
+    return replace(fused, _hold=_hold(names, found), _bent=curved, _beyond=_extrapolated(found, seen))
+
+
+def _settled(
+    names: Sequence[str], found: Sequence[Measurement], seen: Tensor, T: Tensor, shares: Tensor
+) -> tuple["_Joined", Tensor]:
+    """Measurements joined and linearised at their estimate, each element of the batch until it stands still.
+
+    Returns:
+        That, and which elements still move `(*B,)`.
+    """
+    best = _joined(names, found, seen, T, shares)
+    at, moving = best.placed.detach(), torch.ones(T.shape[:-3], dtype=torch.bool, device=T.device)
+    for _ in range(MOST_STEPS):
+        best = _joined(names, [relinearised(one, at) for one in found], seen, T, shares)
+        moving = moving & (best.deviations_from(at) > STANDS)
+        if not bool(moving.any()):
+            break
+        at = torch.where(moving[..., None, None], best.placed.detach(), at)
+    return best, moving
 
 
 class _Joined(NamedTuple):
     """The best estimate of measurements as they are linearised.
 
     Attributes:
+        found: these.
         y: what each measured, along the plane from near the points `(*B, C, 2 N)`.
         C: the covariances, as much larger as others share them `(*B, C, 2 N, 2 N)`.
         information: their inverses.
@@ -201,6 +228,7 @@ class _Joined(NamedTuple):
         T: the plane's directions `(*B, N, 3, 2)`.
     """
 
+    found: Sequence[Measurement]
     y: Tensor
     C: Tensor
     information: Tensor
@@ -213,7 +241,8 @@ class _Joined(NamedTuple):
         """How many deviations the furthest point is from there `(*B,)`."""
         step = torch.einsum("...nij,...ni->...nj", self.T, self.placed.detach() - at).flatten(-2)
         spread = self.estimate[1].detach().diagonal(dim1=-2, dim2=-1).sqrt()
-        return torch.where(self.estimate[2], step.abs() / spread, 0.0).amax(-1)
+        off = torch.where(self.estimate[2], step.abs() / spread, 0.0)
+        return torch.nn.functional.pad(off, (1, 0)).amax(-1)  # 0 of no points
 
 
 def _joined(names: Sequence[str], found: Sequence[Measurement], seen: Tensor, T: Tensor, shares: Tensor) -> _Joined:
@@ -224,8 +253,7 @@ def _joined(names: Sequence[str], found: Sequence[Measurement], seen: Tensor, T:
     y = torch.einsum("...nij,...cni->...cnj", T, points - origin.unsqueeze(-3)).flatten(-2)
     both = seen.repeat_interleave(2, dim=-1)
     y = torch.where(both, y, 0.0)
-    C = torch.stack([_along(one.joint().expand(*batch, 3 * N, 3 * N), T) for one in found], dim=-3)
-    C = without(shares[..., None, None] * C, both)
+    C = without(_covariances(found, T, shares), both)
     information, sound = inverse(C)
     if not bool(sound.all()):
         who = next(name for name, bad in zip(names, _of_any(~sound), strict=True) if bad)
@@ -236,7 +264,7 @@ def _joined(names: Sequence[str], found: Sequence[Measurement], seen: Tensor, T:
     estimate = joined(information, y)
     there = estimate[2].unflatten(-1, (N, 2)).all(-1)
     placed = origin + (T @ estimate[0].unflatten(-1, (N, 2)).unsqueeze(-1)).squeeze(-1)
-    return _Joined(y, C, information, estimate, torch.where(there.unsqueeze(-1), placed, 0.0), there, T)
+    return _Joined(found, y, C, information, estimate, torch.where(there.unsqueeze(-1), placed, 0.0), there, T)
 
 
 def _checked(
@@ -291,11 +319,10 @@ def _checked(
 def _same(a: Plane, b: Plane) -> bool:
     """Whether two planes are one, up to rounding."""
     try:
-        close = torch.isclose(a.unit_normal.to(torch.float64), b.unit_normal.to(torch.float64), rtol=0, atol=1e-9)
-        distance = a.offset / a.length, b.offset / b.length
-        return bool(close.all()) and bool(
-            torch.isclose(*(d.to(torch.float64) for d in distance), rtol=1e-9, atol=1e-9).all()
-        )
+        (n, d), (m, e) = a.to(torch.float64).normalised(), b.to(torch.float64).normalised()
+        side = (n * m).sum(-1).sign()  # the normal of one may point to the other side
+        close = torch.isclose(n, side.unsqueeze(-1) * m, rtol=0, atol=1e-9)
+        return bool(close.all()) and bool(torch.isclose(d, side * e, rtol=1e-9, atol=1e-9).all())
     except RuntimeError:  # of shapes that do not meet
         return False
 
@@ -325,10 +352,28 @@ def _extrapolated(found: Sequence[Measurement], seen: Tensor) -> Tensor | None:
     return seen.any(-2) & ~torch.stack(inside).any(0)
 
 
+def _hold(names: Sequence[str], found: Sequence[Measurement]) -> tuple[str, ...]:
+    """Whose noise and errors the joined deviations hold, in words."""
+    posed = [name for name, one in zip(names, found, strict=True) if "the pose" in one._held()]
+    return ("pixels",) if not posed else ("pixels", "the pose" + f" of {listed(posed)}" * (len(posed) < len(names)))
+
+
 def _mean(points: Tensor, seen: Tensor) -> Tensor:
     """About where each point is `(*B, N, 3)`, of those that saw it."""
     kept = torch.where(seen.unsqueeze(-1), points.detach(), 0.0)
     return kept.sum(-3) / seen.sum(-2).clamp(min=1).unsqueeze(-1)
+
+
+def _covariances(found: Sequence[Measurement], T: Tensor, shares: Tensor) -> Tensor:
+    """Of coordinates along the plane `(*B, C, 2 N, 2 N)`, each as much larger as others share it."""
+    shape = *T.shape[:-3], 3 * T.shape[-3], 3 * T.shape[-3]
+    return shares[..., None, None] * torch.stack([_along(one.joint().expand(shape), T) for one in found], dim=-3)
+
+
+def _told(one: Measurement) -> Measurement:
+    """The measurement with those errors alone whose scale the calibration's residuals tell."""
+    noise = one._noise
+    return one if noise.pixels_too else replace(one, _noise=replace(noise, own=0 * noise.own))
 
 
 def _along(joint: Tensor, T: Tensor) -> Tensor:
@@ -349,9 +394,6 @@ def _doubts(names: Sequence[str], disagrees: Tensor) -> str:
     if not who:
         return ""
     if len(who) == len(names):
-        listed = " and ".join((", ".join(who[:-1]), who[-1]))
-        return f"{listed} disagree by more than their deviations explain: was one moved, or is its pose wrong?"
+        return f"{listed(who)} disagree by more than their deviations explain: was one moved, or is its pose wrong?"
     verb = "disagrees" if len(who) == 1 else "disagree"
-    return (
-        f"{', '.join(who)} {verb} with the other cameras by more than the deviations explain: moved, or a wrong pose?"
-    )
+    return f"{listed(who)} {verb} with the other cameras by more than the deviations explain: moved, or a wrong pose?"

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from diffproj._core import arguments
 from diffproj._core.copying import Copied
-from diffproj._core.shown import Shown, counted, decimals, rounded
+from diffproj._core.shown import Shown, counted, decimals, listed, rounded
 from diffproj.calibration.results.covariance import zero_where_infinite
 from diffproj.calibration.results.region import in_region
 from diffproj.geometry.back_projection import Reason, explain
@@ -250,9 +250,15 @@ class Measurement(Copied, Shown):
         if self.doubts:
             lines.append(f"Doubtful: {self.doubts}.".replace("?.", "?"))
         if not self.includes_intrinsics:
-            known = "pixels and the pose" if self._noise.sigma.shape[-1] else "pixels alone"
+            known = listed(self._held()) + " alone" * (len(self._held()) == 1)
             lines.append(f"The deviations hold the noise of the {known}: the camera came without a covariance.")
         return "\n".join(lines)
+
+    def _held(self) -> tuple[str, ...]:
+        """Whose noise and errors the deviations hold, beside those of the intrinsics."""
+        sight = self._sight
+        posed, others = sight.by_theta.shape[-1], self._noise.sigma.shape[-1] - sight.away.shape[-1]
+        return ("pixels", *["the pose"][: min(1, posed)], *["the plane"][: min(1, others - posed)])
 
     def to_dict(self) -> dict[str, list[Any]]:
         """The points as columns of Python's own numbers, of many cameras with theirs: `pandas.DataFrame` takes it.

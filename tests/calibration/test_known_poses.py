@@ -127,6 +127,19 @@ def test_the_intrinsics_of_a_calibration_go_along() -> None:
     torch.testing.assert_close(found.covariance.shared, want.covariance.shared)
 
 
+def test_how_steeply_a_camera_without_a_pose_looks_the_corners_tell() -> None:
+    """A prior on its roll was refused, as of one that looks straight down; of one that does it still is."""
+    found, level = (
+        located(PIXELS[None], one, pixel_sigma=0.8, priors={"roll": (2.5, 0.01)})
+        for one in (TRUE.without_pose(), dp.Camera.mounted(5.0, 10.0, focal=900.0, size=(1280, 720)))
+    )
+    torch.testing.assert_close(found.cameras.R, level.cameras.R, rtol=0, atol=1e-7)
+    assert float(found.cameras.mounting().roll) == pytest.approx(2.5, abs=0.05)
+    down = dp.Camera.mounted(30.0, 90.0, position=[12.0, 18.0], focal=900.0, size=(1280, 720))
+    with pytest.raises(ValueError, match="for a camera that looks straight down"):
+        located(down.project(LANDMARKS)[0][None], down.without_pose(), pixel_sigma=0.8, priors={"roll": (2.5, 0.01)})
+
+
 def test_landmarks_far_from_the_origin() -> None:
     offset = torch.tensor([642735.0, 8304292.0, 0.0], dtype=D)
     there = TRUE.shifted(-offset)

@@ -355,6 +355,18 @@ def test_what_is_known_beforehand_is_what_the_library_makes_of_it(
     assert place["value"] == pytest.approx(float(located.cameras.center[0, 2]), abs=1e-6)
 
 
+def test_a_roll_is_held_and_weighs_where_the_camera_file_has_no_pose(
+    mast: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where nothing is said of the tilt: a camera without a pose looks straight up, where a roll is a heading."""
+    for more, held in (((), 3.0), (("--fixed", "heading=39"), 3.0), (("--fixed", "height=12.3"), -2.0)):
+        found = parsed(capsys, *mast, "--fixed", f"roll={held}", *more)
+        assert found["mounting"]["roll"] == {"value": pytest.approx(held, abs=1e-9), "deviation": 0.0}
+        assert found["rms"] > 10  # the truth is 0
+    found = parsed(capsys, *mast, "--prior", "roll=3+-0.001")["mounting"]["roll"]
+    assert found["value"] == pytest.approx(3.0, abs=0.02)
+
+
 def test_two_landmarks_and_what_is_known(mast: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     two = (*mast[:3], mast[3].replace("marks.csv", "two.csv"), *mast[4:])
     known = ("height=12.3+-0.02", "tilt=18+-0.5", "x=100+-0.5", "y=200+-0.5", "focal=1510+-5")

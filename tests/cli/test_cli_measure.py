@@ -381,9 +381,14 @@ def test_equations_and_quantities_for_people() -> None:
     assert equation([0, 0, 1, 0]) == "z = 0"
     assert equation([0, -1, 0.5, -3]) == "-y + 0.5 z = -3"
     assert equation([2, -3, 0, 1]) == "2 x - 3 y = 1"
+    assert equation([0.1, 0.2, 1, 1725135.5]) == "0.1 x + 0.2 y + z = 1725135.5"
     assert coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 0) == ("2.5", " ± unknown")
     assert coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 1) == ("0.00", " ± 0.20")
     assert coordinate([2.5, 0.0, 1e-12], [None, 0.2, 1e-17], 2) == ("0", "")
+    far = [642730.0, 8304290.0, 0.002], [0.004, 0.006, 0.0]  # UTM: millimetres of millions of metres
+    assert [coordinate(*far, axis)[1] for axis in range(3)] == [" \u00b1 0.0040", " \u00b1 0.0060", ""]
+    assert coordinate(*far, 2)[0] == "0.002"
+    assert coordinate([642730.0, 8304290.0, 1e-9], [0.004, 0.006, 1e-18], 2) == ("0", "")
     assert shown({"value": 2.5, "deviation": None, "interval_95": None}) == ("2.5", "unknown", "unknown")
     assert shown({"value": 900.0, "deviation": 300.0, "interval_95": [500.0, None]}) == ("900", "300", "from 500")
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import diffproj as dp
-from diffproj.measurement.agreement import _tail as tail
+from diffproj.measurement.agreement import log_tail
 
 D = torch.float64
 K = torch.tensor([[900.0, 0, 640], [0, 900, 480], [0, 0, 1]], dtype=D)
@@ -118,6 +118,60 @@ def test_of_two_cameras_nothing_tells_which_one_is_wrong() -> None:
     assert fused.disagrees.tolist() == [True, True]
 
 
+@pytest.mark.parametrize("landmarks", [4, 5, 12])
+@pytest.mark.parametrize("px", [20.0, 300.0])
+def test_a_camera_that_is_far_off_is_named_alone(landmarks: int, px: float) -> None:
+    """However few landmarks each was located by, and however far the estimate is drawn away."""
+    g, found = torch.Generator().manual_seed(0), []
+    survey = torch.tensor([[-4.0, -3, 0], [8, -3, 0.5], [9, 7, 1], [-3, 8, 0], [2, 3, 2]], dtype=D)
+    survey = torch.cat([survey, survey + 1, survey - torch.tensor([1.0, -1, 0], dtype=D)])[:landmarks]
+    for place in PLACES:
+        truth = camera(place)
+        seen = truth.project(survey)[0] + 0.5 * torch.randn(landmarks, 2, dtype=D, generator=g)
+        one = dp.locate(dp.Views(seen[None], size=truth.size), dp.Landmarks(survey), truth.without_pose())
+        pixels = truth.project(POINTS)[0] + 0.5 * torch.randn(4, 2, dtype=D, generator=g)
+        found.append(dp.measure(pixels + torch.tensor([px * (place == PLACES[1]), 0.0]), one, GROUND, pixel_sigma=0.5))
+    with pytest.warns(dp.CameraDisagreementWarning, match="camera 1 disagrees with the other cameras"):
+        fused = dp.fuse(found)
+    assert fused.disagrees.tolist() == [False, True, False]
+    assert bool(((fused.points - POINTS)[:, :2].abs() < 4 * fused.deviations[:, :2]).all())
+
+
+def test_the_normal_of_a_plane_may_point_to_either_side() -> None:
+    pixels = [camera(place).project(POINTS + torch.tensor([0, 0, 0.25]))[0] for place in PLACES[:2]]
+    planes = [dp.Plane([0.0, 0, 2], 0.5), dp.Plane([0.0, 0, -4], -1.0)]
+    one, other, turned = (
+        dp.measure(pixels[c], camera(PLACES[c]), planes[p], pixel_sigma=1.0) for c, p in ((0, 0), (1, 0), (1, 1))
+    )
+    want, fused = dp.fuse([one, other]), dp.fuse([one, turned])
+    torch.testing.assert_close(fused.points, want.points)
+    torch.testing.assert_close(fused.covariance, want.covariance)
+
+
+def test_no_points_are_joined_to_none() -> None:
+    none = dp.measure(torch.zeros(0, 2, dtype=D), camera(PLACES[0]), GROUND, pixel_sigma=1.0)
+    fused = dp.fuse([none, none])
+    assert fused.points.shape == (0, 3)
+    assert fused.to_dict()["point"] == []
+
+
+def test_the_summary_says_whose_errors_the_deviations_hold() -> None:
+    truths = [camera(place) for place in PLACES[:2]]
+    alone = [dp.measure(one.project(POINTS)[0], one, GROUND, pixel_sigma=1.0) for one in truths]
+    posed = measured(0)[:2]
+    for names, pair, held in (
+        (("a", "b"), alone, "noise of the pixels alone:"),
+        (("a", "b"), posed, "noise of the pixels and the pose:"),
+        (("mast", "roof"), [posed[0], alone[1]], "noise of the pixels and the pose of mast:"),
+    ):
+        assert held in dp.fuse(dict(zip(names, pair, strict=True))).summary()
+    uncertain = 0.01 * torch.eye(4, dtype=D)
+    for one, held in ((truths[0], "pixels and the plane"), (located(truths[0], 0 * BOARD.points[:, :2]), "")):
+        given = {"pixel_sigma": 1.0, "plane_covariance": uncertain}
+        text = dp.measure(truths[0].project(POINTS)[0], one, GROUND, **given).summary()
+        assert f"noise of the {held or 'pixels, the pose and the plane'}:" in text
+
+
 def test_what_a_camera_does_not_see_others_tell() -> None:
     pixels = camera(PLACES[0]).project(POINTS)[0].clone()
     pixels[1] = torch.nan
@@ -169,14 +223,18 @@ def test_batches_heights_and_gradients() -> None:
 
 
 def test_the_tail_of_the_f_distribution() -> None:
-    # scipy.stats.f.sf(2.5, 8, 18), chi2.sf(20, 8), f.sf(6, 2, 5), chi2.sf(4, 1), and nothing that could be unlike
+    # scipy.stats.f.logsf(chi2 / count, count, freedom) and chi2.logsf, and nothing that could be unlike
     chi2, count, freedom = (
         torch.tensor(x, dtype=D)
-        for x in ([20.0, 20, 12, 4, 0], [8, 8, 2, 1, 0], [18.0, math.inf, 5, math.inf, math.inf])
+        for x in (
+            [20.0, 20, 12, 4, 1e4, 300, 5e4, 50, 0],
+            [8, 8, 2, 2, 8, 40, 8, 8, 0],
+            [18.0, math.inf, 5, 3.7, 2, 50, math.inf, 1e12, math.inf],
+        )
     )
-    torch.testing.assert_close(
-        tail(chi2, count, freedom), torch.tensor([0.0513, 0.0103, 0.0471, 0.0455, 1], dtype=D), rtol=0.06, atol=0
-    )
+    want = [-2.981131177, -4.572117429, -3.059438579, -1.355841892, -7.131398755, -23.474587449, -24971.411746155]
+    want = torch.tensor([*want, -17.012928521, 0], dtype=D)
+    torch.testing.assert_close(log_tail(chi2, count, freedom), want, rtol=1e-9, atol=1e-9)
 
 
 def test_it_refuses_what_cannot_be_joined(monkeypatch: pytest.MonkeyPatch) -> None:
