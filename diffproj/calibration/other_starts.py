@@ -9,7 +9,7 @@ The minima are compared as they are: on the same corners, and with the likelihoo
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ from diffproj.calibration.outcome import Begun
 from diffproj.calibration.problem.parametrisation import POSE, Pose
 from diffproj.calibration.results.ambiguity import difference
 from diffproj.calibration.results.remark import Kind, Remark, Remarks
+from diffproj.calibration.trust.noise import times_less_likely
 from diffproj.calibration.trust.other_poses import APART, typical_noise
 from diffproj.calibration.trust.reach import folds_at_corners
 
@@ -39,8 +40,8 @@ FEW_VIEWS, FEW_CORNERS = 4, 40
 """Views and corners up to which other starts are looked for: more have had better ones."""
 FOCAL = (1.0, 0.5, 0.7, 1.4, 2.0)
 """Focal lengths to start from, in that of the camera."""
-SHORT_FIT = 20
-"""Steps after which only the best of the starts goes on."""
+SHORT_FIT = 50
+"""Steps after which only the best of the starts goes on: with 20 of them some valleys' lowest places are not seen."""
 NEAR = 1e-6
 """Part of the cost that another of these steps need not gain."""
 FEWEST_STEPS = 40
@@ -50,22 +51,40 @@ NEARLY = 20.0
 ANOTHER = "another camera and pose explain the corners nearly as well"
 
 
-def lowest(begin: Begun, options: Options) -> Fit:
-    """The minimum from the start, or a lower one from another pose or focal length, where the first is doubtful."""
+class Rivals(NamedTuple):
+    """Of each camera the lowest of other minima that lie beyond the error bars of the one that is taken.
+
+    Attributes:
+        ratio: how many times less likely it is `(P,)`; infinite where there is none.
+        focal: its focal length f_x `(P,)`.
+    """
+
+    ratio: Tensor
+    focal: Tensor
+
+
+def lowest(begin: Begun, options: Options) -> tuple[Fit, Rivals]:
+    """The minimum from the start, or a lower one from another pose or focal length, where the first is doubtful.
+
+    With it what else nearly as low was seen on the way.
+    """
     found = begin.minimum(options)
+    rivals = Rivals(*(torch.full_like(found.solution.cost, torch.inf) for _ in Rivals._fields))
     if options.max_iterations < FEWEST_STEPS or not _may_be_several(found):
-        return found
+        return found, rivals
     rows = _doubtful(found, begin.shared).nonzero().flatten()
     if len(rows) == 0:
-        return found
+        return found, rivals
     first, start = found.part(rows), begin.shared[rows]
-    best = _best_of(first, start)
-    if best is None:
-        return found
-    which, shared, poses = best
-    limits: dict[str, Any] = {"max_iterations": options.max_iterations, "tolerance": options.tolerance}
-    other = fit(begin.task.part(rows[which]), shared, poses, reject=options.outlier_limit, **limits)
-    return exchanged(found, other, rows[which], _better(first.part(which), other, start[which]))
+    near, cost = _led_to(first, start)
+    which, lane = _lower(first, start, cost)
+    if len(which) > 0:
+        limits: dict[str, Any] = {"max_iterations": options.max_iterations, "tolerance": options.tolerance}
+        shared, poses = near.shared[lane], tuple(z[lane] for z in near.local)
+        other = fit(begin.task.part(rows[which]), shared, poses, reject=options.outlier_limit, **limits)
+        found = exchanged(found, other, rows[which], _better(first.part(which), other, start[which]))
+    told = _rivals(found.part(rows), near, cost)
+    return found, Rivals(*(a.index_copy(0, rows, b) for a, b in zip(rivals, told, strict=True)))
 
 
 def _may_be_several(found: Fit) -> bool:
@@ -97,10 +116,11 @@ def _on_a_line(task: Task) -> Tensor:
 
 
 def _explains(found: Fit) -> Tensor:
-    """Which fits leave residuals as small as those of corners are `(P,)`."""
+    """Which fits leave residuals as small as those of corners are `(P,)`; few are left of few corners."""
     task = found.task
     weights = task.used if task.weights is None or found.knows_noise else torch.where(task.used, task.weights, 0.0)
-    return found.solution.cost <= POOR * weights.sum((1, 2))
+    left = found.degrees_of_freedom().clamp(min=1) / (2 * task.used.sum((1, 2))).clamp(min=1)
+    return found.solution.cost <= POOR * weights.sum((1, 2)) * left.clamp(max=1)
 
 
 def _no_camera(task: Task, solution: Solution, start: Tensor) -> Tensor:
@@ -109,16 +129,12 @@ def _no_camera(task: Task, solution: Solution, start: Tensor) -> Tensor:
     return mirrored | folds_at_corners(task, solution.shared, solution.local)
 
 
-def _best_of(first: Fit, start: Tensor) -> tuple[Tensor, Tensor, Pose] | None:
-    """Of the starts of each camera that one which came lowest: the cameras `(n,)` it is lower for, and where it is."""
-    near, cost = _led_to(first, start)
+def _lower(first: Fit, start: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
+    """The cameras `(n,)` that one of the starts led lower, of costs `(L, P)`, and which of the L P that was."""
     lowest, lane = cost.min(0)
     before = torch.where(_no_camera(first.task, first.solution, start), torch.inf, first.solution.cost * (1 - LOWER))
     which = (lowest < before).nonzero().flatten()
-    if len(which) == 0:
-        return None
-    at = lane[which] * len(start) + which
-    return which, near.shared[at], tuple(z[at] for z in near.local)
+    return which, lane[which] * len(start) + which
 
 
 def _led_to(first: Fit, start: Tensor) -> tuple[Solution, Tensor]:
@@ -165,14 +181,16 @@ def _starts(task: Task, shared: Tensor, found: Pose) -> tuple[Tensor, Pose]:
 def _better(first: Fit, other: Fit, start: Tensor) -> Tensor:
     """Which of other fits are better `(P,)`: at an end, possible, on the same corners, and likelier than the first.
 
-    Where the first is impossible, another that explains the corners is better whatever it costs; one that does not
+    Where the first is impossible, another that explains as many corners is better whatever it costs; one that does not
     would only hide that.
     """
     same = (other.rejected == first.rejected).flatten(1).all(-1)
+    impossible = _no_camera(first.task, first.solution, start)
+    same |= impossible & (other.rejected.sum((1, 2)) <= first.rejected.sum((1, 2)))
     ended = other.solution.status == Status.CONVERGED
     here, there = _improbability(first), _improbability(other)
     lower = there < here - LOWER * here.abs()
-    lower = torch.where(_no_camera(first.task, first.solution, start), _explains(other), lower)
+    lower = torch.where(impossible, _explains(other), lower)
     return same & ended & ~_no_camera(other.task, other.solution, start) & lower
 
 
@@ -186,41 +204,33 @@ def _improbability(found: Fit) -> Tensor:
     return cost / level + torch.where(task.used, log, 0.0).sum((1, 2))
 
 
-def with_other_minima(said: Callable[[], tuple[Remarks, ...]], found: Fit, start: Tensor) -> tuple[Remarks, ...]:
-    """The remarks on each of P cameras, and one where another minimum, beyond its error bars, is nearly as likely.
+def _rivals(kept: Fit, near: Solution, cost: Tensor) -> Rivals:
+    """What is nearly as low as minima that are taken, of starts that led to `near (L P, ...)` at costs `(L, P)`."""
+    solution, P = kept.solution, len(kept.rejected)
+    each = torch.arange(P, device=cost.device).repeat(len(cost))
+    step = (near.shared - solution.shared[each]).unsqueeze(-1)
+    turn = difference(tuple(z[each] for z in solution.local), near.local, kept.task.points.mean(0)).unsqueeze(-1)
+    U, E, W = (getattr(solution.equations, name)[each] for name in ("U", "E", "W"))
+    of_views = 2 * step.mT.unsqueeze(1) @ E @ turn + turn.mT @ W @ turn
+    apart = ((step.mT @ U @ step).flatten() + of_views.flatten(1).sum(1)).reshape(-1, P)
+    noise = typical_noise(kept)
+    another = (apart > APART**2 * noise.variance) & (near.status == Status.CONVERGED).reshape(-1, P)
+    another &= solution.status == Status.CONVERGED
+    lowest, lane = torch.where(another, cost, torch.inf).min(0)
+    noise = noise._replace(variance=noise.variance.clamp(min=1e-18))
+    focal = near.shared[:, 0].reshape(-1, P).gather(0, lane.unsqueeze(0)).squeeze(0)
+    return Rivals(times_less_likely(lowest - solution.cost, noise), focal)
 
-    Args:
-        said: the remarks without it.
-        found: the lowest minimum.
-        start: shared parameters that the camera was given with `(P, s)`.
-    """
-    with torch.no_grad():
-        rows = (_doubtful(found, start) & (found.solution.status == Status.CONVERGED)).nonzero().flatten()
-        if not _may_be_several(found) or len(rows) == 0:
-            return said()
-        first = found.part(rows)
-        near, cost = _led_to(first, start[rows])
-        kept, P = first.solution, len(rows)
-        each = torch.arange(P, device=rows.device).repeat(len(cost))
-        step = near.shared - kept.shared[each]
-        turn = difference(tuple(z[each] for z in kept.local), near.local, first.task.points.mean(0))
-        U, E, W = (getattr(kept.equations, name)[each] for name in ("U", "E", "W"))
-        along = (step.unsqueeze(-2) @ U @ step.unsqueeze(-1)).flatten()
-        along += (2 * step[:, None, None] @ E @ turn.unsqueeze(-1) + turn.unsqueeze(-2) @ W @ turn.unsqueeze(-1)).sum(
-            (1, 2, 3)
-        )
-        variance, freedom = typical_noise(first)
-        another = (along.reshape(-1, P) > APART**2 * variance) & (near.status == Status.CONVERGED).reshape(-1, P)
-        lowest, lane = torch.where(another, cost, torch.inf).min(0)
-        excess = 2 * (lowest - kept.cost).clamp(min=0) / (variance.clamp(min=1e-18) * freedom)
-        ratio = (freedom / 2 * excess.log1p()).exp()
+
+def with_rivals(said: Callable[[], tuple[Remarks, ...]], focal: Tensor, rivals: Rivals) -> tuple[Remarks, ...]:
+    """The remarks on each of P cameras of focal lengths `(P,)`, and one where another minimum is nearly as likely."""
     more: dict[int, Remarks] = {}
-    for row in (ratio < NEARLY).nonzero().flatten().tolist():
-        here, there = (float(x[0]) for x in (kept.shared[row], near.shared[lane[row] * P + row]))
+    for p in (rivals.ratio < NEARLY).nonzero().flatten().tolist():
+        here, there = float(focal[p]), float(rivals.focal[p])
         moved = f", focal length {there:.4g} px in place of {here:.4g} px" if abs(there - here) > 1e-3 * here else ""
         sentence = (
-            f"{ANOTHER}, {float(1 / ratio[row]):.2g} times as likely{moved}; more corners, off the line or plane of "
-            "the others, or a prior, tell them apart"
+            f"{ANOTHER}, {float(1 / rivals.ratio[p]):.2g} times as likely{moved}; more corners, off the line or plane "
+            "of the others, or a prior, tell them apart"
         )
-        more[int(rows[row])] = (Remark(sentence, Kind.RIVAL, ANOTHER),)
+        more[p] = (Remark(sentence, Kind.RIVAL, ANOTHER),)
     return tuple((*one, *more.get(p, ())) for p, one in enumerate(said()))

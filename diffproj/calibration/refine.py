@@ -13,7 +13,7 @@ from diffproj.calibration.fitting.data import Data
 from diffproj.calibration.fitting.free_points import with_free_points
 from diffproj.calibration.fitting.implicit import check_differentiable, differentiated
 from diffproj.calibration.fitting.options import CalibrationOptions, calibration_options
-from diffproj.calibration.other_starts import lowest, with_other_minima
+from diffproj.calibration.other_starts import lowest, with_rivals
 from diffproj.calibration.outcome import begun, outcome
 from diffproj.calibration.results.calibration import Calibration
 from diffproj.geometry.camera import Camera, as_camera
@@ -33,8 +33,8 @@ def refine(
 
     Few corners have several minima. Where up to 40 corners of up to four views hardly outnumber the unknowns, lie
     nearly on a line or are explained badly, other poses and focal lengths are started from, too, and the lowest minimum
-    is taken, which takes 5 to 50 ms a camera. A remark tells of one nearly as likely. Not so where the camera brings
-    poses, with the objective `"plane"`, or with fewer than 40 `max_iterations`.
+    is taken, which mostly takes 10 to 150 ms a camera. A remark tells of one nearly as likely. Not so where the camera
+    brings poses, with the objective `"plane"`, or with fewer than 40 `max_iterations`.
 
     Args:
         views: corners `(*B, V, N, 2)`.
@@ -90,14 +90,14 @@ def refine(
         own = own if differentiable else own.detach()
         begin = begun(data, chosen, parameters, own.detach(), local, own)
         posed = not start.broadcasts(beginning.batch_shape, tuple(data.batch))
-        found, prior = begin.minimum(chosen) if posed else lowest(begin, chosen), begin.prior
-        found, prior = with_free_points(found, data, chosen, prior)
+        found, rivals = (begin.minimum(chosen), None) if posed else lowest(begin, chosen)
+        found, prior = with_free_points(found, data, chosen, begin.prior)
         if differentiable:
             found = differentiated(found, data, prior, chosen, own)
         refined = outcome("refine", data, found, beginning.size or views.size, chosen.throw)
         said = refined._remarks
-        if posed or said is None:
+        if rivals is None or said is None or found.task.free:
             return refined
-        return replace(refined, _remarks=partial(with_other_minima, said, found, begin.shared))
+        return replace(refined, _remarks=partial(with_rivals, said, found.solution.shared.detach()[:, 0], rivals))
 
     return with_true_centres(fit, views, target)

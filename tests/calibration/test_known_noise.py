@@ -39,6 +39,7 @@ def test_nothing_is_said_of_noise_that_is_as_known_or_is_estimated() -> None:
         assert not found.doubts
         assert not dp.measure([[600.0, 800.0]], found, dp.Plane.z(0.0), view=0, pixel_sigma=1.0).doubts
         assert "nothing speaks against" in found.verdict
+    assert "and landmarks are met to 13 px in each coordinate" in found.verdict  # for people to judge
 
 
 def test_the_verdict_tells_the_scatter_that_residuals_show_and_not_what_was_said_of_it() -> None:

@@ -118,7 +118,15 @@ def test_a_pair_is_placed_by_what_opencv_calls_r_and_t(tmp_path: Path, names: tu
             ("stereo 1", "stereo 2"),
             ("master", "slave"),
         ),
-        *(("cam0_left", "cam1_right"), ("left0", "right1"), ("camera_1_left", "camera_2_right"), ("cam122", "cam123")),
+        *(
+            ("cam0_left", "cam1_right"),
+            ("left0", "right1"),
+            ("camera", "right"),
+            ("camera", "second"),
+            ("camleft", "camright"),
+            ("camera_1_left", "camera_2_right"),
+            ("cam122", "cam123"),
+        ),
     ],
 )
 def test_names_tell_the_first_of_a_pair_whatever_the_order_in_the_file(tmp_path: Path, first: str, second: str) -> None:
@@ -139,6 +147,8 @@ def test_a_pair_whose_names_tell_no_order_has_no_pose(tmp_path: Path) -> None:
         ("cam_845112", "cam_123456"),
         ("thermal", "camera"),
         ("left1", "right0"),
+        *(("cam", "cam123"), ("cam", "cam_b"), ("depth", "right"), ("camera", "depth2"), ("cam1", "cam2x")),
+        *(("cam_1", "cam1"), ("cam9", "cam100"), ("cam_ab", "cam_b")),
     ]
     for tree in (flat, *(dict.fromkeys(pair, ONE) for pair in pairs)):
         with pytest.warns(UserWarning, match="R, T: a pose that is not read"):

@@ -204,7 +204,9 @@ class Account(Shown):
         if self.status:
             return advice.Judgement("Not usable", (self._ends()[0],))
         if self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics):
-            return advice.Judgement(advice.POSES_ONLY, (self.doubts or "nothing speaks against them",))
+            points = "corners" if self.landmarks is None else "landmarks"
+            met = f"nothing speaks against them, and {points} are met to {self._scatter:.2g} px in each coordinate"
+            return advice.Judgement(advice.POSES_ONLY, (self.doubts or met,))
         used = self.used.any(-1)
         unsure = None
         if self.has_covariance:

@@ -160,7 +160,7 @@ def judged(seen: Evidence) -> Judgement:
     if Kind.SPACING in seen.kinds:
         remedies.insert(0, "no other photograph yet, but the side and the distance of the tags measured")
     if Kind.WRONG_PRIOR in seen.kinds:
-        remedies.insert(0, "first another look at the prior that the remark names")
+        remedies.insert(0, "first another look at the prior, or the value that was held, that the remark names")
     if Kind.BENT in seen.kinds:
         remedies.insert(0, "no other photograph yet, but shape='bow', or a board glued to something flat")
     word, reasons = ("Weak", faults) if faults else ("Good", _praise(seen, tilt, covered))
@@ -194,7 +194,7 @@ def of_landmarks(count: int, unsure: float | None, sigma: float, spare: float | 
         remedies.append("more landmarks, off the plane of the others, or a prior that tells the poses apart")
     if contradicted := _reasons(remarks, Kind.CONTRADICTION, Kind.WRONG_PRIOR):
         faults += contradicted
-        remedies.append("a look at wrong landmarks and wrong priors, or larger deviations for them")
+        remedies.append("a look at wrong landmarks, wrong priors and held values, or larger deviations for them")
     if not faults:
         known = [f"focal length and principal point are known to {100 * unsure:.1g} %"] if unsure else []
         return Judgement("Good", (f"{count} landmarks are met to {sigma:.2g} px in each coordinate", *known))

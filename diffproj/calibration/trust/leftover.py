@@ -85,6 +85,9 @@ class Leftover:
         print: the same by a stretch along x and a shear, as printers and wrong sides of squares make them.
         proportion: the same as a proportion of the board changes them, such as the distance of its tags; `None` for
             boards without one.
+        focal: focal lengths that are held, relative to themselves; `None` where none is.
+        ratio: the same of f_y alone, where the ratio of focal lengths is held.
+        point: coordinates of the principal point that are held.
         moved: how far the points lie off the board within its plane, `(n,)`, RMS in world units, without the noise.
         lifted: how far they lie off that plane `(n,)`, likewise.
     """
@@ -96,6 +99,9 @@ class Leftover:
     bow: Effect
     print: Effect
     proportion: Effect | None
+    focal: Effect | None
+    ratio: Effect | None
+    point: Effect | None
     moved: Tensor
     lifted: Tensor
 
@@ -136,6 +142,7 @@ class _Scores:
         s = len(task.names)
         self.shared, self.poses, self.residual = panel[:, :, :s], panel[:, :, s:-1], panel[:, :, -1]
         self.by_point = torch.einsum("pvikn,pvij->pvjkn", panel[:, :, -4:-1], poses[0])  # the board's, in its frame
+        self.held = self._held(shared[:, :2])
         if task.basis is not None:
             self.shared = torch.einsum("psq,pvskn->pvqkn", task.basis, self.shared)
         told = share * (2 * task.used.sum(-1) - POSE * task.used.any(-1))
@@ -169,7 +176,22 @@ class _Scores:
         proportion = None
         if by_proportion is not None and not self.task.free:
             proportion = self._added(self._moving(by_proportion), self.residual, self.count)
-        return Leftover(radial, smooth, skew, shape, bow, uneven, proportion, *self._spread(moves))
+        focal, ratio, point = (None if columns is None else besides_shape(columns) for columns in self.held)
+        moved, lifted = self._spread(moves)
+        return Leftover(radial, smooth, skew, shape, bow, uneven, proportion, focal, ratio, point, moved, lifted)
+
+    def _held(self, focal: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+        """Derivatives by focal lengths, their ratio and the principal point, as far as they are held."""
+        basis = self.task.basis
+        if basis is None:
+            return None, None, None
+        f_held, c_held = (basis[:, :4] == 0).all(-1).all(0).split(2)
+        relative = self.shared[:, :, :2] * focal[:, None, :, None, None]
+        return (
+            relative[:, :, f_held].sum(2, keepdim=True) if bool(f_held.any()) else None,
+            relative[:, :, 1:] if bool((basis[:, 0] * basis[:, 1] != 0).any()) else None,
+            self.shared[:, :, 2:4][:, :, c_held] if bool(c_held.any()) else None,
+        )
 
     def _radial(self) -> Tensor:
         off = self.projected - self.middle[:, None, None]

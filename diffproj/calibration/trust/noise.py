@@ -77,3 +77,9 @@ def pooled(own: Noise, known: Noise) -> Noise:
     usual = usual & (chance > CONTRADICTION)
     both = torch.where(usual, own.freedom + known.freedom, own.freedom)
     return Noise(torch.where(usual, squares + known.variance * known.freedom, squares) / both, both)
+
+
+def times_less_likely(more: Tensor, noise: Noise) -> Tensor:
+    """How many times less likely what costs so much more is; by Student's distribution, for the noise is estimated."""
+    excess = 2 * more.clamp(min=0) / (noise.variance * noise.freedom)
+    return (noise.freedom / 2 * excess.log1p()).exp()

@@ -9,7 +9,7 @@ from diffproj.calibration.fitting.task import Task
 from diffproj.calibration.fitting.two_poses import FEW_CORNERS, posed, tilted_poses, view_costs, weak_perspective
 from diffproj.calibration.problem.parametrisation import Pose
 from diffproj.calibration.results.ambiguity import OtherPoses, difference
-from diffproj.calibration.trust.noise import Noise, own_noise, pooled
+from diffproj.calibration.trust.noise import Noise, own_noise, pooled, times_less_likely
 
 APART = 3.0
 """Distance of two poses, in standard deviations, up to which the kept one's error bar covers the other."""
@@ -78,8 +78,7 @@ def _other_poses(found: Fit, variance: Tensor, freedom: Tensor) -> tuple[Tensor,
         here, there = (_improbability(task, shared, poses, variance.unsqueeze(-1)) for poses in (kept, best))
         ratio = (there - here).nan_to_num(torch.inf).clamp(min=0).exp()
         return best[0], best[1], torch.where(cost.isfinite(), ratio, torch.inf)
-    excess = 2 * (cost - here).clamp(min=0) / (variance * freedom)
-    return best[0], best[1], (freedom / 2 * excess.log1p()).exp()
+    return best[0], best[1], times_less_likely(cost - here, Noise(variance, freedom))
 
 
 def _improbability(task: Task, shared: Tensor, poses: Pose, variance: Tensor) -> Tensor:

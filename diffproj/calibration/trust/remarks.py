@@ -31,6 +31,7 @@ from diffproj.calibration.trust.discounted import discounted
 from diffproj.calibration.trust.dispersion import Pulls, contradiction, dispersion, pulls_of
 from diffproj.calibration.trust.entangled import Entangled, Simpler
 from diffproj.calibration.trust.flexing import of_a_flexing_board
+from diffproj.calibration.trust.held_values import held_value
 from diffproj.calibration.trust.leftover import Leftover, f_deviations, leftover
 from diffproj.calibration.trust.own_intrinsics import OwnIntrinsics, own_intrinsics
 from diffproj.calibration.trust.prior_contradiction import PriorContradiction, prior_contradictions
@@ -151,8 +152,12 @@ def remarks(
             if spacing is not None:
                 said[p].append(spacing)
                 continue
-            if not of_landmarks and _uneven_print(task, left, i, p, saved):
+            wrong_value, gained = held_value(left, i)
+            if not of_landmarks and _uneven_print(task, left, i, p, max(saved, gained)):
                 said[p].append(_of_the_print(left, i))
+                continue
+            if wrong_value is not None and gained > BETTER * saved:
+                said[p].append(wrong_value)
                 continue
             remark = _left_over(task, left, i, p)
             two = p in groups and saved > BETTER * float(left.smooth.share[i])
