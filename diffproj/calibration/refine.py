@@ -33,7 +33,7 @@ def refine(
 
     Few corners have several minima. Where up to 40 corners of up to four views hardly outnumber the unknowns, lie
     nearly on a line or are explained badly, other poses and focal lengths are started from, too, and the lowest minimum
-    is taken, which mostly takes 10 to 150 ms a camera. A remark tells of one nearly as likely. Not so where the camera
+    is taken, which mostly takes 10 to 200 ms a camera. A remark tells of one nearly as likely. Not so where the camera
     brings poses, with the objective `"plane"`, or with fewer than 40 `max_iterations`.
 
     Args:

@@ -5,7 +5,6 @@ import math
 import re
 from typing import NamedTuple
 
-from diffproj._core.shown import plain
 from diffproj.cli.inputs import LARGEST_NUMBER
 
 PLACE = ("x", "y", "height")
@@ -31,7 +30,7 @@ class Known(NamedTuple):
 
     def __str__(self) -> str:
         """As the command line has it."""
-        return f"{self.name}={plain(self.value)}" + f"+-{self.deviation:g}" * (self.deviation > 0)
+        return f"{self.name}={self.value:.12g}" + f"+-{self.deviation:g}" * (self.deviation > 0)
 
 
 class FieldOfView(NamedTuple):
@@ -74,7 +73,7 @@ def prior(text: str) -> Known:
     name, _, rest = text.partition("=")
     parts = re.split(PLUS_MINUS, rest)
     if len(parts) == 1 and name.strip() and (value := _number(rest)) is not None:
-        said = f"{name.strip()}={plain(value)}"
+        said = f"{name.strip()}={value:.12g}"
         raise argparse.ArgumentTypeError(
             f"want a standard deviation behind the value, such as {said}+-0.1, got {text!r}; --fixed {said} holds it"
         )
@@ -82,7 +81,7 @@ def prior(text: str) -> Known:
     if value is None or deviation is None or not name.strip():
         raise argparse.ArgumentTypeError(f"want NAME=VALUE+-DEVIATION, such as height=12+-0.02, got {text!r}")
     if deviation <= 0:
-        zero = f"; --fixed {name.strip()}={plain(value)} holds it" * (deviation == 0)
+        zero = f"; --fixed {name.strip()}={value:.12g} holds it" * (deviation == 0)
         raise argparse.ArgumentTypeError(f"want a standard deviation above 0, got {text!r}{zero}")
     return _checked(name, value, deviation, text)
 

@@ -13,6 +13,9 @@ from torch import Tensor
 
 CHANCE = 1e-3
 """How likely a disagreement may be by chance, over all sources, before it is one."""
+RARELY = 0.67
+"""Deviations of a normal variable below which one in four lies: a scale is taken to be as small by chance as that, by
+the cube root of a chi-square over its freedom (Wilson and Hilferty 1931)."""
 KNOWN = 1e8
 """Residuals from which on the scale that they tell counts as known."""
 
@@ -104,6 +107,9 @@ def _judged(sources: Sources, c: int) -> tuple[Tensor, Tensor]:
     ours, theirs = _form(sources.estimated[..., c, :, :], weight), _form(sources.estimated[..., others, :, :], back)
     share = (ours + theirs.sum(-1)) / torch.where(chi2 > 0, chi2, 1.0)
     least = sources.freedom.amin(-1).clamp(min=1)
+    # A scale that was estimated too small makes its own part look small: it counts as what it may well be.
+    small = (1 - 2 / (9 * least) - RARELY * (2 / (9 * least)).sqrt()).pow(3).clamp(max=1)
+    share = share / (share + small * (1 - share))
     return log_tail(chi2, count, least / share.square().clamp(min=1e-300)), log_tail(chi2, count, least)
 
 
@@ -120,11 +126,16 @@ def disagreeing(
     """
     count = sources.y.shape[-2]
     limit, kept = math.log(CHANCE / count), torch.ones_like(sources.freedom, dtype=torch.bool)
-    if not bool(((chances(sources) if chance is None else chance) < limit).any()):
+    doubtful = ((chances(sources) if chance is None else chance) < limit).any(-1, keepdim=True)
+    if not bool(doubtful.any()):
         return ~kept
+    certain = torch.zeros_like(sources.freedom[..., 0])  # the chance 1 of a source that is out
     for _ in range(count - 1):
         found = []
         for c in range(count):
+            if not bool(kept[..., c].any()):
+                found.append((certain, certain))
+                continue
             others = kept.clone()
             others[..., c] = False
             rest = sources if seen_by is None else seen_by(others)
@@ -132,7 +143,7 @@ def disagreeing(
             information = rest.information * kept[..., None, None].to(rest.y)
             found.append(_judged(rest._replace(information=information, both=known), c))
         chance, alike = (torch.where(kept, torch.stack(one, -1), 0.0) for one in zip(*found, strict=True))
-        beyond = chance.amin(-1, keepdim=True) < limit
+        beyond = doubtful & (chance.amin(-1, keepdim=True) < limit)
         now = beyond & (alike == alike.amin(-1, keepdim=True)) & kept
         now = now | (_pairs(kept[..., None] & sources.both) & now.unsqueeze(-2)).any(-1)
         if not bool(now.any()):

@@ -164,7 +164,7 @@ def fuse(measurements: Sequence[Measurement] | Mapping[str, Measurement]) -> Fus
         return Sources(one.y, one.C, one.information, both, estimated, freedom)
 
     def seen_by(some: Tensor) -> Sources:
-        theirs, _ = _settled(names, found, seen & some.unsqueeze(-1), T, shares)
+        theirs = _joined(names, found, seen & some.unsqueeze(-1), T, shares)
         at = torch.where(theirs.there.unsqueeze(-1), theirs.placed, best.placed).detach()
         return sources_at(_joined(names, [relinearised(one, at) for one in found], seen, T, shares))
 

@@ -30,6 +30,17 @@ def test_many_points_are_judged_as_each_alone() -> None:
     assert found[3].tolist() == [False, True, False]
 
 
+def test_who_agrees_is_not_judged_anew_for_others_sake() -> None:
+    """Where the sources of one element of a batch disagree, those of another are as they are alone."""
+    y = torch.zeros(2, 3, 2, dtype=D)
+    y[1, 2] = 90.0
+    C = torch.eye(2, dtype=D).expand(2, 3, 2, 2).clone()
+    both, freedom = torch.ones(2, 3, 2, dtype=torch.bool), torch.full((2, 3), torch.inf, dtype=D)
+    elsewhere = Sources(torch.full_like(y, 0.0).index_fill(1, torch.tensor([0]), 90.0), C, C, both, C, freedom)
+    found = disagreeing(Sources(y, C, C, both, C, freedom), lambda _: elsewhere)
+    assert found.tolist() == [[False, False, False], [True, False, False]]
+
+
 def test_of_two_that_disagree_nothing_tells_which_is_wrong() -> None:
     """Whatever their covariances, and however rounding makes the chances of the two differ."""
     root = torch.randn(200, 2, 2, 2, dtype=D)

@@ -28,6 +28,8 @@ OF_MANY = {
     Kind.CONTRADICTION: "the residuals of cameras {} are larger than pixel_sigma says",
     Kind.TOLD_APART: "EXIF data speak against the photographs of cameras {} being of the camera that was given",
 }
+EXACT_PX = 1e-9
+"""Residuals up to which corners are met exactly, but for rounding."""
 REMARK = "something speaks against the poses of cameras {}"
 """What a remark of a kind says against poses, and any other one, of some of many cameras."""
 
@@ -205,7 +207,8 @@ class Account(Shown):
             return advice.Judgement("Not usable", (self._ends()[0],))
         if self.lens_region is not None or (self.has_covariance and not self.knows_intrinsics):
             points = "corners" if self.landmarks is None else "landmarks"
-            met = f"nothing speaks against them, and {points} are met to {self._scatter:.2g} px in each coordinate"
+            met = f"to {self._scatter:.2g} px in each coordinate" if self._scatter > EXACT_PX else "exactly"
+            met = f"nothing speaks against them, and {points} are met {met}"
             return advice.Judgement(advice.POSES_ONLY, (self.doubts or met,))
         used = self.used.any(-1)
         unsure = None

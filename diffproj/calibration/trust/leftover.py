@@ -86,7 +86,7 @@ class Leftover:
         proportion: the same as a proportion of the board changes them, such as the distance of its tags; `None` for
             boards without one.
         focal: focal lengths that are held, relative to themselves; `None` where none is.
-        ratio: the same of f_y alone, where the ratio of focal lengths is held.
+        ratio: the same of f_y alone, where its ratio to f_x is held.
         point: coordinates of the principal point that are held.
         moved: how far the points lie off the board within its plane, `(n,)`, RMS in world units, without the noise.
         lifted: how far they lie off that plane `(n,)`, likewise.

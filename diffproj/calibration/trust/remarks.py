@@ -186,8 +186,9 @@ def _restrained(found: Fit, p: int) -> str:
 
 
 def _otherwise(left: Leftover, i: int) -> float:
-    """The part of the sum of squares that a lens of another kind, skew, a bent or a stretched board explains alone."""
-    effects = (left.radial, left.skew, left.bow, left.print)
+    """The part of the squares that another kind of lens, skew, a bent or stretched board or what is held explains."""
+    held = (effect for effect in (left.focal, left.ratio, left.point) if effect is not None)
+    effects = (left.radial, left.skew, left.bow, left.print, *held)
     return max((float(effect.share[i]) for effect in effects if counts(effect, i, 0.0)), default=0.0)
 
 
