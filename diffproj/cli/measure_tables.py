@@ -97,8 +97,9 @@ def coordinate(world: list[float], deviations: list[float | None], axis: int) ->
     if deviation is None:
         return plain(value), " ± unknown"
     known = [each for each in deviations if each is not None]
-    if deviation <= max(EXACT * max(known), ROUNDED * scale):
-        return ("0" if abs(value) <= max(EXACT * max(known), ROUNDED * scale) else plain(value)), ""
+    exact = max(EXACT * max(known), ROUNDED * scale)
+    if deviation <= exact:
+        return ("0" if abs(value) <= exact else plain(value)), ""
     text, spread = rounded(value, deviation)
     return text, f" ± {spread}"
 

@@ -13,9 +13,6 @@ from torch import Tensor
 
 CHANCE = 1e-3
 """How likely a disagreement may be by chance, over all sources, before it is one."""
-RARELY = 0.67
-"""Deviations of a normal variable below which one in four lies: a scale is taken to be as small by chance as that, by
-the cube root of a chi-square over its freedom (Wilson and Hilferty 1931)."""
 KNOWN = 1e8
 """Residuals from which on the scale that they tell counts as known."""
 
@@ -90,7 +87,10 @@ def _judged(sources: Sources, c: int) -> tuple[Tensor, Tensor]:
     """Source c against the estimate of all others: the logarithm of the chance that it differs as much `(*B,)`.
 
     The scale of the difference is known the better, the smaller the part of it that was estimated (Welch 1947,
-    Satterthwaite 1946), all of which counts as estimated from as few residuals as that of any source.
+    Satterthwaite 1946), all of which counts as estimated from as few residuals as that of any source. A scale that was
+    estimated too small makes its part look small: of cameras located by four landmarks 0.5 % are named by chance, and
+    1.3 % where clicks are five times surer than the landmarks. To count less on it hid most that were ten deviations of
+    a pixel off.
 
     Returns:
         That, and one for comparing sources with each other, as if all scales were known alike.
@@ -107,9 +107,6 @@ def _judged(sources: Sources, c: int) -> tuple[Tensor, Tensor]:
     ours, theirs = _form(sources.estimated[..., c, :, :], weight), _form(sources.estimated[..., others, :, :], back)
     share = (ours + theirs.sum(-1)) / torch.where(chi2 > 0, chi2, 1.0)
     least = sources.freedom.amin(-1).clamp(min=1)
-    # A scale that was estimated too small makes its own part look small: it counts as what it may well be.
-    small = (1 - 2 / (9 * least) - RARELY * (2 / (9 * least)).sqrt()).pow(3).clamp(max=1)
-    share = share / (share + small * (1 - share))
     return log_tail(chi2, count, least / share.square().clamp(min=1e-300)), log_tail(chi2, count, least)
 
 

@@ -119,7 +119,7 @@ def test_of_two_cameras_nothing_tells_which_one_is_wrong() -> None:
 
 
 @pytest.mark.parametrize("landmarks", [4, 5, 12])
-@pytest.mark.parametrize("px", [20.0, 300.0])
+@pytest.mark.parametrize("px", [5.0, 20.0, 300.0])
 def test_a_camera_that_is_far_off_is_named_alone(landmarks: int, px: float) -> None:
     """However few landmarks each was located by, and however far the estimate is drawn away."""
     g, found = torch.Generator().manual_seed(0), []

@@ -39,9 +39,9 @@ def held_value(left: Leftover, i: int) -> tuple[Remark | None, float]:
         if effect is None or effect.deviations[i] <= beyond or effect.least_share[i] <= most[1]:
             continue
         moved = effect.strengths[i].tolist()  # type: ignore[index]
-        size = 100 * abs(moved[0])
-        far = effect is left.ratio and size > FAR  # by one step it is told only roughly
-        by = f"{'' if far else f'{size:.2g} % '}{'larger' if moved[0] > 0 else 'smaller'}"
+        percent = 100 * abs(moved[0])
+        told = effect is left.focal or percent <= FAR  # of the ratio one step tells much only roughly
+        by = f"{percent:.2g} % " * told + ("larger" if moved[0] > 0 else "smaller")
         by = f"{math.hypot(*moved):.2g} px elsewhere" if effect is left.point else by
         reason = f"the views contradict the {name}"
         sentence = f"{reason}: they want it {by}, and all else follows it, beyond the error bars; {remedy}"
